@@ -1,0 +1,45 @@
+"""Gaussian likelihood of levels of which some lie below the limit of detection (left-censored)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.special import log_ndtr
+
+if TYPE_CHECKING:
+    import torch
+
+HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
+
+
+def gaussian_nll(
+    level_db: np.ndarray, mean_db: np.ndarray, sigma_db: np.ndarray, limit_db: float | None
+) -> np.ndarray:
+    """Negative log-likelihood of each level, in nats; the arguments broadcast against each other.
+
+    level_db [dB]: NaN = not detected, which counts as P(level < limit): -log Phi((limit - mean) / sigma)
+    (Tobin 1958, 'Estimation of relationships for limited dependent variables'), or as 0 where limit_db is None.
+    """
+    missing = np.isnan(level_db)
+    seen = 0.5 * ((level_db - mean_db) / sigma_db) ** 2 + np.log(sigma_db) + HALF_LOG_2PI
+    if not missing.any():
+        return seen
+    below = 0.0 if limit_db is None else -log_ndtr((limit_db - mean_db) / sigma_db)
+    return np.where(missing, below, seen)
+
+
+def gaussian_nll_torch(
+    level: torch.Tensor, mean: torch.Tensor, log_sigma: torch.Tensor, censored: torch.Tensor
+) -> torch.Tensor:
+    """The same in torch, differentiable in mean and log_sigma.
+
+    Where `censored` is True, `level` holds the limit of detection instead of a level. Everything broadcasts.
+    """
+    import torch
+
+    z = (level - mean) * torch.exp(-log_sigma)
+    # The branch that is not taken must stay finite, or its gradient (0 times infinity) is NaN.
+    below = -torch.special.log_ndtr(torch.where(censored, z, 0.0))
+    seen = 0.5 * torch.where(censored, 0.0, z) ** 2 + log_sigma + HALF_LOG_2PI
+    return torch.where(censored, below, seen)

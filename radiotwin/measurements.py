@@ -1,0 +1,202 @@
+"""Measured levels of links, and the devices they belong to: two tables, checked at the border."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from radiotwin.errors import BadInput
+from radiotwin.files import atomic_path
+
+REQUIRED = ["flight", "receiver", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device"]
+LEVELS = ["gain_db", "rssi_dbm"]
+OPTIONAL = ["time_s", "heading_deg", "pitch_deg", "roll_deg", "quality"]
+MAY_BE_EMPTY = {"time_s", "receiver_z_m", *LEVELS, *OPTIONAL}
+DEVICE_REQUIRED = ["device", "x_m", "y_m", "z_m", "role"]
+DEVICE_OPTIONAL = ["frequency_hz", "tx_power_dbm", "azimuth_deg", "tilt_deg"]
+TEXT = {"flight", "receiver", "device", "role"}
+ROLES = ("anchor", "unknown")
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """Levels of links between devices and receivers.
+
+    Attributes:
+        table: one row a link, columns as in `measurements.csv`; NaN level = not detected.
+        devices: one row a device, columns as in `devices.csv`; NaN x, y where the position is unknown.
+    """
+
+    table: pd.DataFrame
+    devices: pd.DataFrame
+
+    @property
+    def level_column(self) -> str:
+        """`gain_db`, or `rssi_dbm` where transmit power is unknown."""
+        return next(name for name in LEVELS if name in self.table)
+
+    @property
+    def level_db(self) -> np.ndarray:
+        """(n,) measured level [dB or dBm]; NaN = not detected."""
+        return self.table[self.level_column].to_numpy(dtype=float)
+
+    @property
+    def receiver_m(self) -> np.ndarray:
+        """(n, 3) receiver positions [m]"""
+        return self.table[["receiver_x_m", "receiver_y_m", "receiver_z_m"]].to_numpy(dtype=float)
+
+    @cached_property
+    def device_index(self) -> np.ndarray:
+        """(n,) row of each link's device in `devices`."""
+        return pd.Index(self.devices["device"]).get_indexer(self.table["device"])
+
+    @property
+    def device_m(self) -> np.ndarray:
+        """(k, 3) declared device positions [m]; NaN where unknown."""
+        return self.devices[["x_m", "y_m", "z_m"]].to_numpy(dtype=float)
+
+    @property
+    def is_anchor(self) -> np.ndarray:
+        """(k,) bool: the device's position is known."""
+        return (self.devices["role"] == "anchor").to_numpy()
+
+    @property
+    def flights(self) -> list[str]:
+        """Names of the flights, in the order of their first rows."""
+        return list(dict.fromkeys(self.table["flight"]))
+
+    def select(self, mask: np.ndarray) -> "Measurements":
+        """The links where `mask` (n,) is true, with all devices."""
+        return Measurements(self.table[np.asarray(mask)].reset_index(drop=True), self.devices)
+
+    def write(self, path: Path | str) -> None:
+        """Write the links to `path` (.csv, .csv.gz, .parquet) and the devices to `devices.csv` beside it."""
+        path = Path(path)
+        _check_suffix(path)
+        with atomic_path(path.parent / "devices.csv") as devices, atomic_path(path) as links:
+            self.devices.to_csv(devices, index=False)
+            if path.suffix == ".parquet":
+                _needs_pyarrow(path)
+                self.table.to_parquet(links, index=False)
+            else:
+                self.table.to_csv(links, index=False, compression="gzip" if path.suffix == ".gz" else None)
+
+
+def read_measurements(path: Path | str, devices_path: Path | str | None = None) -> Measurements:
+    """Read links and devices.
+
+    Args:
+        path: `.csv`, `.csv.gz` or `.parquet` with the columns of `REQUIRED` and one of `LEVELS`.
+        devices_path: the devices' table; by default `devices.csv` in the same folder.
+
+    Raises:
+        BadInput: names the file, row and column of the first value that cannot be used.
+    """
+    path = Path(path)
+    table = _read_table(path, REQUIRED, OPTIONAL + LEVELS)
+    levels = [name for name in LEVELS if name in table]
+    if len(levels) != 1:
+        raise BadInput(f"{path}: needs exactly one of the columns {LEVELS}, it has {levels or 'neither'}")
+    devices_path = Path(devices_path) if devices_path else path.parent / "devices.csv"
+    devices = read_devices(devices_path)
+    if table.empty:
+        raise BadInput(f"{path}: has no rows; it needs at least one measured link")
+    stranger = ~table["device"].isin(devices["device"])
+    if stranger.any():
+        row = int(np.flatnonzero(stranger)[0])
+        raise BadInput(f"{path}: row {row + 2}, column device: {table['device'][row]!r} is not in {devices_path} "
+                       f"(it has {_some(devices['device'])}); add it there or correct the name")
+    return Measurements(table, devices)
+
+
+def read_devices(path: Path | str) -> pd.DataFrame:
+    """Read `devices.csv`; raises BadInput as `read_measurements` does."""
+    path = Path(path)
+    devices = _read_table(path, DEVICE_REQUIRED, DEVICE_OPTIONAL, may_be_empty={"x_m", "y_m", "z_m", *DEVICE_OPTIONAL})
+    double = devices["device"].duplicated()
+    if double.any():
+        row = int(np.flatnonzero(double)[0])
+        raise BadInput(f"{path}: row {row + 2}, column device: {devices['device'][row]!r} stands there twice")
+    wrong = ~devices["role"].isin(ROLES)
+    if wrong.any():
+        row = int(np.flatnonzero(wrong)[0])
+        raise BadInput(f"{path}: row {row + 2}, column role: {devices['role'][row]!r}; allowed are {ROLES}")
+    lost = (devices["role"] == "anchor") & devices[["x_m", "y_m"]].isna().any(axis=1)
+    if lost.any():
+        row = int(np.flatnonzero(lost)[0])
+        raise BadInput(f"{path}: row {row + 2}: anchor {devices['device'][row]!r} has no x_m, y_m; "
+                       "fill them in or give it the role unknown")
+    return devices
+
+
+def _read_table(path: Path, required: list[str], optional: list[str], may_be_empty=MAY_BE_EMPTY) -> pd.DataFrame:
+    _check_suffix(path)
+    if not path.is_file():
+        raise BadInput(f"{path} does not exist")
+    try:
+        if path.suffix == ".parquet":
+            _needs_pyarrow(path)
+            raw = pd.read_parquet(path)
+        else:
+            raw = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True)
+    except BadInput:
+        raise
+    except Exception as error:  # pandas, gzip and pyarrow each have their own
+        raise BadInput(f"{path} cannot be read as {''.join(path.suffixes)}: {error}") from None
+    missing = [name for name in required if name not in raw]
+    if missing:
+        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {required}, it has {list(raw.columns)}")
+    table = raw[[name for name in raw.columns if name in required + optional]].copy()
+    for name in table.columns:
+        if name in TEXT:
+            table[name] = table[name].astype(str).str.strip()
+            _refuse(path, name, table[name], table[name] == "", "is empty; give a name")
+        else:
+            table[name] = _numbers(path, name, table[name], name in may_be_empty)
+    return table
+
+
+def _numbers(path: Path, name: str, column: pd.Series, may_be_empty: bool) -> pd.Series:
+    if column.dtype.kind in "fiu":
+        numbers, empty = column.astype(float), column.isna()
+    else:
+        text = column.fillna("").astype(str).str.strip()
+        empty = text == ""
+        numbers = pd.to_numeric(text, errors="coerce")
+        not_a_number = text.str.lower().isin(["nan", "na", "none"])
+        _refuse(path, name, column, numbers.isna() & ~empty & ~not_a_number, "is not a number")
+        _refuse(path, name, column, not_a_number, "is not a number; leave the cell empty where there is no value")
+        numbers = numbers.astype(float)
+    _refuse(path, name, column, np.isinf(numbers), "is not finite; leave the cell empty where nothing was detected"
+            if name in LEVELS else "is not finite")
+    if not may_be_empty:
+        _refuse(path, name, column, empty, "is empty")
+    return numbers
+
+
+def _refuse(path: Path, name: str, column: pd.Series, bad, why: str) -> None:
+    bad = np.asarray(bad, dtype=bool)
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        more = f" ({bad.sum()} such rows)" if bad.sum() > 1 else ""
+        raise BadInput(f"{path}: row {row + 2}, column {name}: {str(column.iloc[row])!r} {why}{more}")
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix not in (".csv", ".parquet") and path.suffixes[-2:] != [".csv", ".gz"]:
+        raise BadInput(f"{path}: unknown format; allowed are .csv, .csv.gz and .parquet")
+
+
+def _needs_pyarrow(path: Path) -> None:
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError:
+        raise BadInput(f"{path}: Parquet needs the package pyarrow; `pip install radiotwin[parquet]`, "
+                       "or use .csv.gz") from None
+
+
+def _some(names) -> str:
+    names = list(names)
+    return ", ".join(map(str, names[:6])) + (f", … {len(names)} in all" if len(names) > 6 else "")

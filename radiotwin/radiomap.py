@@ -1,0 +1,95 @@
+"""The radio map: gain at every lattice position for every device. Everything else is a way to make or use one."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from radiotwin.errors import BadInput
+from radiotwin.files import atomic_path
+from radiotwin.scene.lattice import Lattice
+
+DIMS = ("device", "z", "y", "x")
+_UNITS = {"x": "m", "y": "m", "z": "m", "gain_db": "dB", "sigma_db": "dB"}
+_NAMES = {
+    "x": "east", "y": "north", "z": "height above the ground datum", "gain_db": "channel gain (NaN: not detected)",
+    "sigma_db": "standard deviation of the gain", "los": "line of sight by the 3D map",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class RadioMap:
+    """Channel gain over a lattice.
+
+    Attributes:
+        dataset: `gain_db` (float32, NaN where not detected), `los` (bool), optionally `sigma_db`, each with dims
+            (device, z, y, x); coordinates in metres; attributes say where it comes from.
+    """
+
+    dataset: xr.Dataset
+
+    @classmethod
+    def build(cls, devices: list[str], lattice: Lattice, gain_db: np.ndarray, los: np.ndarray,
+              sigma_db: np.ndarray | None = None, attributes: dict | None = None) -> "RadioMap":
+        """Put arrays of shape (device, z, y, x), or (device, z * y * x), into a map."""
+        shape = (len(devices), *lattice.shape)
+        variables = {"gain_db": gain_db.astype(np.float32), "los": los.astype(bool)}
+        if sigma_db is not None:
+            variables["sigma_db"] = sigma_db.astype(np.float32)
+        dataset = xr.Dataset(
+            {name: (DIMS, values.reshape(shape)) for name, values in variables.items()},
+            coords={"device": np.array(devices, dtype=object), "z": lattice.z_m, "y": lattice.y_m, "x": lattice.x_m},
+            attrs={"schema": "radiotwin.radiomap/1", **(attributes or {})},
+        )
+        for name in dataset.variables:
+            if name in _UNITS:
+                dataset[name].attrs["units"] = _UNITS[name]
+            if name in _NAMES:
+                dataset[name].attrs["long_name"] = _NAMES[name]
+        return cls(dataset)
+
+    @classmethod
+    def read(cls, path: Path | str) -> "RadioMap":
+        """Read a NetCDF-4 file.
+
+        Raises:
+            BadInput: no such file, not NetCDF-4, or not a radio map.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise BadInput(f"{path} does not exist; `radiotwin trace` or `radiotwin map` makes a radio map")
+        try:
+            with xr.open_dataset(path, engine="h5netcdf") as file:
+                dataset = file.load()
+        except Exception as error:  # h5py raises OSError, KeyError, ValueError by the kind of damage
+            raise BadInput(f"{path} is not a readable NetCDF-4 file ({error}); make it again") from None
+        if "gain_db" not in dataset or dataset["gain_db"].dims != DIMS or "los" not in dataset:
+            raise BadInput(f"{path} is not a radio map: it needs gain_db and los with dims {DIMS}, "
+                           f"it has {dict(dataset.sizes)} and {list(dataset.data_vars)}")
+        dataset["los"] = dataset["los"].astype(bool)
+        return cls(dataset)
+
+    def write(self, path: Path | str) -> None:
+        """Write NetCDF-4, compressed; whole or not at all."""
+        encoding = {name: {"zlib": True, "complevel": 4} for name in self.dataset.data_vars}
+        with atomic_path(path) as temporary:
+            self.dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
+
+    @property
+    def devices(self) -> list[str]:
+        return [str(name) for name in self.dataset["device"].values]
+
+    @property
+    def lattice(self) -> Lattice:
+        return Lattice(*(self.dataset[axis].values.astype(float) for axis in "xyz"))
+
+    @property
+    def gain_db(self) -> np.ndarray:
+        """(device, z, y, x) float32, NaN where not detected."""
+        return self.dataset["gain_db"].values
+
+    @property
+    def los(self) -> np.ndarray:
+        """(device, z, y, x) bool"""
+        return self.dataset["los"].values

@@ -1,0 +1,89 @@
+"""A scene: a declared world in a folder (`scene.toml`, `city.xml`, `meshes/*.ply`)."""
+
+import hashlib
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from radiotwin.errors import BadInput
+from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.config import SceneConfig, read_config
+from radiotwin.scene.lattice import Lattice
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scene folder that was read and checked.
+
+    Attributes:
+        folder: where it lies.
+        config: the content of `scene.toml`.
+    """
+
+    folder: Path
+    config: SceneConfig
+
+    @classmethod
+    def load(cls, folder: Path | str) -> "Scene":
+        """Read a scene folder.
+
+        Raises:
+            BadInput: not a scene folder, an impossible value, or a device inside a building.
+        """
+        folder = Path(folder)
+        if not folder.is_dir():
+            raise BadInput(f"{folder} is not a folder; give a scene folder, as `radiotwin build-scene` makes it")
+        scene = cls(folder, read_config(folder / "scene.toml"))
+        scene.check_devices()
+        return scene
+
+    @property
+    def xml_path(self) -> Path:
+        return self.folder / "city.xml"
+
+    @cached_property
+    def city(self) -> CityMap:
+        return CityMap.from_xml(self.xml_path)
+
+    @cached_property
+    def lattice(self) -> Lattice:
+        return Lattice.over(*self.config.extent.bounds, self.config.lattice.step_m,
+                            self.config.lattice.altitudes_m)
+
+    @cached_property
+    def device_m(self) -> np.ndarray:
+        """(k, 3) true positions of the declared devices [m]."""
+        return np.array([(d.x_m, d.y_m, d.z_m) for d in self.config.devices], dtype=float).reshape(-1, 3)
+
+    @cached_property
+    def blocked(self) -> np.ndarray:
+        """(nz, ny, nx) bool: lattice positions inside a building, where no UAV can be."""
+        return self.city.inside(self.lattice.positions_m).reshape(self.lattice.shape)
+
+    def check_devices(self) -> None:
+        """Raise BadInput when a device is inside a building, or a UAV starts or ends in one."""
+        path = self.folder / "scene.toml"
+        for device, bad in zip(self.config.devices, self.city.inside(self.device_m)):
+            if bad:
+                top_m = float(self.city.height_at(device.x_m, device.y_m))
+                raise BadInput(
+                    f"{path}: device {device.device!r} at ({device.x_m:g}, {device.y_m:g}, {device.z_m:g}) m is "
+                    f"inside a building {top_m:.1f} m high; move it, or put it on the roof (z_m > {top_m:.1f})")
+        for uav in self.config.uavs:
+            for end, x_m, y_m in (("start", uav.start_x_m, uav.start_y_m),
+                                  ("terminal", uav.terminal_x_m, uav.terminal_y_m)):
+                if self.city.inside(np.array([[x_m, y_m, uav.altitude_m]]))[0]:
+                    raise BadInput(f"{path}: uav {uav.uav!r}: its {end} ({x_m:g}, {y_m:g}, {uav.altitude_m:g}) m "
+                                   "is inside a building; move it or raise altitude_m")
+
+    def content_hash(self) -> str:
+        """SHA-256 over what decides a gain: geometry, materials, radio and device positions."""
+        digest = hashlib.sha256()
+        for path in (self.xml_path, *sorted(self.folder.glob("meshes/*"))):
+            digest.update(path.name.encode() + b"\0" + path.read_bytes())
+        digest.update(self.config.radio.model_dump_json().encode())
+        for device in self.config.devices:
+            digest.update(f"{device.device},{device.x_m!r},{device.y_m!r},{device.z_m!r};".encode())
+        return digest.hexdigest()

@@ -1,0 +1,192 @@
+"""`scene.toml`: what a scene declares besides its geometry, checked when it is read."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tomli_w
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from radiotwin.errors import BadInput
+from radiotwin.files import atomic_path
+
+SCHEMA = "radiotwin.scene/1"
+Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.+-]+$")]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class RadioConfig(_Table):
+    """One radio for all links; a device's own frequency or power may come with later formats."""
+
+    frequency_hz: float = Field(2.4e9, gt=0, ge=1e6, le=450e9)
+    bandwidth_hz: float = Field(1e6, gt=0)
+    tx_power_dbm: float = Field(0.0, ge=-100, le=100)
+    noise_dbm: float = Field(-102.0, ge=-200, le=50)
+    sensitivity_dbm: float = Field(-120.0, ge=-250, le=50)
+    snr_threshold_db: float = Field(10.0, ge=-50, le=100)
+
+
+class Extent(_Table):
+    """The part of the plane that UAVs fly over and devices are searched in."""
+
+    x_min_m: float
+    x_max_m: float
+    y_min_m: float
+    y_max_m: float
+
+    @model_validator(mode="after")
+    def _not_empty(self):
+        if self.x_max_m <= self.x_min_m or self.y_max_m <= self.y_min_m:
+            raise ValueError("x_max_m and y_max_m must be greater than x_min_m and y_min_m")
+        return self
+
+    @property
+    def bounds(self) -> tuple[float, float, float, float]:
+        """(x_min, x_max, y_min, y_max) [m]"""
+        return self.x_min_m, self.x_max_m, self.y_min_m, self.y_max_m
+
+
+class LatticeConfig(_Table):
+    step_m: float = Field(20.0, gt=0)
+    altitudes_m: list[Annotated[float, Field(gt=0)]] = Field(min_length=1)
+
+
+class Origin(_Table):
+    """WGS84 position of the local frame's origin."""
+
+    latitude_deg: float = Field(ge=-90, le=90)
+    longitude_deg: float = Field(ge=-180, le=180)
+    altitude_m: float = 0.0
+
+
+class DeviceConfig(_Table):
+    """The true position of a device; `role` says whether a survey may tell it."""
+
+    device: Name
+    x_m: float
+    y_m: float
+    z_m: float = Field(1.5, gt=0)
+    role: Literal["anchor", "unknown"] = "unknown"
+
+
+class UavConfig(_Table):
+    """A UAV flies at one altitude, from its start to its terminal, on `battery` units (move 1, hover 0.5)."""
+
+    uav: Name
+    altitude_m: float = Field(gt=0)
+    start_x_m: float
+    start_y_m: float
+    terminal_x_m: float
+    terminal_y_m: float
+    battery: float = Field(gt=0)
+
+
+class MissionConfig(_Table):
+    data_units: float = Field(16_000.0, gt=0, description="data waiting at each device")
+    rate_scale: float = Field(100.0, gt=0, description="data units per slot and bit/s/Hz")
+    slot_s: float = Field(2.0, gt=0, description="duration of one move or hover")
+
+
+class SceneConfig(_Table):
+    """All of `scene.toml`."""
+
+    schema_: Literal["radiotwin.scene/1"] = Field(SCHEMA, alias="schema")
+    name: Name
+    radio: RadioConfig = RadioConfig()
+    extent: Extent
+    lattice: LatticeConfig
+    origin: Origin | None = None
+    devices: list[DeviceConfig] = []
+    uavs: list[UavConfig] = []
+    mission: MissionConfig = MissionConfig()
+    provenance: dict[str, str] = {}
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
+
+    @model_validator(mode="after")
+    def _consistent(self):
+        for kind, names in (("device", [d.device for d in self.devices]), ("uav", [u.uav for u in self.uavs])):
+            double = {name for name in names if names.count(name) > 1}
+            if double:
+                raise ValueError(f"{kind} {sorted(double)[0]!r} is declared twice; every name must be unique")
+        for uav in self.uavs:
+            if uav.altitude_m not in self.lattice.altitudes_m:
+                raise ValueError(f"uav {uav.uav!r}: altitude_m = {uav.altitude_m:g} is not one of "
+                                 f"lattice.altitudes_m = {self.lattice.altitudes_m}")
+            for end in ("start", "terminal"):
+                self._check_on_lattice(uav, end)
+        return self
+
+    def _check_on_lattice(self, uav: UavConfig, end: str) -> None:
+        for axis, low, high in (("x", self.extent.x_min_m, self.extent.x_max_m),
+                                ("y", self.extent.y_min_m, self.extent.y_max_m)):
+            value = getattr(uav, f"{end}_{axis}_m")
+            steps = (value - low) / self.lattice.step_m
+            if not low <= value <= high or abs(steps - round(steps)) * self.lattice.step_m > 0.01:
+                raise ValueError(f"uav {uav.uav!r}: {end}_{axis}_m = {value:g} is not on the lattice "
+                                 f"({low:g} to {high:g} m in steps of {self.lattice.step_m:g} m)")
+
+    @property
+    def gain_limit_db(self) -> float:
+        """Gain below which a link is not detected [dB]."""
+        return self.radio.sensitivity_dbm - self.radio.tx_power_dbm
+
+
+def _explain(path: Path, error: ValidationError) -> str:
+    lines = []
+    for problem in error.errors():
+        key = ".".join(str(part) for part in problem["loc"]) or "scene"
+        reason = problem["msg"].removeprefix("Value error, ")
+        if problem["type"] == "extra_forbidden":
+            reason = "unknown key; remove it or correct its name"
+            lines.append(f"{path}: {key}: {reason}")
+        elif problem["type"] == "missing":
+            lines.append(f"{path}: {key}: missing; add it")
+        elif isinstance(problem["input"], dict | BaseModel):
+            lines.append(f"{path}: {key}: {reason}")
+        else:
+            lines.append(f"{path}: {key} = {problem['input']!r}: {reason}")
+    return "\n".join(lines)
+
+
+def parse_config(data: dict, path: Path | str) -> SceneConfig:
+    """Check the content of a scene file.
+
+    Args:
+        data: nested tables as TOML gives them.
+        path: named in messages only.
+
+    Raises:
+        BadInput: names file, key, value and what is allowed.
+    """
+    try:
+        return SceneConfig.model_validate(data)
+    except ValidationError as error:
+        raise BadInput(_explain(Path(path), error)) from None
+
+
+def read_config(path: Path | str) -> SceneConfig:
+    """Read and check `scene.toml`.
+
+    Raises:
+        BadInput: no such file, not TOML, an unknown key or an impossible value.
+    """
+    path = Path(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise BadInput(f"{path} does not exist; `radiotwin build-scene` makes a scene folder") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise BadInput(f"{path} cannot be read: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise BadInput(f"{path} is not valid TOML: {error}") from None
+    return parse_config(data, path)
+
+
+def write_config(config: SceneConfig, path: Path | str) -> None:
+    """Write `scene.toml`; every number that a later step uses is in it, defaults included."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(tomli_w.dumps(config.model_dump(by_alias=True, exclude_none=True)), encoding="utf-8")

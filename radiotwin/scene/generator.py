@@ -1,0 +1,126 @@
+"""Random cities of blocks between avenues and streets, with every building's height declared.
+
+The parameters follow the maps of Chen et al., "Model-aided Federated Reinforcement Learning for Multi-UAV
+Trajectory Planning in IoT Networks", GLOBECOM Workshops 2023. The cities are our own draws.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+import trimesh
+
+
+@dataclass(frozen=True)
+class CityParameters:
+    """What a random city is made of; lengths in metres."""
+
+    width_m: float
+    depth_m: float
+    avenue_width_m: float
+    avenue_spacing_m: float  # side of the large block between two avenues
+    street_width_m: float
+    block_mean_m: float  # small blocks: Poisson(mean), at least the minimum
+    block_min_m: float
+    side_min_m: float  # building sides: max(min, Exp(80)), clipped to the block
+    mean_height_m: float
+    first_block_m: tuple[float, float]  # south-west corner of the first large block; may lie off the map
+    max_height_m: float = 50.0
+    side_mean_m: float = 80.0
+    side_kept_m: float = 30.0  # a clipped side must keep this much
+    min_height_m: float = 5.0
+    buildings_per_m2: float = 0.001
+    clearance_m: float = 10.0  # free ground on each side of a device
+
+
+def draw_buildings(parameters: CityParameters, keep_free_m: np.ndarray, seed: int) -> np.ndarray:
+    """Draw the buildings of a city as axis-aligned boxes, which may overlap.
+
+    Args:
+        parameters: of the city.
+        keep_free_m: (k, 2) points to keep clear of buildings by `clearance_m`.
+        seed: of the draw.
+
+    Returns:
+        (n, 5) x_min, y_min, x_max, y_max, height [m]
+    """
+    rng = np.random.default_rng(seed)
+    boxes = []
+    period_m = parameters.avenue_spacing_m + parameters.avenue_width_m
+    for x0 in np.arange(parameters.first_block_m[0], parameters.width_m, period_m):
+        for y0 in np.arange(parameters.first_block_m[1], parameters.depth_m, period_m):
+            columns = _small_blocks(x0, parameters.width_m, parameters, rng)
+            for row in _small_blocks(y0, parameters.depth_m, parameters, rng):
+                for column in columns:
+                    boxes += _buildings_in(column, row, parameters, keep_free_m, rng)
+    return np.array(boxes).reshape(-1, 5)
+
+
+def _small_blocks(low: float, length_m: float, p: CityParameters, rng) -> list[tuple[float, float]]:
+    """Cut one side of the large block at `low` by streets, and clip the pieces to the map.
+
+    What is left after the last street is a block of at least the minimum.
+    """
+    blocks, high = [], low + p.avenue_spacing_m
+    while high - low >= 2 * p.block_min_m + p.street_width_m:
+        side = max(rng.poisson(p.block_mean_m), p.block_min_m)
+        side = min(side, high - low - p.street_width_m - p.block_min_m)
+        blocks.append((low, low + side))
+        low += side + p.street_width_m
+    clipped = [(max(a, 0.0), min(b, length_m)) for a, b in [*blocks, (low, high)]]
+    return [(a, b) for a, b in clipped if b - a >= p.side_kept_m]
+
+
+def _buildings_in(column, row, p: CityParameters, keep_free_m, rng) -> list[tuple]:
+    (x0, x1), (y0, y1) = column, row
+    boxes = []
+    for _ in range(rng.poisson((x1 - x0) * (y1 - y0) * p.buildings_per_m2)):
+        centre = rng.uniform((x0, y0), (x1, y1))
+        sides = np.maximum(p.side_min_m, rng.exponential(p.side_mean_m, 2))
+        height = min(rng.exponential(p.mean_height_m),
+                     abs(rng.normal()) * 3 * np.sqrt(p.max_height_m - p.mean_height_m) + p.mean_height_m)
+        low = np.maximum(centre - sides / 2, (x0, y0))
+        high = np.minimum(centre + sides / 2, (x1, y1))
+        low, high = _trimmed(low, high, keep_free_m, p.clearance_m)
+        if np.all(high - low >= p.side_kept_m):
+            boxes.append((*low.round(2), *high.round(2),
+                          round(float(np.clip(height, p.min_height_m, p.max_height_m)), 2)))
+    return boxes
+
+
+def _trimmed(low, high, keep_free_m, clearance_m):
+    """Pull the side of a rectangle back that frees a point at the least loss of area, for every point."""
+    for point in keep_free_m:
+        near, far = point - clearance_m, point + clearance_m
+        if np.any(far <= low) or np.any(near >= high):
+            continue
+        choices = []
+        for axis in (0, 1):
+            for side, value in ((high, near[axis]), (low, far[axis])):
+                trimmed = side.copy()
+                trimmed[axis] = value
+                choices.append((trimmed, high) if side is low else (low, trimmed))
+        low, high = max(choices, key=lambda c: np.prod(np.maximum(c[1] - c[0], 0.0)))
+    return low, high
+
+
+def building_meshes(boxes: np.ndarray) -> list[trimesh.Trimesh]:
+    """Boxes as watertight solids, one per group of boxes that touch.
+
+    Overlapping boxes are united, because coplanar walls and roofs standing in one another would be hit twice
+    by the ray tracer.
+
+    Args:
+        boxes: (n, 5) x_min, y_min, x_max, y_max, height [m]
+
+    Returns:
+        meshes with outward normals, from west to east.
+    """
+    solids = [trimesh.creation.box(bounds=[[x0, y0, 0.0], [x1, y1, height]]) for x0, y0, x1, y1, height in boxes]
+    union = trimesh.boolean.union(solids, engine="manifold")
+    return sorted(union.split(), key=lambda mesh: tuple(mesh.bounds[0]))
+
+
+def built_fraction(boxes: np.ndarray, width_m: float, depth_m: float) -> float:
+    """Share of the ground that buildings stand on."""
+    return shapely.union_all(shapely.box(*boxes[:, :4].T)).area / (width_m * depth_m)

@@ -1,0 +1,125 @@
+"""The scenes that ship: two after the maps of Chen et al. 2023, and a small one for the demonstration."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from radiotwin.errors import BadInput
+from radiotwin.files import atomic_folder
+from radiotwin.scene.config import (DeviceConfig, Extent, LatticeConfig, MissionConfig, SceneConfig, UavConfig,
+                                    write_config)
+from radiotwin.scene.generator import CityParameters, building_meshes, draw_buildings
+
+ANTENNA_HEIGHT_M = 1.5
+GROUND_MARGIN_M = 100.0
+
+
+@dataclass(frozen=True)
+class Preset:
+    """A generated city and the mission in it; devices as (x_m, y_m, is_anchor)."""
+
+    city: CityParameters
+    seed: int
+    devices: list[tuple[float, float, bool]]
+    start_m: tuple[float, float]
+    terminal_m: tuple[float, float]
+    battery: float
+    data_units: float
+    altitudes_m: tuple[float, ...]  # one UAV at each
+
+
+def _devices(text: str) -> list[tuple[float, float, bool]]:
+    """Parse '(20,200) (60,320)* …'; an asterisk marks an anchor."""
+    devices = []
+    for word in text.split():
+        x_m, y_m = word.strip("()*").replace(")", "").split(",")
+        devices.append((float(x_m), float(y_m), word.endswith("*")))
+    return devices
+
+
+PRESETS = {
+    "rbm": Preset(
+        CityParameters(600, 800, avenue_width_m=60, avenue_spacing_m=200, street_width_m=20, block_mean_m=100,
+                       block_min_m=80, side_min_m=50, mean_height_m=15, first_block_m=(-169, -34)),
+        seed=0,
+        devices=_devices("(20,200) (60,320)* (60,760) (120,600) (200,80) (320,120)* (320,760) (460,720) (460,200) "
+                         "(580,520)*"),
+        start_m=(320, 460), terminal_m=(320, 460), battery=60, data_units=16_000, altitudes_m=(55, 60, 65)),
+    "rdm": Preset(
+        CityParameters(1000, 1200, avenue_width_m=90, avenue_spacing_m=300, street_width_m=30, block_mean_m=120,
+                       block_min_m=100, side_min_m=75, side_mean_m=100, mean_height_m=30,
+                       first_block_m=(-72, -25)),
+        seed=0,
+        devices=_devices("(200,700) (280,1100)* (360,500) (460,400) (540,700)* (660,220) (600,1100) (660,800) "
+                         "(800,520)* (860,920)"),
+        start_m=(280, 300), terminal_m=(660, 920), battery=80, data_units=20_000, altitudes_m=(55, 60, 65)),
+    "small": Preset(
+        CityParameters(300, 300, avenue_width_m=40, avenue_spacing_m=160, street_width_m=20, block_mean_m=70,
+                       block_min_m=60, side_min_m=40, mean_height_m=18, first_block_m=(-100, -60)),
+        seed=0,
+        devices=_devices("(80,40)* (280,60) (80,200) (160,120) (280,280)* (200,200) (80,280)*"),
+        start_m=(80, 120), terminal_m=(80, 120), battery=40, data_units=8_000, altitudes_m=(55, 60)),
+}
+
+
+def preset_config(name: str) -> SceneConfig:
+    """The declarations of a preset.
+
+    Raises:
+        BadInput: no such preset.
+    """
+    preset = _find(name)
+    return SceneConfig(
+        name=name,
+        extent=Extent(x_min_m=0, x_max_m=preset.city.width_m, y_min_m=0, y_max_m=preset.city.depth_m),
+        lattice=LatticeConfig(step_m=20, altitudes_m=list(preset.altitudes_m)),
+        devices=[DeviceConfig(device=f"d{i}", x_m=x_m, y_m=y_m, z_m=ANTENNA_HEIGHT_M,
+                              role="anchor" if anchor else "unknown")
+                 for i, (x_m, y_m, anchor) in enumerate(preset.devices)],
+        uavs=[UavConfig(uav=f"uav{i}", altitude_m=altitude_m, start_x_m=preset.start_m[0],
+                        start_y_m=preset.start_m[1], terminal_x_m=preset.terminal_m[0],
+                        terminal_y_m=preset.terminal_m[1], battery=preset.battery)
+              for i, altitude_m in enumerate(preset.altitudes_m)],
+        mission=MissionConfig(data_units=preset.data_units),
+        provenance={"source": f"preset:{name}", "seed": str(preset.seed),
+                    "generator": "after Chen et al., GLOBECOM Workshops 2023"},
+    )
+
+
+def preset_boxes(name: str) -> np.ndarray:
+    """The buildings of a preset: (n, 5) x_min, y_min, x_max, y_max, height [m]."""
+    preset = _find(name)
+    return draw_buildings(preset.city, np.array([(x_m, y_m) for x_m, y_m, _ in preset.devices]), preset.seed)
+
+
+def build_preset(name: str, folder: Path | str) -> None:
+    """Write the scene folder of a preset.
+
+    Raises:
+        BadInput: no such preset, or the folder cannot be written.
+    """
+    from radiotwin.scene.materials import Material
+    from radiotwin.scene.writer import CityShape, write_city
+
+    preset = _find(name)
+    margin = GROUND_MARGIN_M
+    ground = trimesh.Trimesh(
+        vertices=[[-margin, -margin, 0], [preset.city.width_m + margin, -margin, 0],
+                  [preset.city.width_m + margin, preset.city.depth_m + margin, 0],
+                  [-margin, preset.city.depth_m + margin, 0]],
+        faces=[[0, 1, 2], [0, 2, 3]], process=False)
+    shapes = [CityShape("ground", ground, Material("asphalt_concrete", itu="asphalt_concrete"))]
+    concrete = Material("concrete", itu="concrete")
+    shapes += [CityShape(f"building_{i:03d}", mesh, concrete)
+               for i, mesh in enumerate(building_meshes(preset_boxes(name)))]
+    with atomic_folder(folder) as temporary:
+        write_city(temporary, shapes)
+        write_config(preset_config(name), temporary / "scene.toml")
+
+
+def _find(name: str) -> Preset:
+    if name not in PRESETS:
+        raise BadInput(f"preset {name!r} does not exist; allowed are {', '.join(PRESETS)}")
+    return PRESETS[name]

@@ -1,0 +1,101 @@
+"""A city as Sionna RT 2.2 loads it: `city.xml`, and one binary PLY file for each shape."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from radiotwin.progress import progress
+from radiotwin.scene.materials import Material
+
+
+@dataclass(frozen=True, eq=False)
+class CityShape:
+    """One surface or body of a city.
+
+    Attributes:
+        name: unique in the city; letters, digits, `_` and `-`.
+        mesh: triangles in the scene's frame [m].
+        material: shapes that share one have equal `Material` objects.
+    """
+
+    name: str
+    mesh: trimesh.Trimesh
+    material: Material
+
+
+def write_city(folder: Path | str, shapes: Sequence[CityShape]) -> None:
+    """Write `city.xml` and `meshes/*.ply` into an existing folder.
+
+    Args:
+        folder: of the scene; `atomic_folder` gives one that appears only when everything is written.
+        shapes: names unique, also among the names of materials (Sionna RT has one register for both).
+    """
+    folder = Path(folder)
+    (folder / "meshes").mkdir(exist_ok=True)
+    root = ET.Element("scene", version="2.1.0")
+    for material in sorted({shape.material for shape in shapes}, key=lambda material: material.name):
+        root.append(_material_element(material))
+    with progress("writing meshes", total=len(shapes)) as advance:
+        for shape in shapes:
+            root.append(_shape_element(shape))
+            write_ply(folder / "meshes" / f"{shape.name}.ply", shape.mesh.vertices, shape.mesh.faces)
+            advance(1)
+    ET.indent(root)
+    ET.ElementTree(root).write(folder / "city.xml", encoding="utf-8", xml_declaration=True)
+
+
+def _material_element(material: Material) -> ET.Element:
+    # The identifier must not begin with "itu_": Sionna RT rebuilds such a material from its type and thickness
+    # and forgets its scattering.
+    if material.itu is not None:
+        element = ET.Element("bsdf", type="itu-radio-material", id=f"mat-{material.name}")
+        ET.SubElement(element, "string", name="type", value=material.itu)
+    else:
+        element = ET.Element("bsdf", type="radio-material", id=f"mat-{material.name}")
+        _add_float(element, "relative_permittivity", material.relative_permittivity)
+        _add_float(element, "conductivity", material.conductivity_s_per_m)
+        ET.SubElement(element, "rgb", name="color", value="0.6 0.6 0.6")  # else Sionna RT draws one at random
+    _add_float(element, "thickness", material.thickness_m)
+    if material.scattering_coefficient:
+        _add_float(element, "scattering_coefficient", material.scattering_coefficient)
+        _add_float(element, "xpd_coefficient", material.xpd_coefficient)
+    return element
+
+
+def _add_float(element: ET.Element, name: str, value: float) -> None:
+    ET.SubElement(element, "float", name=name, value=repr(float(value)))
+
+
+def _shape_element(shape: CityShape) -> ET.Element:
+    element = ET.Element("shape", type="ply", id=f"mesh-{shape.name}")
+    ET.SubElement(element, "string", name="filename", value=f"meshes/{shape.name}.ply")
+    # Without this Mitsuba rounds the normals of walls that share vertices, and reflections go astray.
+    ET.SubElement(element, "boolean", name="face_normals", value="true")
+    ET.SubElement(element, "ref", id=f"mat-{shape.material.name}", name="bsdf")
+    return element
+
+
+def write_ply(path: Path, vertices_m: np.ndarray, faces: np.ndarray) -> None:
+    """Write triangles as a binary little-endian PLY file; equal meshes give equal bytes.
+
+    Args:
+        path: file to write.
+        vertices_m: (v, 3) positions, stored in single precision.
+        faces: (f, 3) indices of vertices.
+    """
+    header = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(vertices_m)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    rows = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
+    rows["count"] = 3
+    rows["index"] = faces
+    with open(path, "wb") as file:
+        file.write(header.encode("ascii"))
+        file.write(np.ascontiguousarray(vertices_m, dtype="<f4").tobytes())
+        file.write(rows.tobytes())

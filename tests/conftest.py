@@ -1,0 +1,23 @@
+"""Skips what a machine cannot run, with the reason."""
+
+import pytest
+
+from radiotwin import llvm
+
+
+def pytest_collection_modifyitems(items):
+    needs_llvm = [item for item in items if item.get_closest_marker("llvm")]
+    if needs_llvm and not llvm.available():
+        for item in needs_llvm:
+            item.add_marker(pytest.mark.skip(reason="no working libLLVM >= 17; `radiotwin doctor` says what to do"))
+
+
+@pytest.fixture(scope="session")
+def small_scene(tmp_path_factory):
+    """The scene folder of `preset:small`."""
+    from radiotwin.scene import Scene
+    from radiotwin.scene.presets import build_preset
+
+    folder = tmp_path_factory.mktemp("scenes") / "small"
+    build_preset("small", folder)
+    return Scene.load(folder)
