@@ -12,8 +12,6 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from radiotwin import llvm
 
@@ -30,13 +28,15 @@ llvm.prepare()
 import sionna.rt
 scene = sionna.rt.load_scene()
 scene.frequency = 2.4e9
-scene.tx_array = scene.rx_array = sionna.rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+one_antenna = sionna.rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+scene.tx_array = scene.rx_array = one_antenna
 scene.add(sionna.rt.Transmitter("device", [0, 0, 10]))
 scene.add(sionna.rt.Receiver("receiver", [100, 0, 10]))
 real, imaginary = sionna.rt.PathSolver(deterministic=True)(scene, max_depth=0).a
 print(10 * np.log10(float((np.square(real) + np.square(imaginary)).sum())))
 """
 _FREE_SPACE_GAIN_DB = 20 * math.log10(299_792_458 / 2.4e9 / (4 * math.pi * 100))  # Friis, the same link
+_TESTED_VERSIONS = "install the versions of sionna-rt, mitsuba and drjit that constraints.txt names"
 
 
 @dataclass
@@ -92,22 +92,20 @@ def _check_llvm(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 def _check_tracing(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     """Trace one free-space link in a process of its own and hold it against its closed form."""
     name = "one link of 100 m at 2.4 GHz"
+    command = [sys.executable, "-c", _TRACE]
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", _TRACE], check=False, capture_output=True, text=True, timeout=TRACE_TIMEOUT_S
-        )
+        done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=TRACE_TIMEOUT_S)
     except subprocess.TimeoutExpired:
         diagnosis.problems.append(f"tracing one link did not end within {TRACE_TIMEOUT_S} s")
         return [(name, "did not end")]
     if done.returncode != 0:
         complaint = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
-        diagnosis.problems.append(f"tracing fails ({complaint}): pip install --force-reinstall sionna-rt mitsuba drjit")
+        diagnosis.problems.append(f"tracing fails ({complaint}): {_TESTED_VERSIONS}")
         return [(name, f"fails: {complaint}")]
     gain_db = float(done.stdout.split()[-1])
     if abs(gain_db - _FREE_SPACE_GAIN_DB) > 0.01:
         diagnosis.problems.append(
-            f"tracing gives {gain_db:.2f} dB where free space has {_FREE_SPACE_GAIN_DB:.2f} dB: install the versions "
-            "in constraints.txt, with which it was tested"
+            f"tracing gives {gain_db:.2f} dB, free space has {_FREE_SPACE_GAIN_DB:.2f} dB: {_TESTED_VERSIONS}"
         )
     return [(name, f"{gain_db:.2f} dB (free space: {_FREE_SPACE_GAIN_DB:.2f} dB)")]
 
@@ -125,14 +123,15 @@ def _check_gpu() -> list[tuple[str, str]]:
     try:
         import torch  # takes seconds
 
-        rows.append(("torch", "uses it" if torch.cuda.is_available() else "does not use it (CPU build or driver)"))
+        used = torch.cuda.is_available()
+        rows.append(("torch", "uses it" if used else "does not use it (a CPU build, or the driver)"))
     except (ImportError, OSError) as error:
         rows.append(("torch", f"cannot be imported: {error}"))
     return rows
 
 
 def _memory_gib() -> float | None:
-    """What this process may use [GiB]: the machine's memory, or the limit of its container; None if unknown."""
+    """What this process may use [GiB]: the machine's memory or its container's limit; None if unknown."""
     try:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):  # Windows
@@ -150,7 +149,7 @@ def _check_machine(diagnosis: Diagnosis) -> list[tuple[str, str]]:
     disk_gib = shutil.disk_usage(Path.cwd()).free / GIB
     if memory_gib is not None and memory_gib < MEMORY_WANTED_GIB:
         diagnosis.cautions.append(
-            f"{memory_gib:.1f} GiB of memory: tracing a city takes up to {MEMORY_WANTED_GIB} GiB; close other programs"
+            f"{memory_gib:.1f} GiB of memory: tracing a city takes up to {MEMORY_WANTED_GIB} GiB"
         )
     if disk_gib < DISK_WANTED_GIB:
         diagnosis.cautions.append(
@@ -164,7 +163,7 @@ def _check_machine(diagnosis: Diagnosis) -> list[tuple[str, str]]:
 
 
 def diagnose() -> Diagnosis:
-    """Look at everything that radiotwin needs. Nothing is changed, and nothing that fails ends this process."""
+    """Look at everything that radiotwin needs; nothing that fails in it can end this process."""
     diagnosis = Diagnosis()
     diagnosis.sections["System"] = [
         ("Python", f"{platform.python_version()} ({sys.executable})"),
@@ -185,17 +184,19 @@ def run(console: Console) -> bool:
     """Print the diagnosis, and what to do, on `console`; True if everything works."""
     with console.status("looking at this machine"):
         diagnosis = diagnose()
+
+    def say(text: str, style: str | None = None) -> None:  # paths as they are: neither wrapped nor markup
+        console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
     for heading, rows in diagnosis.sections.items():
-        console.print(f"[bold]{escape(heading)}[/bold]")
-        table = Table.grid(padding=(0, 2), pad_edge=True)
-        for row in rows:
-            table.add_row(*map(escape, row))
-        console.print(table)
-    console.print("[bold]What to do[/bold]")
-    for caution in diagnosis.cautions:
-        console.print(f"  [yellow]•[/yellow] {escape(caution)}", soft_wrap=True)
-    for problem in diagnosis.problems:
-        console.print(f"  [red]•[/red] {escape(problem)}", soft_wrap=True)
+        say(heading, "bold")
+        width = max(len(what) for what, _ in rows)
+        for what, finding in rows:
+            say(f"  {what:<{width}}  {finding}")
+    say("What to do", "bold")
+    for lines, style in ((diagnosis.problems, "red"), (diagnosis.cautions, "yellow")):
+        for line in lines:
+            say(f"  - {line}".replace("\n", "\n    "), style)
     if diagnosis.healthy:
-        console.print("  Everything works.")
+        say("  Everything works.", "green")
     return diagnosis.healthy

@@ -219,12 +219,14 @@ def install_line() -> str:
         return "winget install LLVM.LLVM"
     sudo = "" if os.geteuid() == 0 else "sudo "
     managers = {
-        "apt-get": "apt-get install -y libllvm19", "dnf": "dnf install -y llvm-libs",
-        "pacman": "pacman -S --noconfirm llvm-libs", "zypper": "zypper install -y libLLVM19",
+        "apt-get": "apt-get install -y libllvm19  # not known there? see https://apt.llvm.org",
+        "dnf": "dnf install -y llvm-libs",
+        "pacman": "pacman -S --noconfirm llvm-libs",
+        "zypper": "zypper install -y libLLVM19",
         "apk": "apk add llvm19-libs",
     }
     line = next((line for manager, line in managers.items() if shutil.which(manager)), None)
-    return sudo + line if line else "conda install -y -c conda-forge libllvm19"
+    return sudo + line if line else "this system's package manager has it as libLLVM, llvm or llvm-libs"
 
 
 def advice() -> str:

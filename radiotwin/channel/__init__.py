@@ -2,11 +2,6 @@
 
 from radiotwin.channel.base import ChannelModel, check_fit_data
 from radiotwin.channel.links import Links, make_links
-from radiotwin.channel.log_distance import LogDistance
-from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
+from radiotwin.channel.store import MODELS, load_channel, save_channel
 
-MODELS: dict[str, type[ChannelModel]] = {
-    model.name: model for model in (LogDistance, SegmentedLogDistance)
-}
-
-__all__ = ["MODELS", "ChannelModel", "Links", "check_fit_data", "make_links"]
+__all__ = ["MODELS", "ChannelModel", "Links", "check_fit_data", "load_channel", "make_links", "save_channel"]

@@ -35,6 +35,12 @@ class ChannelModel(ABC):
     def predict(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
         """Mean [dB] and standard deviation [dB] of n links, (n,) each, before any limit of detection."""
 
+    @property
+    def trend(self) -> ChannelModel:
+        """The part that holds for any device, measured before or not: the model itself, unless it keeps something
+        per device."""
+        return self
+
     @abstractmethod
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Arrays, and settings that JSON can hold, from which `from_state` makes an equal model."""

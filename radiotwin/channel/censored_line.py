@@ -92,7 +92,9 @@ def shift_line(
         return nll + 0.5 * ((shift_db - prior_db) / spread_db) ** 2
 
     reach_db = 10.0 * spread_db
-    shift_db = minimize_scalar(objective, bounds=(prior_db - reach_db, prior_db + reach_db), method="bounded").x
+    shift_db = minimize_scalar(
+        objective, bounds=(prior_db - reach_db, prior_db + reach_db), method="bounded"
+    ).x
     return LogDistanceLine(line.intercept_db + float(shift_db), line.exponent, line.sigma_db)
 
 
@@ -102,4 +104,6 @@ def fit_sigma(level_db: np.ndarray, mean_db: np.ndarray, limit_db: float | None)
     def objective(log_sigma: float) -> float:
         return gaussian_nll(level_db, mean_db, np.exp(log_sigma), limit_db).sum()
 
-    return float(np.exp(minimize_scalar(objective, bounds=(np.log(MIN_SIGMA_DB), np.log(100.0)), method="bounded").x))
+    return float(
+        np.exp(minimize_scalar(objective, bounds=(np.log(MIN_SIGMA_DB), np.log(100.0)), method="bounded").x)
+    )

@@ -16,6 +16,8 @@ from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 BLOCK_M = 100.0
 TABLE = 129
 TRIM = 0.005
+LEAST_SPAN = np.array([0.1, 10.0])
+"""Least range of log-distance and of height difference [m] that counts as a difference."""
 
 
 class SegmentedNN(ChannelModel):
@@ -25,7 +27,7 @@ class SegmentedNN(ChannelModel):
     networks' (GLOBECOM Workshops 2023): the same inputs and likelihood, with a standard deviation per class. Here
     the network learns only what the law leaves over. Each member of the ensemble holds out one part of the links,
     starts as the law itself and keeps the weights that were best on that part, so that a bad start cannot ship; the
-    prediction is the members' mean. Outside the distances and elevations measured the residual stays as at the
+    prediction is the members' mean. Outside the distances and heights measured the residual stays as at the
     edge, and the law extrapolates. A class that borrowed its line keeps it unbent.
 
     Predictions come from a table of that mean, TABLE x TABLE values a class, bilinear between them: as exact as
@@ -37,7 +39,7 @@ class SegmentedNN(ChannelModel):
 
     def __init__(self) -> None:
         self.law = SegmentedLogDistance()
-        # Per class, NLoS first: the box of the inputs (log-distance, elevation) and of the residual [dB].
+        # Per class, NLoS first: the box of the data's places, see _place, and of the residual [dB].
         self.low, self.high = np.zeros((2, 2)), np.ones((2, 2))
         self.residual_db = np.zeros((2, 2))
         self.sigma_db = np.ones(2)
@@ -49,17 +51,17 @@ class SegmentedNN(ChannelModel):
         self.law.fit(links, level_db, limit_db)
         law_db, law_sigma_db = self.law.predict(links)
         segment = links.los.astype(np.intp)
-        inputs = np.stack([links.log_distance, links.elevation_rad], axis=1)
+        place = _place(links)
         bent = np.array([self.law.borrowed != "nlos", self.law.borrowed != "los"])
-        for s in np.flatnonzero(bent):
-            # The outermost links are too few to shape the edge that everything beyond is read from.
-            self.low[s], self.high[s] = np.quantile(inputs[segment == s], [TRIM, 1.0 - TRIM], axis=0)
-
         use = bent[segment]
+        for s in (0, 1):
+            # The outermost links are too few to shape the edge that everything beyond is read from.
+            source = place[segment == s] if bent[s] else place[use]
+            self.low[s], self.high[s] = np.quantile(source, [TRIM, 1.0 - TRIM], axis=0)
         censored = np.isnan(level_db)
         residual = (np.where(censored, limit_db or 0.0, level_db) - law_db) / law_sigma_db
         data = TrainingData(
-            inputs=self._normalise(inputs, segment)[use],
+            inputs=self._inputs(place, segment)[use],
             target=residual[use],
             censored=censored[use],
             los=links.los[use],
@@ -68,13 +70,13 @@ class SegmentedNN(ChannelModel):
         self.weights, unseen = train(data, seed)
         mean_db = law_db.copy()
         mean_db[use] += unseen * law_sigma_db[use]
-        for s in (0, 1):
+        for s, line in enumerate((self.law.nlos, self.law.los)):
             mask = segment == s
             if bent[s]:
                 self.residual_db[s] = np.quantile(mean_db[mask] - law_db[mask], [TRIM, 1.0 - TRIM])
                 self.sigma_db[s] = fit_sigma(level_db[mask], mean_db[mask], limit_db)
             else:
-                self.sigma_db[s] = (self.law.nlos, self.law.los)[s].sigma_db
+                self.residual_db[s], self.sigma_db[s] = 0.0, line.sigma_db
         self._tabulate()
         return self
 
@@ -83,7 +85,7 @@ class SegmentedNN(ChannelModel):
         segment = links.los.astype(np.intp)
         scale = (TABLE - 1) / np.maximum(self.high - self.low, 1e-9)
         index, weight = [], []
-        for axis, value in enumerate((links.log_distance, links.elevation_rad)):
+        for axis, value in enumerate(_place(links).T):
             position = (value - self.low[segment, axis]) * scale[segment, axis]
             position = np.clip(position, 0.0, TABLE - 1)
             index.append(np.minimum(position.astype(np.intp), TABLE - 2))
@@ -94,12 +96,15 @@ class SegmentedNN(ChannelModel):
         far = table[corner + TABLE] * (1.0 - v) + table[corner + TABLE + 1] * v
         return self.law.predict(links)[0] + near * (1.0 - u) + far * u, self.sigma_db[segment]
 
-    def _normalise(self, inputs: np.ndarray, segment: np.ndarray) -> np.ndarray:
-        """(n, 3) inputs of the network, in [-1, 1]: log-distance, elevation, line of sight."""
-        inputs = np.clip(inputs, self.low[segment], self.high[segment])
+    def _inputs(self, place: np.ndarray, segment: np.ndarray) -> np.ndarray:
+        """(n, 4) inputs of the network: log-distance, elevation, line of sight, and the height difference once more,
+        because at a few altitudes the elevation hardly tells more than the distance; the first and last in [-1, 1].
+        """
+        place = np.clip(place, self.low[segment], self.high[segment])
+        elevation_rad = np.arcsin(np.clip(place[:, 1] / 10.0 ** place[:, 0], -1.0, 1.0))
         low, high = self.low.min(axis=0), self.high.max(axis=0)
-        scaled = 2.0 * (inputs - low) / np.maximum(high - low, 1e-9) - 1.0
-        return np.column_stack([scaled, 2.0 * segment - 1.0])
+        scaled = (2.0 * place - low - high) / np.maximum(high - low, LEAST_SPAN)
+        return np.column_stack([scaled[:, 0], elevation_rad, 2.0 * segment - 1.0, scaled[:, 1]])
 
     def _tabulate(self) -> None:
         """The mean residual of the ensemble [dB] on a grid over each class's box, (2, TABLE, TABLE)."""
@@ -108,7 +113,7 @@ class SegmentedNN(ChannelModel):
         for s, line in enumerate((self.law.nlos, self.law.los)):
             axes = np.linspace(self.low[s], self.high[s], TABLE).T
             grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-            inputs = torch.as_tensor(self._normalise(grid, np.full(len(grid), s)), dtype=torch.float32)
+            inputs = torch.as_tensor(self._inputs(grid, np.full(len(grid), s)), dtype=torch.float32)
             with one_thread(), torch.no_grad():
                 mean = forward(weights, inputs).mean(0).numpy().astype(float) * line.sigma_db
             self._table[s] = np.clip(mean, *self.residual_db[s]).reshape(TABLE, TABLE)
@@ -129,6 +134,12 @@ class SegmentedNN(ChannelModel):
         model.weights = {name: arrays[name] for name in WEIGHTS}
         model._tabulate()
         return model
+
+
+def _place(links: Links) -> np.ndarray:
+    """(n, 2) log-distance and height of the receiver above the device [m]: with these as axes, unlike elevation, the
+    box around the data of a few altitudes is full of data."""
+    return np.column_stack([links.log_distance, links.receiver_m[:, 2] - links.device_m[:, 2]])
 
 
 def _folds(links: Links, rng: np.random.Generator) -> np.ndarray:

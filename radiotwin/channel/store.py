@@ -25,30 +25,24 @@ MODELS: dict[str, type[ChannelModel]] = {
 def save_channel(model: ChannelModel, path: str | Path) -> None:
     """Writes a fitted model; `load_channel` gives one with equal predictions."""
     arrays, settings = model.state()
-    metadata = {"model": model.name, "settings": json.dumps(settings, sort_keys=True)}
+    # One key, because safetensors writes several in an order that changes from run to run.
+    header = {"channel": json.dumps({"model": model.name, "settings": settings}, sort_keys=True)}
     with atomic_path(Path(path)) as temporary:
-        save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary, metadata)
+        save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary, header)
 
 
 def load_channel(path: str | Path) -> ChannelModel:
     """Reads what `save_channel` wrote. Raises BadInput where the file is missing, damaged or of something else."""
     try:
         with safe_open(path, framework="numpy") as file:
-            metadata = file.metadata() or {}
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (OSError, SafetensorError) as error:
-        raise BadInput(f"{path}: cannot be read as a channel model ({error}): run `radiotwin fit` again") from error
-    if metadata.get("model") not in MODELS:
+            header = json.loads(file.metadata()["channel"])
+            arrays = {name: file.get_tensor(name) for name in sorted(file.keys())}
+        bad = [name for name, array in arrays.items() if not np.isfinite(array).all()]
+        if bad:
+            raise ValueError(f"{', '.join(bad)} holds values that are not finite")
+        return MODELS[header["model"]].from_state(arrays, header["settings"])
+    except (OSError, SafetensorError, KeyError, ValueError, TypeError, IndexError, RuntimeError) as error:
         raise BadInput(
-            f"{path}: holds the model {metadata.get('model')!r}; known are {', '.join(MODELS)}"
-        )
-    bad = [name for name, array in arrays.items() if not np.isfinite(array).all()]
-    if bad:
-        raise BadInput(f"{path}: {', '.join(bad)} holds values that are not finite: run `radiotwin fit` again")
-    try:
-        return MODELS[metadata["model"]].from_state(arrays, json.loads(metadata["settings"]))
-    except (KeyError, ValueError, TypeError, IndexError, RuntimeError) as error:
-        raise BadInput(
-            f"{path}: is not a complete {metadata['model']} model ({type(error).__name__}: {error}): "
+            f"{path}: not a whole channel model of one of {', '.join(MODELS)} ({type(error).__name__}: {error}); "
             "run `radiotwin fit` again"
         ) from error

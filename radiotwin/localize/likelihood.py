@@ -10,6 +10,7 @@ from scipy.special import ndtr
 
 from radiotwin.localize.link_table import DirectChannel, LinkTable
 from radiotwin.localize.observations import DeviceObservations, Observations
+from radiotwin.localize.overconfidence import DeviceResiduals
 
 if TYPE_CHECKING:
     from radiotwin.scene.citymap import CityMap
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
 OUTLIER_SHARE = 0.02
 OUTLIER_SPAN_DB = 100.0
 CHUNK_LINKS = 1 << 18
-MIN_REPEAT_SHARE = 0.01
+SLOPE_STEP_M = 2.0
 
 
 class Likelihood:
@@ -41,19 +42,19 @@ class Likelihood:
         limit_db: float | None,
         chunk_links: int = CHUNK_LINKS,
     ):
-        """devices: (k,) indices into observations.devices; limit_db may be None only where nothing is `missed`."""
+        """devices: (k,) positions in observations.devices, by which the methods know them; limit_db may be None only where nothing is `missed`."""
         self.devices, self.z_m, self._channel, self._city = devices, z_m, channel, city
         self.receiver_m, self._limit_db, self._chunk_links = observations.receiver_m, limit_db, chunk_links
         self._all = observations.devices
         self.repeat_share = 1.0
 
-    def of_device(self, device: int, xy_m: np.ndarray) -> np.ndarray:
+    def of_device(self, k: int, xy_m: np.ndarray) -> np.ndarray:
         """(p,) log-likelihood [nats] of one device's data at positions (p, 2)."""
-        data = self._all[device]
+        data = self._all[k]
         rows = np.union1d(data.seen, data.missed)
         total = np.zeros(len(xy_m))
         for part, los in self._sight(xy_m, rows):
-            total[part] = self._score(data, rows, *self._channel.look_up(xy_m[part], rows, los, device))
+            total[part] = self._score(data, rows, *self._channel.look_up(xy_m[part], rows, los, data.device))
         return total
 
     def of_all(self, xy_m: np.ndarray) -> np.ndarray:
@@ -64,18 +65,34 @@ class Likelihood:
         total = np.zeros((len(self.devices), len(xy_m)))
         for part, los in self._sight(xy_m, rows):
             link = None
-            for i, device in enumerate(self.devices):
+            for i, k in enumerate(self.devices):
+                data = self._all[k]
                 if link is None or self._channel.by_device:
-                    link = self._channel.look_up(xy_m[part], rows, los, device)
-                total[i, part] = self._score(self._all[device], rows, *link)
+                    link = self._channel.look_up(xy_m[part], rows, los, data.device)
+                total[i, part] = self._score(data, rows, *link)
         return total
 
-    def residuals(self, device: int, xy_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """At one position (2,): residual of each merged detected level [dB], its link's sigma [dB], and los."""
-        data = self._all[device]
-        (_, los), = self._sight(xy_m[None], data.seen)
-        mean, sigma = self._channel.look_up(xy_m[None], data.seen, los, device)
-        return data.level_db - mean[0], sigma[0], los[0]
+    def link_at(self, k: int, xy_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and standard deviation [dB] of the channel at a device's detected positions (n,), if it were at one
+        position (2,)."""
+        data = self._all[k]
+        los = self._line_of_sight(xy_m[None], data.seen)
+        mean, sigma = self._channel.look_up(xy_m[None], data.seen, los, data.device)
+        return mean[0], sigma[0]
+
+    def residuals(self, k: int, xy_m: np.ndarray) -> DeviceResiduals:
+        """Standardised residuals of a device's merged levels at one position (2,), and how they would change if it
+        moved without any change of line of sight."""
+        data = self._all[k]
+        mean, sigma = self.link_at(k, xy_m)
+        deviation = sigma * np.sqrt(self.variance_share(data.count))
+        los = np.repeat(self._line_of_sight(xy_m[None], data.seen), 4, axis=0)
+        steps = SLOPE_STEP_M * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+        around, _ = self._channel.look_up(xy_m + steps, data.seen, los, data.device)
+        slope = np.column_stack([around[0] - around[1], around[2] - around[3]]) / (2 * SLOPE_STEP_M)
+        return DeviceResiduals(
+            self.receiver_m[data.seen], (data.level_db - mean) / deviation, slope / deviation[:, None]
+        )
 
     def variance_share(self, count: np.ndarray) -> np.ndarray:
         """Variance of the mean of `count` repeats, as a share of the channel's variance."""
@@ -85,15 +102,15 @@ class Likelihood:
         step = max(1, self._chunk_links // max(len(rows), 1))
         for start in range(0, len(xy_m), step):
             part = slice(start, start + step)
-            xy = xy_m[part]
-            if self._city is None:
-                yield part, np.ones((len(xy), len(rows)), bool)
-                continue
-            ends_m = np.column_stack([xy, np.full(len(xy), self.z_m)])
-            los = self._city.line_of_sight(
-                np.repeat(ends_m, len(rows), axis=0), np.tile(self.receiver_m[rows], (len(xy), 1))
-            )
-            yield part, los.reshape(len(xy), len(rows))
+            yield part, self._line_of_sight(xy_m[part], rows)
+
+    def _line_of_sight(self, xy_m: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        """(p, c) bool between positions (p, 2) and receivers (c,)."""
+        p, c = len(xy_m), len(rows)
+        if self._city is None:
+            return np.ones((p, c), bool)
+        ends_m = np.repeat(np.column_stack([xy_m, np.full(p, self.z_m)]), c, axis=0)
+        return self._city.line_of_sight(ends_m, np.tile(self.receiver_m[rows], (p, 1))).reshape(p, c)
 
     def _score(
         self, data: DeviceObservations, rows: np.ndarray, mean: np.ndarray, sigma: np.ndarray

@@ -15,26 +15,25 @@ SAME_POSITION_M = 1e-3
 class DeviceObservations:
     """One device's measurements, merged over repeats of the same receiver position.
 
-    Detected: `seen` (n,) rows of `Observations.receiver_m`, `level_db` (n,) mean level, `count` (n,) how many
-    were averaged, `squares` (n,) sum of squares about that mean [dB^2]. Not detected: `missed` (m,) rows and
-    `missed_count` (m,). A position where some were detected and some were not is in both.
+    device: its index, as the channel knows it. Detected: `seen` (n,) rows of `Observations.receiver_m`, `level_db`
+    (n,) mean level, `count` (n,) how many were averaged, `squares` (n,) sum of squares about that mean [dB^2]. Not
+    detected, if that can be used: `missed` (m,) rows and `missed_count` (m,). A position where some were detected
+    and some were not is in both. n_detected of n_links measurements were detected.
     """
 
+    device: int
     seen: np.ndarray
     level_db: np.ndarray
     count: np.ndarray
     squares: np.ndarray
     missed: np.ndarray
     missed_count: np.ndarray
+    n_detected: int
+    n_links: int
 
     @property
-    def n_detected(self) -> int:
-        """Measurements, not positions."""
-        return int(self.count.sum())
-
-    @property
-    def n_links(self) -> int:
-        return self.n_detected + int(self.missed_count.sum())
+    def usable(self) -> bool:
+        return len(self.seen) + len(self.missed) > 0
 
 
 @dataclass(frozen=True)
@@ -46,13 +45,14 @@ class Observations:
 
 
 def merge_repeats(
-    receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarray, n_devices: int, *, use_missed: bool
+    receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarray, devices: np.ndarray, *, use_missed: bool
 ) -> Observations:
-    """Merges the measurements of each device at each receiver position (equal to the millimetre).
+    """Merges the measurements of each of `devices` at each receiver position (equal to the millimetre).
 
-    receiver_m: (n, 3) [m]; device: (n,) in 0 … n_devices - 1; level_db: (n,), NaN = not detected. Without
-    `use_missed` (no limit of detection is known) links that were not detected are left out.
-    Raises BadInput for shapes that disagree, positions that are not finite, infinite levels, unknown devices.
+    receiver_m: (n, 3) [m]; device: (n,) int; level_db: (n,), NaN = not detected; devices: (k,) int, those wanted:
+    rows of others are not used. Without `use_missed` (no limit of detection is known) links that were not detected
+    are counted and left out.
+    Raises BadInput for shapes that disagree, positions that are not finite, infinite levels.
     """
     receiver_m, level_db = np.asarray(receiver_m, float), np.asarray(level_db, float)
     device = np.asarray(device)
@@ -62,33 +62,33 @@ def merge_repeats(
             f"receiver positions {receiver_m.shape}, devices {device.shape} and levels {level_db.shape} do not "
             "fit together: expected (n, 3), (n,) and (n,)"
         )
-    if n and not np.issubdtype(device.dtype, np.integer):
-        raise BadInput(f"devices are given as {device.dtype}, expected integers from 0 to {n_devices - 1}")
-    if n and not 0 <= device.min() <= device.max() < n_devices:
+    for row in np.flatnonzero(~np.isfinite(receiver_m).all(axis=1))[:1]:
         raise BadInput(
-            f"measurements name devices {device.min()} to {device.max()}, allowed are 0 to {n_devices - 1}"
+            f"the receiver's position in row {row} is {receiver_m[row].tolist()}: x, y and z must be finite "
+            "numbers [m]; fill it in or leave the row out"
         )
-    for bad, what in ((~np.isfinite(receiver_m).all(axis=1), "receiver position"), (np.isinf(level_db), "level")):
-        if bad.any():
-            row = int(np.flatnonzero(bad)[0])
-            value = receiver_m[row].tolist() if what == "receiver position" else level_db[row]
-            raise BadInput(f"the {what} in row {row} is {value}: finite numbers are allowed; leave the row out")
-    if n == 0:
-        nothing = [_merge(np.empty(0, int), np.empty(0), use_missed) for _ in range(n_devices)]
-        return Observations(np.empty((0, 3)), nothing)
+    for row in np.flatnonzero(np.isinf(level_db))[:1]:
+        raise BadInput(f"the level in row {row} is {level_db[row]} dB: allowed are finite numbers, or blank")
+    rows = np.isin(device, devices)
+    receiver_m, device, level_db = receiver_m[rows], device[rows], level_db[rows]
     _, first, position = np.unique(
-        np.round(receiver_m / SAME_POSITION_M).astype(np.int64), axis=0, return_index=True, return_inverse=True
+        np.round(receiver_m / SAME_POSITION_M).astype(np.int64),
+        axis=0,
+        return_index=True,
+        return_inverse=True,
     )
     position = position.ravel()
-    devices = [_merge(position[device == k], level_db[device == k], use_missed) for k in range(n_devices)]
-    return Observations(receiver_m[first], devices)
+    merged = [_merge(k, position[device == k], level_db[device == k], use_missed) for k in devices]
+    return Observations(receiver_m[first], merged)
 
 
-def _merge(position: np.ndarray, level_db: np.ndarray, use_missed: bool) -> DeviceObservations:
+def _merge(device: int, position: np.ndarray, level_db: np.ndarray, use_missed: bool) -> DeviceObservations:
     detected = ~np.isnan(level_db)
     seen, group, count = np.unique(position[detected], return_inverse=True, return_counts=True)
     level = level_db[detected]
     mean = np.bincount(group, level, len(seen)) / np.maximum(count, 1)
     squares = np.bincount(group, (level - mean[group]) ** 2, len(seen))
     missed, missed_count = np.unique(position[~detected & use_missed], return_counts=True)
-    return DeviceObservations(seen, mean, count, squares, missed, missed_count)
+    return DeviceObservations(
+        int(device), seen, mean, count, squares, missed, missed_count, int(detected.sum()), len(level_db)
+    )

@@ -79,11 +79,12 @@ class Scene:
                                    "is inside a building; move it or raise altitude_m")
 
     def content_hash(self) -> str:
-        """SHA-256 over what decides a gain: geometry, materials, radio and device positions."""
+        """SHA-256 over what decides a gain map: geometry, materials, frequency, sensitivity and device positions."""
         digest = hashlib.sha256()
         for path in (self.xml_path, *sorted(self.folder.glob("meshes/*"))):
             digest.update(path.name.encode() + b"\0" + path.read_bytes())
-        digest.update(self.config.radio.model_dump_json().encode())
+        radio = self.config.radio
+        digest.update(f"{radio.frequency_hz!r},{radio.tx_power_dbm!r},{radio.sensitivity_dbm!r};".encode())
         for device in self.config.devices:
             digest.update(f"{device.device},{device.x_m!r},{device.y_m!r},{device.z_m!r};".encode())
         return digest.hexdigest()

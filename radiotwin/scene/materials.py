@@ -13,26 +13,43 @@ ITU_TABLE: dict[str, tuple[tuple[float, float, float, float, float, float], ...]
     "concrete": ((1, 100, 5.24, 0, 0.0462, 0.7822), (110, 330, 5.17, 0, 0.0145, 1.09)),
     "brick": ((1, 40, 3.91, 0, 0.0238, 0.16), (110, 330, 4.15, 0, 0.0006, 1.5712)),
     "plasterboard": (
-        (1, 100, 2.73, 0, 0.0085, 0.9395), (110, 330, 2.56, 0, 0.0001, 1.7799), (100, 400, 2.65, 0, 0.0002, 1.598),
+        (1, 100, 2.73, 0, 0.0085, 0.9395),
+        (110, 330, 2.56, 0, 0.0001, 1.7799),
+        (100, 400, 2.65, 0, 0.0002, 1.598),
     ),
     "wood": (
-        (0.001, 100, 1.99, 0, 0.0047, 1.0718), (110, 330, 1.82, 0, 0.004, 1.0761),
+        (0.001, 100, 1.99, 0, 0.0047, 1.0718),
+        (110, 330, 1.82, 0, 0.004, 1.0761),
         (100, 400, 2.1183, 0, 0.0055, 1.1113),
     ),
     "glass": (
-        (0.1, 100, 6.31, 0, 0.0036, 1.3394), (220, 450, 5.79, 0, 0.0004, 1.658),
+        (0.1, 100, 6.31, 0, 0.0036, 1.3394),
+        (220, 450, 5.79, 0, 0.0004, 1.658),
         (100, 400, 6.5767, 0, 0.0012, 1.4697),
     ),
     "clear_acrylic": ((110, 330, 2.58, 0, 0.0001, 1.6524),),
     "ceiling_board": (
-        (1, 100, 1.48, 0, 0.0011, 1.075), (220, 450, 1.52, 0, 0.0029, 1.029), (100, 400, 1.2567, 0, 0.00013, 1.454),
+        (1, 100, 1.48, 0, 0.0011, 1.075),
+        (220, 450, 1.52, 0, 0.0029, 1.029),
+        (100, 400, 1.2567, 0, 0.00013, 1.454),
     ),
     "chipboard": ((1, 100, 2.58, 0, 0.0217, 0.78), (100, 200, 2.16, 0, 0.0023, 1.359)),
-    "plywood": ((1, 40, 2.71, 0, 0.33, 0), (110, 330, 1.94, 0, 0.0067, 0.9982), (100, 400, 2.17, 0, 0.0063, 1.045)),
-    "marble": ((1, 60, 7.074, 0, 0.0055, 0.9262), (110, 330, 7.94, 0, 0.0001, 1.733), (100, 400, 8.62, 0, 0.0027, 1.15)),
+    "plywood": (
+        (1, 40, 2.71, 0, 0.33, 0),
+        (110, 330, 1.94, 0, 0.0067, 0.9982),
+        (100, 400, 2.17, 0, 0.0063, 1.045),
+    ),
+    "marble": (
+        (1, 60, 7.074, 0, 0.0055, 0.9262),
+        (110, 330, 7.94, 0, 0.0001, 1.733),
+        (100, 400, 8.62, 0, 0.0027, 1.15),
+    ),
     "floorboard": (
-        (50, 100, 3.66, 0, 0.0044, 1.3515), (220, 300, 5.27, 0, 2.22e-17, 7.3413), (300, 400, 5.27, 0, 0.0003, 2.0298),
-        (400, 450, 5.27, 0, 49.8726, 0), (100, 400, 3.1575, 0, 0.001675, 1.32775),
+        (50, 100, 3.66, 0, 0.0044, 1.3515),
+        (220, 300, 5.27, 0, 2.22e-17, 7.3413),
+        (300, 400, 5.27, 0, 0.0003, 2.0298),
+        (400, 450, 5.27, 0, 49.8726, 0),
+        (100, 400, 3.1575, 0, 0.001675, 1.32775),
     ),
     "vinyl_tile": ((1, 40, 3.62, 0, 0.0051, 0.8422),),
     "carpet_tile": ((1, 40, 2.08, 0, 0.0009, 0.82),),
@@ -71,7 +88,7 @@ class Material:
 
 
 def itu_name(text: str) -> str | None:
-    """Key of `ITU_TABLE` that a material's name stands for (`mat-itu_wet_ground`, `itu-metal`, `brick`), or None.
+    """Key of `ITU_TABLE` that a name like `itu-metal` or `brick` stands for, or None.
 
     >>> itu_name("mat-itu_wet_ground")
     'wet_ground'
@@ -101,8 +118,8 @@ def itu_material(text: str, **settings) -> Material:
 def permittivity(name: str, frequency_hz: float) -> tuple[float, float, bool]:
     """Constants of an ITU material (ITU-R P.2040-4, section 2.1.4).
 
-    Outside the frequency ranges of its fit, the material is taken at the nearest end of the nearest range: the
-    power laws are not extrapolated, since the measurements behind them say nothing there.
+    Outside the frequency ranges of its fit, the material is taken at the nearest end of the nearest range:
+    the power laws are not extrapolated, since the measurements behind them say nothing there.
 
     Args:
         name: `concrete`, `itu_concrete`, ...
@@ -138,7 +155,7 @@ def ranges_text(name: str) -> str:
 
 
 def constants(material: Material, frequency_hz: float) -> tuple[float, float, bool]:
-    """Relative permittivity, conductivity [S/m] and whether the ITU table covers the frequency, for any material."""
+    """Relative permittivity and conductivity [S/m] of any material, and whether ITU covers the frequency."""
     if material.itu is not None:
         return permittivity(material.itu, frequency_hz)
     return material.relative_permittivity, material.conductivity_s_per_m, True
@@ -155,5 +172,10 @@ def traceable(material: Material, frequency_hz: float) -> Material:
     relative_permittivity, conductivity, in_range = permittivity(material.itu, frequency_hz)
     if in_range and permittivity(material.itu, SIONNA_LOAD_FREQUENCY_HZ)[2]:
         return material
-    return replace(material, name=f"{material.name}-fixed", itu=None, relative_permittivity=relative_permittivity,
-                   conductivity_s_per_m=conductivity)
+    return replace(
+        material,
+        name=f"{material.name}-fixed",
+        itu=None,
+        relative_permittivity=relative_permittivity,
+        conductivity_s_per_m=conductivity,
+    )

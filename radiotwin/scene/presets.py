@@ -1,7 +1,8 @@
 """The scenes that ship: two after the maps of Chen et al. 2023, and a small one for the demonstration."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import trimesh
@@ -11,6 +12,8 @@ from radiotwin.files import atomic_folder
 from radiotwin.scene.config import (DeviceConfig, Extent, LatticeConfig, MissionConfig, SceneConfig, UavConfig,
                                     write_config)
 from radiotwin.scene.generator import CityParameters, building_meshes, draw_buildings
+from radiotwin.scene.materials import Material
+from radiotwin.scene.writer import CityShape, write_city
 
 ANTENNA_HEIGHT_M = 1.5
 GROUND_MARGIN_M = 100.0
@@ -98,25 +101,53 @@ def build_preset(name: str, folder: Path | str) -> None:
     """Write the scene folder of a preset.
 
     Raises:
-        BadInput: no such preset, or the folder cannot be written.
+        BadInput: no such preset, or the folder cannot be written or holds something else.
     """
-    from radiotwin.scene.materials import Material
-    from radiotwin.scene.writer import CityShape, write_city
+    from radiotwin.scene import Scene
+    from radiotwin.scene.build import check_target
+    from radiotwin.scene.preview import draw_preview
 
-    preset = _find(name)
+    preset, folder = _find(name), Path(folder)
+    check_target(folder)
     margin = GROUND_MARGIN_M
     ground = trimesh.Trimesh(
         vertices=[[-margin, -margin, 0], [preset.city.width_m + margin, -margin, 0],
                   [preset.city.width_m + margin, preset.city.depth_m + margin, 0],
                   [-margin, preset.city.depth_m + margin, 0]],
         faces=[[0, 1, 2], [0, 2, 3]], process=False)
-    shapes = [CityShape("ground", ground, Material("asphalt_concrete", itu="asphalt_concrete"))]
     concrete = Material("concrete", itu="concrete")
+    shapes = [CityShape("ground", ground, Material("asphalt_concrete", itu="asphalt_concrete"))]
     shapes += [CityShape(f"building_{i:03d}", mesh, concrete)
                for i, mesh in enumerate(building_meshes(preset_boxes(name)))]
     with atomic_folder(folder) as temporary:
         write_city(temporary, shapes)
         write_config(preset_config(name), temporary / "scene.toml")
+        draw_preview(Scene.load(temporary), temporary / "preview.png")
+
+
+def build_preset_scene(name: str, folder: Path | str, check_only: bool = False):
+    """Write the scene folder of a preset, and report on it as on any other city.
+
+    Args:
+        name: of the preset.
+        folder: to write.
+        check_only: build it aside, and leave nothing behind.
+
+    Returns:
+        the `radiotwin.scene.report.BuildReport`.
+    """
+    from radiotwin.scene.build import BuildOptions, build_scene
+
+    if check_only:
+        with TemporaryDirectory() as aside:
+            return replace(build_preset_scene(name, Path(aside) / name), folder=None)
+    build_preset(name, folder)
+    config = preset_config(name)
+    report = build_scene(Path(folder) / "city.xml", folder, BuildOptions(frequency_hz=config.radio.frequency_hz),
+                         check_only=True)
+    return replace(report, source=f"preset:{name}", folder=Path(folder), extent_m=config.extent.bounds,
+                   altitudes_m=tuple(config.lattice.altitudes_m), devices=len(config.devices),
+                   uavs=len(config.uavs))
 
 
 def _find(name: str) -> Preset:

@@ -5,11 +5,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import trimesh
 
 from radiotwin.progress import progress
 from radiotwin.scene.materials import Material
+from radiotwin.scene.ply import write_ply
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +49,8 @@ def write_city(folder: Path | str, shapes: Sequence[CityShape]) -> None:
 
 
 def _material_element(material: Material) -> ET.Element:
-    # The identifier must not begin with "itu_": Sionna RT rebuilds such a material from its type and thickness
-    # and forgets its scattering.
+    # The identifier must not begin with "itu_": Sionna RT rebuilds such a material from its type and
+    # thickness and forgets its scattering.
     if material.itu is not None:
         element = ET.Element("bsdf", type="itu-radio-material", id=f"mat-{material.name}")
         ET.SubElement(element, "string", name="type", value=material.itu)
@@ -77,25 +77,3 @@ def _shape_element(shape: CityShape) -> ET.Element:
     ET.SubElement(element, "boolean", name="face_normals", value="true")
     ET.SubElement(element, "ref", id=f"mat-{shape.material.name}", name="bsdf")
     return element
-
-
-def write_ply(path: Path, vertices_m: np.ndarray, faces: np.ndarray) -> None:
-    """Write triangles as a binary little-endian PLY file; equal meshes give equal bytes.
-
-    Args:
-        path: file to write.
-        vertices_m: (v, 3) positions, stored in single precision.
-        faces: (f, 3) indices of vertices.
-    """
-    header = (
-        "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(vertices_m)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    rows = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])
-    rows["count"] = 3
-    rows["index"] = faces
-    with open(path, "wb") as file:
-        file.write(header.encode("ascii"))
-        file.write(np.ascontiguousarray(vertices_m, dtype="<f4").tobytes())
-        file.write(rows.tobytes())

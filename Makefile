@@ -1,0 +1,73 @@
+# Set-up and checks. `make demo` and `make test` need nothing but make and Python >= 3.11.
+#
+#   make demo PYTHON=python3.12         another Python
+#   make demo PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"
+#                                       the CPU build of torch (on Linux, PyPI's is the CUDA build: gigabytes)
+#   make test TESTS=tests/channel       a part of the tests
+
+VENV ?= .venv
+PIP_ARGS ?=
+TESTS ?=
+
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11))
+PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
+	if $$python -c '$(NEW_ENOUGH)' 2> /dev/null; then echo $$python; break; fi; done)
+
+SUDO := $(if $(filter 0,$(shell id -u)),,sudo -n)
+CAN_APT := command -v apt-get > /dev/null && $(SUDO) true 2> /dev/null
+APT_INSTALL := $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=120 install -y -q
+
+.PHONY: help demo test lint bench llvm clean
+
+help:
+	@echo "make demo    set up, then the whole chain on a small city"
+	@echo "make test    set up, then every test"
+	@echo "make lint    ruff"
+	@echo "make bench   the benchmarks"
+	@echo "make llvm    set up only: the package and a libLLVM for tracing"
+	@echo "make clean   remove the environment and what the tools left"
+
+demo: llvm
+	$(BIN)/radiotwin demo
+
+test: $(INSTALLED)
+	@$(MAKE) --no-print-directory llvm \
+	|| echo "make test: without a libLLVM the tests that trace rays are skipped; all the others run." >&2
+	$(BIN)/python -m pytest $(TESTS)
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check
+
+bench: llvm
+	for benchmark in benchmarks/bench_*.py; do $(BIN)/python $$benchmark || exit 1; done
+
+# The second run does nothing, until what is to be installed has changed.
+$(INSTALLED): pyproject.toml constraints.txt
+	@$(BIN)/python -m pip --version > /dev/null 2>&1 || $(MAKE) --no-print-directory $(VENV)
+	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e '.[test]'
+	@touch $@
+
+# Debian and Ubuntu keep the module venv in a package of its own.
+.PHONY: $(VENV)
+$(VENV):
+	@if [ -z "$(PYTHON)" ] || ! $(PYTHON) -c '$(NEW_ENOUGH)'; then \
+		echo "radiotwin needs Python 3.11 or newer, and $(or $(PYTHON),python3) is not: install one," \
+			"or name it with PYTHON=/path/to/python3.11" >&2; exit 1; fi
+	@$(PYTHON) -m venv --clear $(VENV) || { $(CAN_APT) && $(SUDO) apt-get update -q \
+		&& $(APT_INSTALL) $(notdir $(PYTHON))-venv && $(PYTHON) -m venv --clear $(VENV); }
+
+# Tracing needs a libLLVM that Dr.Jit can use. The package finds one or says how to install it; with apt, and the
+# right to use it without a question, it is installed here. Who names one in DRJIT_LIBLLVM_PATH has that one.
+llvm: $(INSTALLED)
+	@if ! $(BIN)/python -m radiotwin.llvm > /dev/null 2>&1 && [ -z "$$DRJIT_LIBLLVM_PATH" ] \
+		&& $(CAN_APT); then \
+		$(SUDO) apt-get update -q; \
+		for package in libllvm19 libllvm20 libllvm21 libllvm18 libllvm17; do \
+			$(APT_INSTALL) $$package && break; done; fi >&2 || true
+	@$(BIN)/python -m radiotwin.llvm
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	find radiotwin marl tests benchmarks -name __pycache__ -prune -exec rm -rf {} +

@@ -1,0 +1,51 @@
+"""What the commands print with."""
+
+import warnings
+
+from rich.console import Console
+from rich.table import Table
+
+console = Console(highlight=False)
+error_console = Console(stderr=True, highlight=False)
+
+
+def complain(message: str) -> None:
+    """One message on standard error, as it is: no markup, no wrapping inside paths."""
+    error_console.print("[bold red]radiotwin:[/] ", end="")
+    error_console.print(message, markup=False, soft_wrap=True)
+
+
+def say(message: str) -> None:
+    """One line on standard output."""
+    console.print(message, markup=False, soft_wrap=True)
+
+
+def show_warnings_plainly() -> None:
+    """Warnings of the library as one line each, without a source line."""
+    def show(message, category, filename, lineno, file=None, line=None):
+        if issubclass(category, UserWarning) and "radiotwin" in filename:
+            error_console.print("[yellow]warning:[/] ", end="")
+            error_console.print(str(message), markup=False, soft_wrap=True)
+    warnings.showwarning = show
+
+
+def print_rows(title: str, columns: dict[str, str], rows: list[list]) -> None:
+    """A table.
+
+    Args:
+        title: above it.
+        columns: heading -> `left` or `right`.
+        rows: cells; floats are printed with two decimals, NaN as a dash.
+    """
+    table = Table(title=title, title_justify="left", title_style="bold")
+    for heading, justify in columns.items():
+        table.add_column(heading, justify=justify)
+    for row in rows:
+        table.add_row(*(_text(cell) for cell in row))
+    console.print(table)
+
+
+def _text(cell) -> str:
+    if isinstance(cell, float):
+        return "–" if cell != cell else f"{cell:.2f}"
+    return str(cell)

@@ -1,0 +1,108 @@
+"""Commands that learn from measurements and judge what was learned: fit, map, compare."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from radiotwin.cli.console import print_rows, say, show_warnings_plainly
+
+MeasurementFile = Annotated[Path, typer.Argument(
+    metavar="MEASUREMENTS", help="measurements.csv, .csv.gz or .parquet; devices.csv lies beside it.")]
+SceneOption = Annotated[Path, typer.Option(help="Scene folder: the 3D map and where UAVs may fly.")]
+
+
+def add_commands(app: typer.Typer) -> None:
+    app.command("fit")(fit)
+    app.command("map")(map_)
+    app.command("compare")(compare)
+
+
+def fit(
+    measurements: MeasurementFile,
+    scene: SceneOption,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the twin.")] = Path("twin"),
+    model: Annotated[str, typer.Option(
+        help="segmented_nn, segmented_log_distance, log_distance or regression_kriging.")] = "segmented_nn",
+    devices: Annotated[Path | None, typer.Option(help="Table of devices [devices.csv beside the file].")] = None,
+    start: Annotated[Path | None, typer.Option(help="An earlier twin, to start the search from.")] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+) -> None:
+    """Learn the channel from the anchors, then find the unknown devices: the twin."""
+    from radiotwin.measurements import read_measurements
+    from radiotwin.scene import Scene
+    from radiotwin.twin import Twin, fit_twin
+
+    show_warnings_plainly()
+    data, world = read_measurements(measurements, devices), Scene.load(scene)
+    earlier = Twin.load(start) if start else None
+    twin = fit_twin(data, world, model=model, seed=seed, start=earlier)
+    twin.save(out)
+    print_rows(f"Twin {out} ({model})",
+               {"device": "left", "role": "left", "x [m]": "right", "y [m]": "right", "90 % radius [m]": "right",
+                "note": "left"},
+               [[d.device, d.role, d.x_m, d.y_m, d.credible_radius_m, _note(d)] for d in twin.devices])
+
+
+def _note(device) -> str:
+    if not device.located:
+        return "not located: the data do not say where it is"
+    if device.second_mode:
+        x_m, y_m, weight = device.second_mode
+        return f"perhaps at ({x_m:.0f}, {y_m:.0f}), {weight:.0%}"
+    return ""
+
+
+def map_(
+    twin: Annotated[Path, typer.Argument(metavar="TWIN", help="Folder of a twin, as `fit` makes it.")],
+    scene: SceneOption,
+    out: Annotated[Path | None, typer.Option(
+        "--out", "-o", help="Radio map: .nc (all), .csv (a row a link) or .png (a picture) [TWIN.nc].")] = None,
+) -> None:
+    """Predict the gain of every device over the scene's lattice."""
+    from radiotwin.export import EXPORTERS, check_format
+    from radiotwin.scene import Scene
+    from radiotwin.twin import Twin
+
+    out = out or twin.with_name(f"{twin.name}.nc")
+    check_format(out)
+    world = Scene.load(scene)
+    radio_map = Twin.load(twin).radio_map(world)
+    EXPORTERS[out.suffix](radio_map, world, out)
+    say(f"wrote {out}: {len(radio_map.devices)} devices on {radio_map.lattice.shape} positions (z, y, x)")
+
+
+def compare(
+    measurements: MeasurementFile,
+    scene: SceneOption,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the tables and figures.")] = Path("comparison"),
+    truth: Annotated[str | None, typer.Option(
+        help="Judge on a whole map, too: traced (SCENE/truth.nc), segmented, or a radio map.")] = None,
+    held_out: Annotated[int, typer.Option(help="Flights, the last ones, that no model is fitted to.")] = 1,
+    devices: Annotated[Path | None, typer.Option(help="Table of devices [devices.csv beside the file].")] = None,
+    also: Annotated[list[Path] | None, typer.Option(
+        help="A twin's folder, or (with --truth) a radio map, to be judged beside the models; may be repeated.")] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+) -> None:
+    """Hold all channel models against flights they have not seen, and against the truth map where there is one."""
+    from radiotwin.cli.world import read_truth
+    from radiotwin.compare import compare_models, split_flights
+    from radiotwin.comparison_output import judge_also, write_comparison
+    from radiotwin.measurements import read_measurements
+    from radiotwin.scene import Scene
+
+    show_warnings_plainly()
+    world = Scene.load(scene)
+    train, test = split_flights(read_measurements(measurements, devices), held_out)
+    truth_map = read_truth(world, truth) if truth else None
+    twins, maps = judge_also(also or [], truth_map)
+    comparison = compare_models(train, test, world, truth_map, seed=seed, twins=twins, maps=maps)
+    write_comparison(comparison, world, truth_map, out)
+    print_comparison(comparison)
+    say(f"wrote {out}")
+
+
+def print_comparison(comparison) -> None:
+    """The tables of a comparison on the terminal."""
+    for title, columns, rows in comparison.tables():
+        print_rows(title, columns, rows)

@@ -1,0 +1,49 @@
+"""What goes into localisation beside the data, and what comes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from radiotwin.localize.likelihood import CHUNK_LINKS
+
+
+@dataclass(frozen=True)
+class LocalizeSettings:
+    """How the search is done.
+
+    scan_step_m: cell of the first scan over the map [m]; scan_links: links that it may look at, beyond which its
+    cells grow; swarms: of each device; particles: of each swarm; iterations: of every swarm; allow_indoor:
+    whether a device may be inside a building; chunk_links: links in memory at once (about 100 bytes each).
+    """
+
+    scan_step_m: float = 5.0
+    scan_links: int = 15_000_000
+    swarms: int = 6
+    particles: int = 12
+    iterations: int = 25
+    allow_indoor: bool = False
+    chunk_links: int = CHUNK_LINKS
+
+
+@dataclass(frozen=True)
+class DeviceEstimate:
+    """Where a device is.
+
+    x_m, y_m: posterior mean of the heaviest mode; z_m: as given. credible_radius_m: radius about it that holds
+    90 % of the posterior, second modes included. second_mode: (x_m, y_m, weight) of another mode at least 20 m
+    away with at least 5 % of the posterior, or None. n_detected of n_links measurements were detected.
+    design_effect: how many links count as one (1 = independent). located: False where the data do not say where
+    the device is: it was never detected, or 90 % of the posterior cover half the map or more. Position and radius
+    are then the best that the links which were *not* detected tell, or NaN and infinity without any.
+    """
+
+    device: int
+    x_m: float
+    y_m: float
+    z_m: float
+    credible_radius_m: float
+    second_mode: tuple[float, float, float] | None
+    n_detected: int
+    n_links: int
+    design_effect: float
+    located: bool

@@ -1,0 +1,243 @@
+"""Any Mitsuba or Sionna RT city into a checked scene folder that needs nothing outside itself."""
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from radiotwin.errors import BadInput
+from radiotwin.files import atomic_folder
+from radiotwin.scene import Scene
+from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.config import Extent, LatticeConfig, SceneConfig, parse_config, write_config
+from radiotwin.scene.importer import ImportedCity, import_city
+from radiotwin.scene.material_mapping import settle
+from radiotwin.scene.materials import constants
+from radiotwin.scene.placement import (
+    BuiltGrid,
+    building_bounds,
+    building_tops,
+    choose_altitudes,
+    choose_extent,
+    choose_step,
+    place_devices,
+    place_uavs,
+)
+from radiotwin.scene.preview import draw_preview
+from radiotwin.scene.problems import Problem
+from radiotwin.scene.report import BuildReport, MaterialUse
+from radiotwin.scene.sources import find_source, scene_name
+from radiotwin.scene.writer import CityShape, write_city
+
+SCENE_FILES = {"scene.toml", "city.xml", "meshes", "preview.png"}
+
+
+@dataclass(frozen=True)
+class BuildOptions:
+    """How to read a city, and what to add to it.
+
+    Attributes:
+        frequency_hz: of the scene's radio [Hz].
+        materials: name of a material in the file -> ITU material to take for it.
+        scale: factor that turns the file's unit into metres; None: metres, with a warning where it looks
+            otherwise.
+        up: axis of the file that points up, "x", "y" or "z"; None: z, with an error where it looks otherwise.
+        bbox: (x_min, y_min, x_max, y_max) [m] in the file's frame, after `scale` and `up`: only shapes that
+            reach into it are kept, and it becomes the extent.
+        devices: how many to place on free ground.
+        uavs: how many to place near the middle.
+        seed: of the placement.
+    """
+
+    frequency_hz: float = 2.4e9
+    materials: Mapping[str, str] | None = None
+    scale: float | None = None
+    up: str | None = None
+    bbox: tuple[float, float, float, float] | None = None
+    devices: int = 0
+    uavs: int = 3
+    seed: int = 0
+
+    def check(self) -> None:
+        """Raise BadInput for a value that cannot be."""
+        if self.scale is not None and not 0 < self.scale < float("inf"):
+            raise BadInput(f"scale {self.scale:g} is not possible; give a positive factor (feet: 0.3048)")
+        if self.up not in (None, "x", "y", "z"):
+            raise BadInput(f"up axis {self.up!r} is not possible; give x, y or z")
+        if self.devices < 0 or self.uavs < 0:
+            raise BadInput(f"{min(self.devices, self.uavs)} devices or UAVs are not possible; give 0 or more")
+        if self.bbox is not None:
+            x_min, y_min, x_max, y_max = self.bbox
+            if not (np.isfinite(self.bbox).all() and x_min < x_max and y_min < y_max):
+                raise BadInput(
+                    f"bbox {self.bbox} is not possible; give x_min,y_min,x_max,y_max in metres, the "
+                    "minimum below the maximum"
+                )
+
+
+def build_scene(
+    source: Path | str,
+    out_folder: Path | str,
+    options: BuildOptions = BuildOptions(),
+    check_only: bool = False,
+) -> BuildReport:
+    """Read a city, check it, put right what can be, and write a scene folder.
+
+    Args:
+        source: path of a Mitsuba or Sionna RT XML file, or `sionna:NAME`.
+        out_folder: scene folder to write; a scene that is already in it is replaced.
+        options: see there.
+        check_only: write nothing, and return errors in the report instead of raising them.
+
+    Returns:
+        The report; its `tracing_would_fail` says whether an error was found.
+
+    Raises:
+        BadInput: the source cannot be read; an option is impossible; or tracing would fail (unless
+            `check_only`).
+    """
+    out_folder = Path(out_folder)
+    options.check()
+    path = find_source(source)
+    if not check_only:
+        check_target(out_folder)
+    city = import_city(path, options.materials or {}, options.scale, options.up, options.bbox)
+    errors = [problem.message for problem in city.problems if problem.severity == "error"]
+    if errors and not check_only:
+        raise BadInput("\n".join([f"{source}: tracing would fail:", *errors]))
+    if city.surfaces is None or None in city.materials:
+        return _unusable(str(source), city, options.frequency_hz)
+    shapes, material_problems = _city_shapes(city, options.frequency_hz)
+    city.problems.extend(material_problems)
+    plan = _plan(city, scene_name(source), str(source), options)
+    if not check_only:
+        with atomic_folder(out_folder) as folder:
+            write_city(folder, shapes)
+            write_config(plan.config, folder / "scene.toml")
+            draw_preview(Scene.load(folder), folder / "preview.png")
+    return _report(city, shapes, plan, str(source), None if check_only else out_folder)
+
+
+def check_target(folder: Path) -> None:
+    """Raise BadInput when the folder holds anything but a scene, so that nothing else is overwritten."""
+    if not folder.is_dir():
+        return
+    foreign = sorted({path.name for path in folder.iterdir()} - SCENE_FILES)
+    if foreign:
+        raise BadInput(
+            f"{folder} holds {', '.join(foreign[:5])}, which a new scene would erase; move it away or choose "
+            "another output folder"
+        )
+
+
+def _unusable(source: str, city: ImportedCity, frequency_hz: float) -> BuildReport:
+    """Report on a city that could not be made sense of as far as its extent and materials."""
+    triangles = 0 if city.surfaces is None else len(city.surfaces.faces)
+    return BuildReport(
+        source,
+        None,
+        frequency_hz,
+        len(city.names),
+        triangles,
+        (0.0, 0.0, 0.0, 0.0),
+        0.0,
+        "",
+        0.0,
+        (),
+        0,
+        0,
+        (),
+        tuple(city.problems),
+    )
+
+
+def _city_shapes(city: ImportedCity, frequency_hz: float) -> tuple[list[CityShape], list[Problem]]:
+    written, problems = settle(city.materials, frequency_hz, {name.lower() for name in city.names})
+    shapes = [
+        CityShape(name, trimesh.Trimesh(vertices, faces, process=False), written[material])
+        for name, material, (vertices, faces) in zip(city.names, city.materials, city.surfaces.meshes())
+    ]
+    return shapes, problems
+
+
+@dataclass(frozen=True, eq=False)
+class _Plan:
+    config: SceneConfig
+    built_fraction: float
+    tallest_m: float
+    tallest: str
+
+
+def _plan(city: ImportedCity, name: str, source: str, options: BuildOptions) -> _Plan:
+    surfaces, solid = city.surfaces, ~city.ground
+    if options.bbox is None:
+        bounds = building_bounds(surfaces, solid)
+        extent = choose_extent(bounds)
+    else:
+        x_min, y_min, x_max, y_max = np.array(options.bbox) + np.tile(city.moved_m[:2], 2)
+        bounds = x_min, x_max, y_min, y_max
+        extent = Extent(x_min_m=x_min, x_max_m=x_max, y_min_m=y_min, y_max_m=y_max)
+    buildings = CityMap(surfaces.vertices, surfaces.faces[solid]) if solid.any() else None
+    ground = CityMap(surfaces.vertices, surfaces.faces[city.ground]) if city.ground.any() else None
+    tops_m, heights_m = building_tops(surfaces, solid, ground)
+    highest = int(heights_m.argmax())
+    lattice = LatticeConfig(step_m=choose_step(bounds), altitudes_m=choose_altitudes(tops_m[heights_m > 0]))
+    grid = BuiltGrid.over(extent, buildings)
+    config = {
+        "name": name,
+        "radio": {"frequency_hz": options.frequency_hz},
+        "extent": extent,
+        "lattice": lattice,
+        "devices": place_devices(options.devices, grid, ground, np.random.default_rng(options.seed)),
+        "uavs": place_uavs(options.uavs, extent, lattice, buildings),
+        "provenance": _provenance(city, source, options),
+    }
+    return _Plan(
+        parse_config(config, Path("scene.toml")),
+        grid.fraction,
+        float(heights_m[highest]),
+        city.names[highest] if solid.any() else "",
+    )
+
+
+def _provenance(city: ImportedCity, source: str, options: BuildOptions) -> dict[str, str]:
+    known = {"source": source, "seed": str(options.seed)}
+    if any(city.moved_m):
+        known["moved_m"] = ", ".join(f"{value:.3f}" for value in city.moved_m)
+    for name in ("scale", "up", "bbox", "materials"):
+        value = getattr(options, name)
+        if value is not None:
+            known[name] = str(value)
+    return known
+
+
+def _report(
+    city: ImportedCity, shapes: list[CityShape], plan: _Plan, source: str, folder: Path | None
+) -> BuildReport:
+    frequency_hz = plan.config.radio.frequency_hz
+    uses = []
+    declared = dict(zip((shape.material for shape in shapes), city.materials))
+    for material, count in Counter(shape.material for shape in shapes).most_common():
+        origin = declared[material]
+        kind = f"ITU {origin.itu}" if origin.itu else "own constants"
+        uses.append(MaterialUse(material.name, kind, count, *constants(origin, frequency_hz)))
+    order = {"error": 0, "warning": 1, "fixed": 2}
+    return BuildReport(
+        source,
+        folder,
+        frequency_hz,
+        len(shapes),
+        sum(len(shape.mesh.faces) for shape in shapes),
+        plan.config.extent.bounds,
+        plan.tallest_m,
+        plan.tallest,
+        plan.built_fraction,
+        tuple(plan.config.lattice.altitudes_m),
+        len(plan.config.devices),
+        len(plan.config.uavs),
+        tuple(uses),
+        tuple(sorted(city.problems, key=lambda problem: order[problem.severity])),
+    )

@@ -1,0 +1,127 @@
+"""What was found in a city, and its printed form."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from radiotwin.scene.problems import Problem
+
+_COLOURS = {"error": "bold red", "warning": "yellow", "fixed": "green"}
+
+
+@dataclass(frozen=True)
+class MaterialUse:
+    """A material at the scene's frequency.
+
+    Attributes:
+        name: in `city.xml`.
+        kind: `ITU concrete`, or `own constants`.
+        shapes: how many shapes are made of it.
+        relative_permittivity, conductivity_s_per_m: at the scene's frequency.
+        in_range: False where the ITU table does not cover the frequency.
+    """
+
+    name: str
+    kind: str
+    shapes: int
+    relative_permittivity: float
+    conductivity_s_per_m: float
+    in_range: bool
+
+
+@dataclass(frozen=True)
+class BuildReport:
+    """Result of `build_scene`.
+
+    Attributes:
+        source: as given.
+        folder: where the scene was written; None where it was only checked.
+        frequency_hz: of the scene [Hz].
+        shapes, triangles: as written.
+        extent_m: (x_min, x_max, y_min, y_max) of the lattice [m].
+        tallest_m: highest point of a building above the ground datum [m]; 0 without buildings.
+        tallest: name of its shape.
+        built_fraction: share of the extent's area under buildings.
+        altitudes_m: of the lattice [m].
+        devices, uavs: how many were placed.
+        materials: in use.
+        problems: errors first.
+    """
+
+    source: str
+    folder: Path | None
+    frequency_hz: float
+    shapes: int
+    triangles: int
+    extent_m: tuple[float, float, float, float]
+    tallest_m: float
+    tallest: str
+    built_fraction: float
+    altitudes_m: tuple[float, ...]
+    devices: int
+    uavs: int
+    materials: tuple[MaterialUse, ...]
+    problems: tuple[Problem, ...]
+
+    @property
+    def tracing_would_fail(self) -> bool:
+        return any(problem.severity == "error" for problem in self.problems)
+
+
+def print_report(report: BuildReport, console: Console) -> None:
+    """Print the report as tables, the problems last."""
+    x_min, x_max, y_min, y_max = report.extent_m
+    facts = Table(
+        title=f"Scene from {report.source}", show_header=False, title_justify="left", title_style="bold"
+    )
+    rows = [
+        ("shapes, triangles", f"{report.shapes:,}, {report.triangles:,}"),
+        (
+            "extent",
+            f"{x_max - x_min:.5g} × {y_max - y_min:.5g} m   (x {x_min:g} … {x_max:g}, y {y_min:g} … {y_max:g})",
+        ),
+        ("tallest building", f"{report.tallest_m:.1f} m   ({report.tallest})" if report.tallest else "none"),
+        ("built fraction", f"{report.built_fraction:.1%}"),
+        (
+            "lattice altitudes",
+            ", ".join(f"{altitude:g}" for altitude in report.altitudes_m)
+            + " m   (from 10 m above 95 % of the roofs)",
+        ),
+        ("devices, UAVs", f"{report.devices}, {report.uavs}"),
+    ]
+    for row in rows:
+        facts.add_row(*row)
+    console.print(facts)
+    if report.materials:
+        console.print(_material_table(report))
+    if not report.problems:
+        console.print("No problems found.", style="green")
+    for problem in report.problems:
+        console.print(f"{problem.severity:>7}", style=_COLOURS[problem.severity], end="  ")
+        console.print(problem.message, markup=False, highlight=False)
+
+
+def _material_table(report: BuildReport) -> Table:
+    table = Table(
+        title=f"Materials at {report.frequency_hz / 1e9:g} GHz", title_justify="left", title_style="bold"
+    )
+    for heading, justify in (
+        ("material", "left"),
+        ("kind", "left"),
+        ("shapes", "right"),
+        ("relative permittivity", "right"),
+        ("conductivity [S/m]", "right"),
+    ):
+        table.add_column(heading, justify=justify)
+    for use in report.materials:
+        mark = "" if use.in_range else " (out of range)"
+        table.add_row(
+            use.name,
+            use.kind + mark,
+            f"{use.shapes:,}",
+            f"{use.relative_permittivity:.3f}",
+            f"{use.conductivity_s_per_m:.4g}",
+        )
+    return table

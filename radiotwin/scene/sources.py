@@ -1,0 +1,63 @@
+"""Where a city comes from: a file, or a scene inside the installed sionna-rt package."""
+
+import re
+from importlib.util import find_spec
+from pathlib import Path
+
+from radiotwin.errors import BadInput
+
+
+def sionna_scenes() -> dict[str, Path]:
+    """XML files of the scenes that come with sionna-rt, by name; found without importing it."""
+    spec = find_spec("sionna")
+    folders = (
+        [] if spec is None else [Path(place) / "rt" / "scenes" for place in spec.submodule_search_locations]
+    )
+    return {
+        path.parent.name: path
+        for folder in folders
+        for path in sorted(folder.glob("*/*.xml"))
+        if path.stem == path.parent.name
+    }
+
+
+def find_source(source: Path | str) -> Path:
+    """The XML file that a source stands for.
+
+    Args:
+        source: a path, or `sionna:NAME`.
+
+    Raises:
+        BadInput: unknown name (the message lists the known ones), no such file, or not XML.
+    """
+    text = str(source)
+    if text.startswith("sionna:"):
+        scenes = sionna_scenes()
+        if not scenes:
+            raise BadInput(
+                f"{text}: no scenes of sionna-rt were found; install it with `pip install sionna-rt`"
+            )
+        name = text.removeprefix("sionna:")
+        if name not in scenes:
+            raise BadInput(f"{text}: sionna-rt has no scene {name!r}; it has: {', '.join(scenes)}")
+        return scenes[name]
+    path = Path(source)
+    if not path.is_file():
+        raise BadInput(
+            f"{path} is not a file; give a Mitsuba or Sionna RT scene (.xml), or sionna:NAME with one of: "
+            f"{', '.join(sionna_scenes()) or '(sionna-rt is not installed)'}"
+        )
+    if path.suffix.lower() != ".xml":
+        raise BadInput(f"{path}: '{path.suffix}' is not read; give a Mitsuba or Sionna RT scene (.xml)")
+    return path
+
+
+def scene_name(source: Path | str) -> str:
+    """Name of the scene made from a source, in the characters that `scene.toml` allows.
+
+    >>> scene_name("sionna:munich"), scene_name("data/My city.xml")
+    ('munich', 'My_city')
+    """
+    text = str(source)
+    name = text.removeprefix("sionna:") if text.startswith("sionna:") else Path(source).stem
+    return re.sub(r"[^A-Za-z0-9_.+-]", "_", name)[:64] or "city"

@@ -1,0 +1,7 @@
+"""Fly UAVs through a truth map and bring back measurements."""
+
+from radiotwin.survey.campaign import fly_survey
+from radiotwin.survey.patterns import PATTERNS
+from radiotwin.survey.statistical import segmented_truth
+
+__all__ = ["PATTERNS", "fly_survey", "segmented_truth"]

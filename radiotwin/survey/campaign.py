@@ -1,0 +1,118 @@
+"""A measurement campaign: every UAV flies every flight, and measures all devices in every slot."""
+
+import numpy as np
+import pandas as pd
+
+from radiotwin.errors import BadInput
+from radiotwin.measurements import Measurements
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.scene.config import UavConfig
+from radiotwin.survey.grid import MOVE_COST, FlightGrid
+from radiotwin.survey.patterns import PATTERNS
+
+
+def fly_survey(scene: Scene, truth: RadioMap, *, flights: int, pattern: str, seed: int,
+               noise_db: float = 1.0) -> Measurements:
+    """Fly and measure.
+
+    Args:
+        scene: its UAVs, devices and sensitivity.
+        truth: map over the scene's lattice; where it has `sigma_db`, shadowing is drawn anew for every link.
+        flights: number of flights; in each, every UAV of the scene flies once.
+        pattern: a key of `PATTERNS`.
+        seed: of paths and noise; the n-th flight does not depend on how many there are.
+        noise_db: standard deviation of the receiver's measurement error [dB].
+
+    Raises:
+        BadInput: an unknown pattern, no flight, no UAV, or a map that belongs to another scene.
+    """
+    _check(scene, truth, flights, pattern, noise_db)
+    limit_db = scene.config.gain_limit_db
+    gain_db = truth.gain_db.reshape(len(truth.devices), -1).astype(float)
+    shadowing_db = truth.dataset["sigma_db"].values.reshape(gain_db.shape) if "sigma_db" in truth.dataset else None
+    slot_s, start_s, parts = scene.config.mission.slot_s, 0.0, []
+    for flight in range(flights):
+        longest = 0
+        for number, uav in enumerate(scene.config.uavs):
+            rng = np.random.default_rng([seed, flight, number])
+            cells = fly(scene, uav, pattern, rng)
+            index = _lattice_index(scene, uav, cells)
+            level_db = gain_db[:, index] + rng.normal(0, noise_db, (len(gain_db), len(index)))
+            if shadowing_db is not None:
+                level_db += rng.normal(0, 1, level_db.shape) * shadowing_db[:, index]
+            level_db[level_db < limit_db] = np.nan
+            time_s = start_s + slot_s * np.arange(len(index))
+            parts.append(_table(scene, f"f{flight}", uav.uav, index, level_db, time_s, _heading_deg(cells)))
+            longest = max(longest, len(index))
+        start_s += slot_s * longest
+    return Measurements(pd.concat(parts, ignore_index=True), declared_devices(scene))
+
+
+def declared_devices(scene: Scene) -> pd.DataFrame:
+    """What a survey may tell of the devices: all positions of anchors, only the height of unknown ones."""
+    rows = [(d.device, *((d.x_m, d.y_m) if d.role == "anchor" else (np.nan, np.nan)), d.z_m, d.role)
+            for d in scene.config.devices]
+    return pd.DataFrame(rows, columns=["device", "x_m", "y_m", "z_m", "role"])
+
+
+def fly(scene: Scene, uav: UavConfig, pattern: str, rng: np.random.Generator) -> np.ndarray:
+    """One flight of one UAV: (slots, 2) cells (row, column) from its start to its terminal.
+
+    Raises:
+        BadInput: the battery does not reach from the start to the terminal.
+    """
+    lattice = scene.lattice
+    level = int(np.abs(lattice.z_m - uav.altitude_m).argmin())
+    start, terminal = ((round((y_m - lattice.y_m[0]) / lattice.step_m), round((x_m - lattice.x_m[0]) / lattice.step_m))
+                       for x_m, y_m in ((uav.start_x_m, uav.start_y_m), (uav.terminal_x_m, uav.terminal_y_m)))
+    grid = FlightGrid(~scene.blocked[level], terminal)
+    needed = grid.steps_home(start) * MOVE_COST
+    if needed > uav.battery:
+        raise BadInput(f"uav {uav.uav!r}: battery = {uav.battery:g} does not reach from its start to its terminal "
+                       f"({needed:g} moves are needed); raise it in {scene.folder / 'scene.toml'}")
+    return np.array(PATTERNS[pattern](grid, start, uav.battery, rng))
+
+
+def _lattice_index(scene: Scene, uav: UavConfig, cells: np.ndarray) -> np.ndarray:
+    level = int(np.abs(scene.lattice.z_m - uav.altitude_m).argmin())
+    return np.ravel_multi_index((np.full(len(cells), level), cells[:, 0], cells[:, 1]), scene.lattice.shape)
+
+
+def _heading_deg(cells: np.ndarray) -> np.ndarray:
+    """Clockwise from north, of the move that led here; a hover keeps it, the first slot has that of the next move."""
+    moves = np.diff(cells, axis=0)
+    heading = pd.Series(np.full(len(cells), np.nan))
+    moved = np.flatnonzero(moves.any(axis=1))
+    heading[moved + 1] = np.degrees(np.arctan2(moves[moved, 1], moves[moved, 0])) % 360
+    return heading.ffill().bfill().fillna(0.0).to_numpy()
+
+
+def _table(scene, flight, receiver, index, level_db, time_s, heading_deg) -> pd.DataFrame:
+    devices, slots = len(level_db), len(index)
+    position_m = scene.lattice.positions_m[index]
+    return pd.DataFrame({
+        "time_s": np.repeat(time_s, devices), "flight": flight, "receiver": receiver,
+        **{f"receiver_{axis}_m": np.repeat(position_m[:, i], devices) for i, axis in enumerate("xyz")},
+        "device": np.tile([d.device for d in scene.config.devices], slots),
+        "gain_db": level_db.T.ravel().round(3), "heading_deg": np.repeat(heading_deg, devices),
+    })
+
+
+def _check(scene: Scene, truth: RadioMap, flights: int, pattern: str, noise_db: float) -> None:
+    path = scene.folder / "scene.toml"
+    if pattern not in PATTERNS:
+        raise BadInput(f"pattern {pattern!r} is unknown; allowed are {', '.join(PATTERNS)}")
+    if flights < 1:
+        raise BadInput(f"flights = {flights}: at least one flight is needed")
+    if not noise_db >= 0:
+        raise BadInput(f"noise_db = {noise_db}: a standard deviation is 0 or more")
+    if not scene.config.uavs:
+        raise BadInput(f"{path}: declares no UAV; add at least one [[uavs]] table")
+    if not scene.config.devices:
+        raise BadInput(f"{path}: declares no device; add [[devices]] tables, or build the scene with --devices N")
+    if truth.dataset.attrs.get("scene_hash") != scene.content_hash() or \
+            truth.gain_db.shape[1:] != scene.lattice.shape or \
+            not np.allclose(truth.lattice.positions_m, scene.lattice.positions_m):
+        raise BadInput(f"the radio map was not made for the scene as it is now in {scene.folder} (geometry, radio, "
+                       "devices or lattice changed since); run `radiotwin trace` again")

@@ -1,0 +1,7 @@
+"""Ray tracing with Sionna RT: the physical truth. Needs libLLVM; importing this package does not."""
+
+from radiotwin.trace.points import read_points, trace_gains, trace_points
+from radiotwin.trace.run import trace_map
+from radiotwin.trace.settings import QUALITIES, SolverSettings
+
+__all__ = ["QUALITIES", "SolverSettings", "read_points", "trace_gains", "trace_map", "trace_points"]

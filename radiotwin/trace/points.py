@@ -1,0 +1,114 @@
+"""Gains at any points in space."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from radiotwin.errors import BadInput
+from radiotwin.files import atomic_path
+from radiotwin.progress import progress
+from radiotwin.scene import Scene
+from radiotwin.trace.run import device_indices
+from radiotwin.trace.settings import SolverSettings
+from radiotwin.trace.solver import PathGains
+
+COLUMNS = ["x_m", "y_m", "z_m"]
+
+
+def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settings: SolverSettings) -> np.ndarray:
+    """Gains between positions in a scene's city.
+
+    Args:
+        scene: city and frequency.
+        device_m: (k, 3) positions of transmitters [m].
+        points_m: (n, 3) positions of receivers [m].
+        settings: with solver `paths`.
+
+    Returns:
+        (k, n) gain [dB]; NaN where there is no path.
+
+    Raises:
+        BadInput: settings for another solver, or a scene that cannot be read.
+        RunFailed: no usable libLLVM.
+    """
+    if settings.solver != "paths":
+        raise BadInput(f"the solver {settings.solver!r} averages over lattice cells; points need the solver 'paths'")
+    solver = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings)
+    gain_db = np.full((len(device_m), len(points_m)), np.nan)
+    with progress("tracing", total=gain_db.size) as advance:
+        for row, one_m in enumerate(device_m):
+            for part in solver.batches(len(points_m)):
+                gain_db[row, part] = solver.solve(one_m, points_m[part])
+                advance(part.stop - part.start)
+    return gain_db
+
+
+def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings, out_path: Path | str | None = None,
+                 devices: list[str] | None = None) -> pd.DataFrame:
+    """Gains from a scene's devices to any points.
+
+    Args:
+        scene: city, devices and radio.
+        points_m: (n, 3) positions [m].
+        settings: with solver `paths`.
+        out_path: CSV file (.csv or .csv.gz); None writes nothing.
+        devices: names; all devices of the scene by default.
+
+    Returns:
+        One row a link: device, x_m, y_m, z_m, gain_db (NaN = not detected), los, and reason: empty, or why nothing
+        is detected ('no path', 'below sensitivity', 'inside a building').
+
+    Raises:
+        BadInput: an unknown device, settings for another solver, or an output that cannot be written.
+        RunFailed: no usable libLLVM.
+    """
+    if out_path is not None and not str(out_path).endswith((".csv", ".csv.gz")):
+        raise BadInput(f"{out_path}: unknown format; allowed are .csv and .csv.gz")
+    index = device_indices(scene, devices)
+    inside = scene.city.inside(points_m)
+    gain_db = trace_gains(scene, scene.device_m[index], points_m, settings)
+    tables = []
+    for row, device in enumerate(index):
+        reason = np.select([inside, np.isnan(gain_db[row]), gain_db[row] < scene.config.gain_limit_db],
+                           ["inside a building", "no path", "below sensitivity"], default="")
+        tables.append(pd.DataFrame({
+            "device": scene.config.devices[device].device, "x_m": points_m[:, 0], "y_m": points_m[:, 1],
+            "z_m": points_m[:, 2], "gain_db": np.where(reason == "", gain_db[row], np.nan),
+            "los": scene.city.line_of_sight(scene.device_m[device][None], points_m), "reason": reason}))
+    table = pd.concat(tables, ignore_index=True)
+    if out_path is not None:
+        with atomic_path(out_path) as temporary:
+            table.to_csv(temporary, index=False)
+    return table
+
+
+def read_points(path: Path | str) -> np.ndarray:
+    """Read points from a CSV file with the columns x_m, y_m and z_m; others are ignored.
+
+    Returns:
+        (n, 3) positions [m].
+
+    Raises:
+        BadInput: no such file, a missing column, no rows, or a cell that is not a finite number.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise BadInput(f"{path} does not exist")
+    try:
+        raw = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True)
+    except (ValueError, OSError, EOFError) as error:  # pandas' own are ValueErrors
+        raise BadInput(f"{path} cannot be read as CSV: {error}") from None
+    missing = [name for name in COLUMNS if name not in raw]
+    if missing:
+        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {COLUMNS}, it has {list(raw.columns)}")
+    if raw.empty:
+        raise BadInput(f"{path}: has no rows; it needs at least one point")
+    points_m = np.empty((len(raw), 3))
+    for axis, name in enumerate(COLUMNS):
+        points_m[:, axis] = pd.to_numeric(raw[name].str.strip(), errors="coerce")
+        bad = ~np.isfinite(points_m[:, axis])
+        if bad.any():
+            row = int(np.flatnonzero(bad)[0])
+            raise BadInput(f"{path}: row {row + 2}, column {name}: {raw[name][row]!r} is not a finite number [m]")
+    return points_m

@@ -1,0 +1,168 @@
+"""The truth map: every lattice position, every device, resumable and checked."""
+
+from importlib.metadata import version
+from pathlib import Path
+
+import numpy as np
+
+from radiotwin.errors import BadInput
+from radiotwin.progress import progress
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.trace.batches import BatchStore
+from radiotwin.trace.cell_gains import CellGains
+from radiotwin.trace.gates import check_gains
+from radiotwin.trace.noise import FINER, noise_figures, sample_receivers
+from radiotwin.trace.settings import SolverSettings
+from radiotwin.trace.sionna_scene import library_versions
+from radiotwin.trace.solver import PathGains
+
+
+def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
+              devices: list[str] | None = None) -> RadioMap:
+    """Trace the radio map of a scene's lattice and write it.
+
+    Each finished batch is kept in the scene's `cache/trace-<hash>`, named by the hash of all that decides a gain.
+    Run again after a kill, the trace goes on behind the last finished batch and gives the same map to the bit;
+    run again when it is finished, it solves nothing.
+
+    Args:
+        scene: city, devices and lattice.
+        settings: of the solver.
+        out_path: NetCDF file.
+        devices: names, in the map's order; all devices of the scene by default.
+
+    Returns:
+        The map: gain [dB], NaN where there is no path, the gain is below the receiver's sensitivity, or the
+        position is inside a building; the counts of each are attributes.
+
+    Raises:
+        BadInput: no device, an unknown one, a scene that cannot be read, or an output that cannot be written.
+        RunFailed: no usable libLLVM, or gains that physics does not allow. Nothing is written then.
+    """
+    index = device_indices(scene, devices)
+    positions_m = scene.lattice.positions_m
+    device_m = scene.device_m[index]
+    store = BatchStore(scene.folder / "cache", _key(scene, settings))
+    raw_db = _solve_all(scene, settings, store, index)
+
+    los = np.stack([scene.city.line_of_sight(one_m[None], positions_m) for one_m in device_m])
+    inside = scene.blocked.ravel()
+    distance_m = np.linalg.norm(device_m[:, None, :] - positions_m[None], axis=2)
+    frequency_hz = scene.config.radio.frequency_hz
+    figures = check_gains(raw_db[:, ~inside].ravel(), los[:, ~inside].ravel(), distance_m[:, ~inside].ravel(),
+                          frequency_hz, settings.solver, settings.combining)
+    limit_db = scene.config.gain_limit_db
+    gain_db, counts = _censor(raw_db, inside, limit_db)
+    if settings.solver == "paths":
+        sample, finer_db = _solve_sample(scene, settings, store, index)
+        outside = ~inside[sample]
+        finer_db = np.where(finer_db >= limit_db, finer_db, np.nan)
+        figures |= noise_figures(gain_db[:, sample][:, outside].ravel(), finer_db[:, outside].ravel())
+    radio_map = RadioMap.build(
+        [scene.config.devices[i].device for i in index], scene.lattice, gain_db, los,
+        attributes={"source": "raytrace", "frequency_hz": frequency_hz, "gain_limit_db": limit_db,
+                    **_origin(scene), "scene": scene.config.name, "scene_hash": scene.content_hash(),
+                    "trace_hash": store.hash, **settings.attributes(), **counts, **figures,
+                    **library_versions(), "radiotwin_version": version("radiotwin")})
+    radio_map.write(out_path)
+    return radio_map
+
+
+def device_indices(scene: Scene, devices: list[str] | None) -> list[int]:
+    """Rows in `scene.config.devices` of the named devices, or of all.
+
+    Raises:
+        BadInput: the scene has no devices, or not that one.
+    """
+    names = [device.device for device in scene.config.devices]
+    if not names:
+        raise BadInput(f"{scene.folder / 'scene.toml'} declares no devices; add at least one to trace from")
+    for name in devices or []:
+        if name not in names:
+            raise BadInput(f"device {name!r} is not in {scene.folder / 'scene.toml'}; it has {', '.join(names)}")
+    return [names.index(name) for name in dict.fromkeys(devices or names)]
+
+
+def _key(scene: Scene, settings: SolverSettings) -> dict:
+    lattice = scene.lattice
+    return {
+        "scene": scene.content_hash(), "lattice": {axis: getattr(lattice, axis).tolist() for axis in ("x_m", "y_m", "z_m")},
+        "settings": settings.attributes(), "libraries": library_versions(),
+    }
+
+
+def _solve_all(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int]) -> np.ndarray:
+    """(devices, positions) gain [dB], NaN where there is no path; what is missing in the store is solved."""
+    lattice = scene.lattice
+    positions_m = lattice.positions_m
+    if settings.solver == "paths":
+        step, label = settings.batch_receivers, "batch"
+    else:
+        step, label = len(lattice.y_m) * len(lattice.x_m), "altitude"
+    parts = [slice(start, min(start + step, len(positions_m))) for start in range(0, len(positions_m), step)]
+    gain_db = np.empty((len(index), len(positions_m)))
+    missing = []
+    for row, device in enumerate(index):
+        for number, part in enumerate(parts):
+            name = f"device-{device:03d}-{label}-{number:05d}"
+            known_db = store.get(name, part.stop - part.start)
+            if known_db is None:
+                missing.append((name, row, part))
+            else:
+                gain_db[row, part] = known_db
+    if not missing:
+        return gain_db
+    frequency_hz = scene.config.radio.frequency_hz
+    if settings.solver == "paths":
+        paths = PathGains(scene.xml_path, frequency_hz, settings)
+    else:
+        cells = CellGains(scene.xml_path, frequency_hz, settings, lattice)
+    with progress("tracing", total=sum(part.stop - part.start for _, _, part in missing)) as advance:
+        for name, row, part in missing:
+            device_m = scene.device_m[index[row]]
+            if settings.solver == "paths":
+                gain_db[row, part] = paths.solve(device_m, positions_m[part])
+            else:
+                gain_db[row, part] = cells.solve(device_m, positions_m[part.start, 2])
+            store.put(name, gain_db[row, part])
+            advance(part.stop - part.start)
+    return gain_db
+
+
+def _solve_sample(scene: Scene, settings: SolverSettings, store: BatchStore,
+                  index: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """A sample of positions (m,) and their gains (devices, m) [dB] with ten times the rays."""
+    sample = sample_receivers(len(scene.lattice.positions_m), settings.seed)
+    points_m = scene.lattice.positions_m[sample]
+    names = [f"device-{device:03d}-finer" for device in index]
+    known = [store.get(name, len(sample)) for name in names]
+    missing = [row for row, gain_db in enumerate(known) if gain_db is None]
+    if missing:
+        finer = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings.finer(FINER))
+        with progress("numerical noise", total=len(missing) * len(sample)) as advance:
+            for row in missing:
+                parts = []
+                for gain_db in finer.gains(scene.device_m[index[row]], points_m):
+                    parts.append(gain_db)
+                    advance(len(gain_db))
+                known[row] = np.concatenate(parts)
+                store.put(names[row], known[row])
+    return sample, np.stack(known)
+
+
+def _censor(raw_db: np.ndarray, inside: np.ndarray, limit_db: float) -> tuple[np.ndarray, dict[str, int]]:
+    """Gains with NaN where nothing is detected, and how many links are so for which reason."""
+    within = np.broadcast_to(inside, raw_db.shape)
+    no_path = np.isnan(raw_db) & ~within
+    below = ~within & (raw_db < limit_db)
+    gain_db = np.where(within | below, np.nan, raw_db)
+    return gain_db, {
+        "links_detected": int(np.isfinite(gain_db).sum()), "links_without_path": int(no_path.sum()),
+        "links_below_sensitivity": int(below.sum()), "links_inside_building": int(within.sum()),
+    }
+
+
+def _origin(scene: Scene) -> dict[str, float]:
+    origin = scene.config.origin
+    return {} if origin is None else {f"origin_{name}": value for name, value in origin.model_dump().items()}

@@ -1,0 +1,228 @@
+"""The twin: a channel learned from anchors, the positions of all devices, and where both come from."""
+
+import json
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+import radiotwin
+from radiotwin.channel import MODELS, ChannelModel, Links, check_fit_data, load_channel, make_links, save_channel
+from radiotwin.errors import BadInput
+from radiotwin.files import atomic_folder
+from radiotwin.localize import localize
+from radiotwin.measurements import Measurements
+from radiotwin.progress import progress
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.scene.citymap import CityMap
+
+SCHEMA = "radiotwin.twin/1"
+CHANNEL_FILE = "channel.safetensors"
+MAP_CHUNK = 200_000  # links predicted at once
+
+
+@dataclass(frozen=True)
+class TwinDevice:
+    """A device as the twin knows it.
+
+    Attributes:
+        device: its name.
+        x_m, y_m, z_m: declared position of an anchor, estimate of an unknown device; NaN where nothing tells it.
+        role: `anchor` or `unknown`.
+        located: whether the position may be relied on; always so for anchors.
+        credible_radius_m: holds 90 % of the posterior; 0 for anchors.
+        second_mode: (x_m, y_m, weight) of another place that explains the data, too.
+    """
+
+    device: str
+    x_m: float
+    y_m: float
+    z_m: float
+    role: str
+    located: bool
+    credible_radius_m: float
+    second_mode: tuple[float, float, float] | None
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """A learned model of all links of a scene.
+
+    Attributes:
+        channel: fitted model.
+        devices: in the order of the measurements' `devices.csv`.
+        level: `gain_db`, or `rssi_dbm` where transmit power is unknown.
+        limit_db: the level below which receivers do not detect; None where it was not known.
+        provenance: measurements, scene, seed and version that made it.
+    """
+
+    channel: ChannelModel
+    devices: list[TwinDevice]
+    level: str
+    limit_db: float | None
+    provenance: dict = field(default_factory=dict)
+
+    @property
+    def device_m(self) -> np.ndarray:
+        """(k, 3) positions [m]; NaN where a device could not be located."""
+        return np.array([(d.x_m, d.y_m, d.z_m) for d in self.devices], dtype=float).reshape(-1, 3)
+
+    def links(self, receiver_m: np.ndarray, device: np.ndarray, city: CityMap | None) -> Links:
+        """Links between receivers (n, 3) and the twin's devices (n,) at the positions that the twin knows."""
+        return make_links(self.device_m, receiver_m, device, city)
+
+    def radio_map(self, scene: Scene) -> RadioMap:
+        """Mean and standard deviation of the level over a scene's lattice, for all devices that have a position.
+
+        The mean is given below sensitivity, too; attribute `limit_db` says where detection ends.
+        """
+        known = np.flatnonzero(np.isfinite(self.device_m).all(axis=1))
+        receiver_m = scene.lattice.positions_m
+        shape = (len(known), len(receiver_m))
+        mean_db, sigma_db, los = np.empty(shape), np.empty(shape), np.empty(shape, dtype=bool)
+        with progress("mapping", total=len(known)) as advance:
+            for row, device in enumerate(known):
+                for start in range(0, len(receiver_m), MAP_CHUNK):
+                    part = slice(start, start + MAP_CHUNK)
+                    ends = receiver_m[part]
+                    links = self.links(ends, np.full(len(ends), device), scene.city)
+                    mean_db[row, part], sigma_db[row, part] = self.channel.predict(links)
+                    los[row, part] = links.los
+                advance(1)
+        if self.level == "rssi_dbm":
+            mean_db -= scene.config.radio.tx_power_dbm
+        attributes = {"source": f"twin:{self.channel.name}", "frequency_hz": scene.config.radio.frequency_hz,
+                      "limit_db": scene.config.gain_limit_db, "scene_hash": scene.content_hash(),
+                      "radiotwin_version": radiotwin.__version__}
+        return RadioMap.build([self.devices[i].device for i in known], scene.lattice, mean_db, los, sigma_db, attributes)
+
+    def save(self, folder: Path | str) -> None:
+        """Write the twin's folder, whole or not at all.
+
+        Raises:
+            BadInput: the folder exists and is not a twin's.
+        """
+        folder = Path(folder)
+        if folder.is_dir() and any(folder.iterdir()) and not (folder / "twin.json").is_file():
+            raise BadInput(f"{folder} is not empty and not a twin's folder; choose another output folder")
+        record = {"schema": SCHEMA, "channel": {"model": self.channel.name, "file": CHANNEL_FILE},
+                  "level": self.level, "limit_db": self.limit_db,
+                  "devices": [_without_nan(asdict(device)) for device in self.devices],
+                  "effects": [], "provenance": self.provenance}
+        with atomic_folder(folder) as temporary:
+            save_channel(self.channel, temporary / CHANNEL_FILE)
+            (temporary / "twin.json").write_text(json.dumps(record, indent=1, allow_nan=False), encoding="utf-8")
+
+    @classmethod
+    def load(cls, folder: Path | str) -> "Twin":
+        """Read a twin's folder.
+
+        Raises:
+            BadInput: not a twin's folder, or a damaged one.
+        """
+        folder = Path(folder)
+        path = folder / "twin.json"
+        try:
+            record = json.loads(path.read_text(encoding="utf-8"))
+            if record["schema"] != SCHEMA:
+                raise BadInput(f"{path}: schema is {record['schema']!r}, this version reads {SCHEMA!r}")
+            devices = [TwinDevice(**_with_nan(device)) for device in record["devices"]]
+            channel = load_channel(folder / record["channel"]["file"])
+            return cls(channel, devices, record["level"], record["limit_db"], record["provenance"])
+        except (FileNotFoundError, NotADirectoryError):
+            raise BadInput(f"{folder} is not a twin's folder (no twin.json); `radiotwin fit` makes one") from None
+        except (KeyError, TypeError, ValueError) as error:
+            raise BadInput(f"{path} is damaged ({type(error).__name__}: {error}); run `radiotwin fit` again") from None
+
+
+def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmented_nn", seed: int,
+             start: "Twin | None" = None) -> Twin:
+    """Learn the channel from the anchors' links, then find the unknown devices with it.
+
+    Args:
+        measurements: links to anchors and unknown devices.
+        scene: its map and extent, and the receivers' sensitivity.
+        model: a key of `radiotwin.channel.MODELS`.
+        seed: of the channel's and the search's random numbers.
+        start: an earlier twin; the search also starts from its positions.
+
+    Raises:
+        BadInput: no anchor, nothing detected, or links that no channel can be learned from.
+    """
+    if model not in MODELS:
+        raise BadInput(f"channel model {model!r} is unknown; allowed are {', '.join(MODELS)}")
+    level = measurements.level_column
+    radio = scene.config.radio
+    limit_db = scene.config.gain_limit_db if level == "gain_db" else radio.sensitivity_dbm
+    # Where a file gives x and y of an unknown device, too, they are not to be learned from.
+    anchors_m = np.where(measurements.is_anchor[:, None], measurements.device_m, np.nan)
+    channel = _fit_channel(measurements, anchors_m, scene, MODELS[model](), limit_db, seed)
+    devices = [_anchor(row) if row.role == "anchor" else None for row in measurements.devices.itertuples()]
+    unknown = np.flatnonzero(~measurements.is_anchor)
+    if len(unknown):
+        for index, found in zip(unknown, _locate(measurements, scene, channel.trend, unknown, limit_db, seed, start)):
+            devices[index] = TwinDevice(measurements.devices["device"][index], found.x_m, found.y_m, found.z_m,
+                                        "unknown", found.located, found.credible_radius_m, found.second_mode)
+    if channel.trend is not channel:
+        device_m = np.array([(d.x_m, d.y_m, d.z_m) for d in devices])
+        channel = _fit_channel(measurements, device_m, scene, MODELS[model](), limit_db, seed)
+    provenance = {"scene": scene.config.name, "scene_hash": scene.content_hash(), "links": len(measurements.table),
+                  "flights": measurements.flights, "seed": seed, "radiotwin_version": radiotwin.__version__}
+    return Twin(channel, devices, level, limit_db, provenance)
+
+
+def _fit_channel(measurements, device_m, scene, channel: ChannelModel, limit_db, seed) -> ChannelModel:
+    """Fit to the links of all devices whose position in `device_m` (k, 3) is known."""
+    if not measurements.is_anchor.any():
+        raise BadInput("no anchor: every device has the role unknown, and a channel is learned from devices whose "
+                       "positions are known; give at least one device x_m, y_m and the role anchor in devices.csv")
+    known = np.isfinite(device_m[:, :2]).all(axis=1)[measurements.device_index]
+    if not known.any():
+        raise BadInput("no link to an anchor: none of the devices with role anchor was measured; fly nearer to them")
+    training = measurements.select(known)
+    _check_heights(training)
+    links = make_links(device_m, training.receiver_m, training.device_index, scene.city)
+    check_fit_data(links, training.level_db, needs_los=channel.uses_map)
+    return channel.fit(links, training.level_db, limit_db, seed)
+
+
+def _check_heights(measurements: Measurements) -> None:
+    for table, column, what in ((measurements.table, "receiver_z_m", "receiver"), (measurements.devices, "z_m", "device")):
+        if table[column].isna().any():
+            row = int(np.flatnonzero(table[column].isna())[0])
+            raise BadInput(f"row {row + 2}, column {column}: the {what}'s height is empty; with a 3D map every "
+                           "position needs one")
+
+
+def _locate(measurements, scene, channel, unknown, limit_db, seed, start):
+    measured = np.isin(measurements.device_index, unknown)
+    links = measurements.select(measured)
+    _check_heights(links)
+    start_m = None
+    if start is not None:
+        before = {device.device: (device.x_m, device.y_m) for device in start.devices}
+        start_m = np.array([before.get(measurements.devices["device"][i], (np.nan, np.nan)) for i in unknown])
+    return localize(
+        links.receiver_m, np.searchsorted(unknown, links.device_index), links.level_db, channel,
+        n_devices=len(unknown), bounds=scene.config.extent.bounds, z_m=measurements.device_m[unknown, 2],
+        city=scene.city if channel.uses_map else None, limit_db=limit_db, seed=seed, start_m=start_m)
+
+
+def _anchor(row) -> TwinDevice:
+    return TwinDevice(row.device, row.x_m, row.y_m, row.z_m, "anchor", True, 0.0, None)
+
+
+def _without_nan(record: dict) -> dict:
+    """NaN and infinity as null: JSON has neither."""
+    return {k: None if isinstance(v, float) and not np.isfinite(v) else v for k, v in record.items()}
+
+
+def _with_nan(record: dict) -> dict:
+    if record["second_mode"] is not None:
+        record["second_mode"] = tuple(record["second_mode"])
+    for key in ("x_m", "y_m", "z_m"):
+        record[key] = np.nan if record[key] is None else record[key]
+    if record["credible_radius_m"] is None:
+        record["credible_radius_m"] = np.inf
+    return record

@@ -1,0 +1,97 @@
+"""Saved models predict the same; damaged files are refused in one message."""
+
+import pickle
+
+import numpy as np
+import pytest
+from safetensors.numpy import save_file
+
+from radiotwin.channel import MODELS, load_channel, save_channel
+from radiotwin.errors import BadInput
+
+
+@pytest.fixture(scope="module")
+def models(fitted_nn):
+    network, data = fitted_nn
+    others = [
+        kind().fit(data.links, data.level_db, -120.0, seed=0)
+        for kind in MODELS.values()
+        if kind.name != network.name
+    ]
+    return {model.name: model for model in [network, *others]}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_predictions_survive_bit_for_bit(name, models, world, tmp_path):
+    links = world(70, 2000).links
+    path = tmp_path / "channel.safetensors"
+    save_channel(models[name], path)
+    loaded = load_channel(path)
+    assert type(loaded) is MODELS[name]
+    assert np.array_equal(loaded.predict(links), models[name].predict(links))
+    first = path.read_bytes()
+    save_channel(loaded, path)
+    assert path.read_bytes() == first
+    assert [file.name for file in tmp_path.iterdir()] == ["channel.safetensors"]
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_truncated_file(name, models, tmp_path):
+    path = tmp_path / "channel.safetensors"
+    save_channel(models[name], path)
+    whole = path.read_bytes()
+    for share in (0.0, 0.3, 0.99):
+        path.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(BadInput, match="not a whole channel model"):
+            load_channel(path)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(BadInput, match="nowhere.safetensors"):
+        load_channel(tmp_path / "nowhere.safetensors")
+
+
+def test_a_pickle_is_not_run(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return (pytest.fail, ("unpickled",))
+
+    path = tmp_path / "channel.safetensors"
+    path.write_bytes(pickle.dumps(Trap()))
+    with pytest.raises(BadInput, match="not a whole channel model"):
+        load_channel(path)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "header"),
+    [
+        ({"line": np.zeros(3)}, None),
+        ({"line": np.zeros(3)}, {"channel": "not json"}),
+        ({"line": np.zeros(3)}, {"channel": '{"model": "crystal_ball", "settings": {}}'}),
+        ({"other": np.zeros(3)}, {"channel": '{"model": "log_distance", "settings": {}}'}),
+        ({"line": np.zeros(2)}, {"channel": '{"model": "log_distance", "settings": {}}'}),
+        ({"line": np.array([-30.0, np.nan, 1.0])}, {"channel": '{"model": "log_distance", "settings": {}}'}),
+        (
+            {"lines": np.zeros((2, 3))},
+            {"channel": '{"model": "segmented_nn", "settings": {"borrowed": null}}'},
+        ),
+        ({"line": np.zeros(3)}, {"channel": "[1]"}),
+    ],
+)
+def test_another_safetensors_file(arrays, header, tmp_path):
+    path = tmp_path / "channel.safetensors"
+    save_file(arrays, path, header)
+    with pytest.raises(BadInput, match="not a whole channel model"):
+        load_channel(path)
+
+
+def test_nothing_is_left_where_saving_fails(models, tmp_path, monkeypatch):
+    path = tmp_path / "channel.safetensors"
+    path.write_text("the old one")
+    monkeypatch.setattr(
+        "radiotwin.channel.store.save_file", lambda *_: (_ for _ in ()).throw(OSError("disk full"))
+    )
+    with pytest.raises(OSError, match="disk full"):
+        save_channel(models["log_distance"], path)
+    assert path.read_text() == "the old one"
+    assert len(list(tmp_path.iterdir())) == 1

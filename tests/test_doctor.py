@@ -1,0 +1,110 @@
+"""The diagnosis: what it lists, and that each thing that can be wrong is said with what to do."""
+
+import io
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from radiotwin import doctor, llvm
+
+HEADINGS = ["System", "Machine", "GPU", "Packages", "libLLVM", "Tracing", "What to do"]
+
+
+@pytest.fixture
+def no_llvm(monkeypatch):
+    monkeypatch.setenv(llvm.VARIABLE, "/nonexistent/libLLVM.so")
+
+
+@pytest.fixture
+def untraced(monkeypatch):
+    """Leave the tracing out, which takes seconds: a machine on which it works."""
+    monkeypatch.setattr(doctor, "_check_tracing", lambda diagnosis: [("one link", "traced")])
+    monkeypatch.setattr(llvm, "_eligible", lambda: [llvm.Candidate(Path("/lib/libLLVM.so.19.1"), (19, 1))])
+    monkeypatch.setattr(llvm, "find", llvm._eligible)
+    monkeypatch.setattr(llvm, "refusal", lambda candidate: None)
+
+
+def printed():
+    """Whether all is well, and the lines that `doctor.run` prints."""
+    output = io.StringIO()
+    healthy = doctor.run(Console(file=output, width=40))
+    return healthy, output.getvalue().splitlines()
+
+
+def test_healthy_machine(untraced):
+    healthy, lines = printed()
+    assert healthy
+    assert [line for line in lines if not line.startswith(" ")] == HEADINGS
+    assert lines[-1].strip() == "Everything works."
+    assert "  /lib/libLLVM.so.19.1 (version 19.1)  works, chosen" in lines  # whole on a narrow console
+    assert any(line.startswith("  Python ") and sys.executable in line for line in lines)
+    for package in ("sionna-rt", "torch", "numpy"):
+        assert any(line.startswith(f"  {package} ") for line in lines)
+
+
+def test_without_llvm(no_llvm):
+    healthy, lines = printed()
+    assert not healthy
+    assert [line for line in lines if not line.startswith(" ")] == HEADINGS
+    assert "Everything works" not in "".join(lines)
+    advice = "\n".join(lines[lines.index("What to do"):])
+    assert "/nonexistent/libLLVM.so" in advice
+    assert f"unset {llvm.VARIABLE}" in advice
+
+
+def test_missing_packages(untraced, monkeypatch):
+    elsewhere = "elsewhere>=1; platform_machine == 'z80'"
+    needed = ["numpy>=1", "no-such-package>=2.1", elsewhere, "more>=1; extra == 'plus'"]
+    monkeypatch.setattr(doctor, "requires", lambda name: needed)
+    diagnosis = doctor.diagnose()
+    rows = dict(diagnosis.sections["Packages"])
+    assert rows["no-such-package"] == "MISSING"
+    assert rows["more"] == "not installed (extra 'plus')"
+    (problem,) = diagnosis.problems
+    assert problem.endswith("no-such-package is missing: pip install 'no-such-package>=2.1'")
+
+
+def test_little_memory_and_disk_is_said_but_stops_nothing(untraced, monkeypatch):
+    monkeypatch.setattr(doctor, "_memory_gib", lambda: 1.5)
+    monkeypatch.setattr(doctor, "DISK_WANTED_GIB", 10**9)
+    diagnosis = doctor.diagnose()
+    assert diagnosis.healthy
+    assert ["memory" in caution or "disk" in caution for caution in diagnosis.cautions] == [True, True]
+
+
+@pytest.mark.parametrize(
+    ("program", "said"),
+    [
+        ("import os; os.abort()", "tracing fails (exit status -6)"),
+        ("raise ImportError('no sionna here')", "tracing fails (ImportError: no sionna here)"),
+        ("print(-70.0)", "tracing gives -70.00 dB, free space has -80.05 dB"),
+    ],
+)
+def test_tracing_that_does_not_work(monkeypatch, program, said):
+    monkeypatch.setattr(doctor, "_TRACE", program)
+    diagnosis = doctor.Diagnosis()
+    doctor._check_tracing(diagnosis)
+    assert len(diagnosis.problems) == 1
+    assert said in diagnosis.problems[0]
+    assert "constraints.txt" in diagnosis.problems[0]
+
+
+def test_gpu_is_listed(tmp_path, monkeypatch):
+    tool = tmp_path / "nvidia-smi"
+    tool.write_text("#!/bin/sh\necho 'Some GPU, 16384 MiB, 550.1'\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    rows = doctor._check_gpu()
+    assert rows[0] == ("GPU", "Some GPU, 16384 MiB, 550.1")
+    assert rows[1][0] == "torch"
+    tool.write_text("#!/bin/sh\nexit 9\n")  # the tool without its driver
+    assert doctor._check_gpu() == [("GPU", "none: everything runs on the processor")]
+
+
+@pytest.mark.llvm
+def test_traces_here():
+    diagnosis = doctor.Diagnosis()
+    doctor._check_tracing(diagnosis)
+    assert diagnosis.problems == []
