@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.channel import MODELS, make_links
+from radiotwin.channel.likelihood import mean_if_detected
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.progress import progress
@@ -109,11 +110,11 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene, truth:
     predictions = test.table[["flight", "receiver", "device"]].assign(measured_db=test.level_db, los=los)
     scores, locations = [], []
     for model, twin in fitted.items():
-        predicted_db = predict(twin, scene, test.receiver_m, test.device_index)
+        predicted_db = predict(twin, scene, test.receiver_m, test.device_index, limit_db=twin.limit_db)
         predictions[model] = predicted_db
         scores += _scores(model, "held-out flights", "estimated", test.level_db, predicted_db, los)
         if np.isfinite(true_m).all():
-            ideal_db = predict(twin, scene, test.receiver_m, test.device_index, true_m)
+            ideal_db = predict(twin, scene, test.receiver_m, test.device_index, true_m, twin.limit_db)
             scores += _scores(model, "held-out flights", "true", test.level_db, ideal_db, los)
         if truth is not None:
             scores += _map_scores(model, twin, scene, truth, true_m)
@@ -129,14 +130,30 @@ def true_positions(scene: Scene, measurements: Measurements) -> np.ndarray:
     return np.array([declared.get(name, (np.nan,) * 3) for name in measurements.devices["device"]])
 
 
-def predict(twin: Twin, scene: Scene, receiver_m, device, device_m=None) -> np.ndarray:
-    """(n,) mean level [dB] of links, at the twin's device positions or at `device_m` (k, 3); NaN without a position."""
+def predict(twin: Twin, scene: Scene, receiver_m, device, device_m=None, limit_db: float | None = None) -> np.ndarray:
+    """Mean level of links.
+
+    Only detected links can be held against a prediction, and near the limit only the strong ones were detected: the
+    mean of all would lie below the mean of those, most for the model with the widest scatter. So every model is
+    asked for the mean of what is detected (a truncated normal distribution).
+
+    Args:
+        twin: model and device positions.
+        scene: with the 3D map.
+        receiver_m, device: (n, 3) positions [m] and (n,) rows of the twin's devices.
+        device_m: (k, 3) other device positions [m].
+        limit_db: of detection; None: the mean of all links.
+
+    Returns:
+        (n,) levels [dB]; NaN for devices without a position.
+    """
     device_m = twin.device_m if device_m is None else device_m
     known = np.isfinite(device_m).all(axis=1)[device]
     predicted_db = np.full(len(device), np.nan)
     if known.any():
         links = make_links(device_m, receiver_m[known], device[known], scene.city)
-        predicted_db[known] = twin.channel.predict(links)[0]
+        mean_db, sigma_db = twin.channel.predict(links)
+        predicted_db[known] = mean_db if limit_db is None else mean_if_detected(mean_db, sigma_db, limit_db)
     return predicted_db
 
 
@@ -172,9 +189,11 @@ def _map_scores(model: str, twin: Twin, scene: Scene, truth: RadioMap, true_m: n
     index = np.repeat(np.arange(len(names)), len(receiver_m))
     everywhere_m = np.tile(receiver_m, (len(names), 1))
     gain_db, los = truth.gain_db[rows].astype(float).ravel(), truth.los[rows].ravel()
+    # A map of means and deviations has all its means; one of gains has only what is detected.
+    limit_db = None if "sigma_db" in truth.dataset else scene.config.gain_limit_db
     scores = []
     for positions, device_m in (("estimated", None), ("true", true_m)):
-        predicted_db = predict(twin, scene, everywhere_m, index, device_m)
+        predicted_db = predict(twin, scene, everywhere_m, index, device_m, limit_db)
         scores += _scores(model, "whole map", positions, gain_db, predicted_db, los)
     return scores
 

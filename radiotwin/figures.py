@@ -31,7 +31,8 @@ def draw_radio_map(radio_map: RadioMap, scene: Scene, path: Path | str) -> None:
     names, gain_db = radio_map.devices, radio_map.gain_db[:, 0]
     columns = min(len(names), 5)
     rows = -(-len(names) // columns)
-    figure, axes = _figure(rows, columns, 3.0, 3.6)
+    x_min, x_max, y_min, y_max = scene.config.extent.bounds
+    figure, axes = _figure(rows, columns, 2.6, 0.6 + 2.3 * (y_max - y_min) / (x_max - x_min))
     low_db, high_db = np.nanquantile(gain_db, [0.01, 0.995]) if np.isfinite(gain_db).any() else (-1.0, 0.0)
     outline = height_grid(scene, 400)
     positions = dict(zip([d.device for d in scene.config.devices], scene.device_m))
@@ -43,6 +44,10 @@ def draw_radio_map(radio_map: RadioMap, scene: Scene, path: Path | str) -> None:
         if names[number] in positions:
             ax.plot(*positions[names[number]][:2], "^", color="white", markeredgecolor="black", markersize=8)
         ax.set_title(names[number], fontsize=10)
+        if number % columns:
+            ax.set(ylabel="", yticklabels=[])
+        if number + columns < len(names):
+            ax.set(xlabel="", xticklabels=[])
     figure.colorbar(image, ax=axes, label="channel gain [dB]", shrink=0.7)
     figure.suptitle(f"{radio_map.dataset.attrs.get('source', '')} at {radio_map.lattice.z_m[0]:g} m")
     _save(figure, path)
@@ -123,7 +128,7 @@ def draw_estimates(comparison: Comparison, models: list[str], scene: Scene, path
     height_m, bounds = height_grid(scene, 500)
     true_m = dict(zip([d.device for d in scene.config.devices], scene.device_m))
     for ax, model in zip(axes.flat, models):
-        draw_heights(ax, height_m, bounds)
+        image = draw_heights(ax, height_m, bounds)
         for device in comparison.twins[model].devices:
             x_m, y_m, _ = true_m[device.device]
             if device.role == "anchor":
@@ -136,9 +141,10 @@ def draw_estimates(comparison: Comparison, models: list[str], scene: Scene, path
                 ax.add_artist(_circle(device, 2 * (bounds[1] - bounds[0])))
         errors = comparison.locations.query("model == @model")["error_m"]
         ax.set_title(f"{LABELS.get(model, model)}: median error {errors.median():.1f} m")
-        handles = dict(zip(*reversed(ax.get_legend_handles_labels())))
-        ax.legend(handles.values(), handles.keys(), loc="upper right", fontsize=8)
         ax.set(xlim=bounds[:2], ylim=bounds[2:])
+    handles = dict(zip(*reversed(axes[0, 0].get_legend_handles_labels())))
+    figure.colorbar(image, ax=axes, label="height [m]", shrink=0.8)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=3, frameon=False)
     _save(figure, path)
 
 

@@ -204,8 +204,8 @@ def _locate(measurements, scene, channel, unknown, limit_db, seed, start):
         before = {device.device: (device.x_m, device.y_m) for device in start.devices}
         start_m = np.array([before.get(measurements.devices["device"][i], (np.nan, np.nan)) for i in unknown])
     return localize(
-        links.receiver_m, np.searchsorted(unknown, links.device_index), links.level_db, channel,
-        n_devices=len(unknown), bounds=scene.config.extent.bounds, z_m=measurements.device_m[unknown, 2],
+        links.receiver_m, links.device_index, links.level_db, channel, devices=unknown,
+        bounds=scene.config.extent.bounds, z_m=measurements.device_m[unknown, 2],
         city=scene.city if channel.uses_map else None, limit_db=limit_db, seed=seed, start_m=start_m)
 
 

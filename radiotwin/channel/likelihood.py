@@ -29,6 +29,17 @@ def gaussian_nll(
     return np.where(missing, below, seen)
 
 
+def mean_if_detected(mean_db: np.ndarray, sigma_db: np.ndarray, limit_db: float) -> np.ndarray:
+    """Mean level [dB] of those links of a kind that are detected, that is, lie above the limit; broadcasts.
+
+    What a prediction has to be compared with measured levels by: near the limit only the strong ones were measured,
+    and the mean of all lies below the mean of those. mean + sigma * phi(a) / Phi(-a), a = (limit - mean) / sigma
+    (the truncated normal distribution; Johnson, Kotz and Balakrishnan 1994, section 13.10.1).
+    """
+    below = (limit_db - mean_db) / sigma_db
+    return mean_db + sigma_db * np.exp(-0.5 * below**2 - HALF_LOG_2PI - log_ndtr(-below))
+
+
 def gaussian_nll_torch(
     level: torch.Tensor, mean: torch.Tensor, log_sigma: torch.Tensor, censored: torch.Tensor
 ) -> torch.Tensor:

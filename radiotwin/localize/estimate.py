@@ -29,7 +29,7 @@ class LocalizeSettings:
 class DeviceEstimate:
     """Where a device is.
 
-    x_m, y_m: posterior mean of the heaviest mode; z_m: as given. credible_radius_m: radius about it that holds
+    x_m, y_m: mean over the heaviest mode of the posterior; z_m: as given. credible_radius_m: radius about it that holds
     90 % of the posterior, second modes included. second_mode: (x_m, y_m, weight) of another mode at least 20 m
     away with at least 5 % of the posterior, or None. n_detected of n_links measurements were detected.
     design_effect: how many links count as one (1 = independent). located: False where the data do not say where

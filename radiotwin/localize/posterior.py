@@ -22,12 +22,14 @@ class Posterior:
     """Square cells that tile the part of the map where a device may be, small where the likelihood is high.
 
     xy_m: (c, 2) a point of each where a device may be; cell_m: (c, 2) centre of the cell of the scan that it is in
-    or is; width_m: (c,); mass: (c,) posterior probability under a uniform prior, sums to 1.
+    or is; width_m: (c,); log_likelihood: (c,) [nats]; mass: (c,) posterior probability under a uniform prior, with
+    the likelihood tempered; sums to 1.
     """
 
     xy_m: np.ndarray
     cell_m: np.ndarray
     width_m: np.ndarray
+    log_likelihood: np.ndarray
     mass: np.ndarray
 
     def radius(self, xy_m: np.ndarray) -> float:
@@ -50,8 +52,9 @@ class Posterior:
         """Position (2,) and weight of each separate mode, heaviest first.
 
         A mode is a connected patch of the scan's grid whose cells hold at least MODE_FLOOR of what the heaviest
-        holds. Its position is its mean, or, where a device may not be there (`allowed`: (p, 2) to (p,) bool) or the
-        mean of a crescent falls beside it, the nearest of its points.
+        holds. Its position is the mean over it under the likelihood as it is: tempering widens a posterior, it does
+        not move a composite likelihood's estimate. Where a device may not be at the mean (`allowed`: (p, 2) to (p,)
+        bool), or a crescent's mean falls beside it, it is the nearest of the patch's points.
         """
         column, row = np.round((self.cell_m - self.cell_m.min(axis=0)) / self.width_m.max()).astype(int).T
         grid = np.zeros((row.max() + 1, column.max() + 1))
@@ -63,7 +66,9 @@ class Posterior:
         found = []
         for k in np.argsort(-weights)[: np.count_nonzero(weights)]:
             mine = patch == k
-            mean = self.mass[mine] @ self.xy_m[mine] / weights[k]
+            height = self.log_likelihood[mine]
+            share = self.width_m[mine] ** 2 * np.exp(height - height.max())
+            mean = share @ self.xy_m[mine] / share.sum()
             beside = np.abs(self.cell_m[mine] - mean).max(axis=1).min() > self.width_m.max() / 2
             if beside or not allowed(mean[None])[0]:
                 mean = self.xy_m[mine][np.argmin(np.linalg.norm(self.xy_m[mine] - mean, axis=1))]
@@ -122,4 +127,4 @@ def refine(
         )
     xy_m, cell_m, width_m, value = (np.concatenate(each) for each in zip(*done, strict=True))
     mass = width_m**2 * np.exp(temper * (value - value.max()))
-    return Posterior(xy_m, cell_m, width_m, mass / mass.sum())
+    return Posterior(xy_m, cell_m, width_m, value, mass / mass.sum())

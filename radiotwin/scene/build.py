@@ -108,8 +108,8 @@ def build_scene(
     errors = [problem.message for problem in city.problems if problem.severity == "error"]
     if errors and not check_only:
         raise BadInput("\n".join([f"{source}: tracing would fail:", *errors]))
-    if city.surfaces is None or None in city.materials:
-        return _unusable(str(source), city, options.frequency_hz)
+    if errors:
+        return _report_on_errors(str(source), city, options.frequency_hz)
     shapes, material_problems = _city_shapes(city, options.frequency_hz)
     city.problems.extend(material_problems)
     plan = _plan(city, scene_name(source), str(source), options)
@@ -133,8 +133,8 @@ def check_target(folder: Path) -> None:
         )
 
 
-def _unusable(source: str, city: ImportedCity, frequency_hz: float) -> BuildReport:
-    """Report on a city that could not be made sense of as far as its extent and materials."""
+def _report_on_errors(source: str, city: ImportedCity, frequency_hz: float) -> BuildReport:
+    """Report without extent, heights and materials, which mean nothing before the errors are put right."""
     triangles = 0 if city.surfaces is None else len(city.surfaces.faces)
     return BuildReport(
         source,
@@ -150,7 +150,7 @@ def _unusable(source: str, city: ImportedCity, frequency_hz: float) -> BuildRepo
         0,
         0,
         (),
-        tuple(city.problems),
+        _by_severity(city.problems),
     )
 
 
@@ -224,7 +224,6 @@ def _report(
         origin = declared[material]
         kind = f"ITU {origin.itu}" if origin.itu else "own constants"
         uses.append(MaterialUse(material.name, kind, count, *constants(origin, frequency_hz)))
-    order = {"error": 0, "warning": 1, "fixed": 2}
     return BuildReport(
         source,
         folder,
@@ -239,5 +238,10 @@ def _report(
         len(plan.config.devices),
         len(plan.config.uavs),
         tuple(uses),
-        tuple(sorted(city.problems, key=lambda problem: order[problem.severity])),
+        _by_severity(city.problems),
     )
+
+
+def _by_severity(problems: list[Problem]) -> tuple[Problem, ...]:
+    order = ("error", "warning", "fixed")
+    return tuple(sorted(problems, key=lambda problem: order.index(problem.severity)))

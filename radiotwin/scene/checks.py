@@ -27,11 +27,10 @@ def upright(vertices: np.ndarray, up: str) -> np.ndarray:
     return vertices @ _AXES[up].T
 
 
-def building_heights(surfaces: Surfaces, ground: np.ndarray) -> np.ndarray:
-    """Height of each part that has walls and is not ground, from its lowest to its highest point."""
+def building_heights(surfaces: Surfaces) -> np.ndarray:
+    """Height of each part that has walls, from its lowest to its highest point."""
     low, high = surfaces.part_bounds()
-    is_ground = surfaces.part_sum(ground.astype(float)) > 0
-    return (high - low)[(surfaces.wall_share > 0.1) & ~is_ground, 2]
+    return (high - low)[surfaces.wall_share > 0.1, 2]
 
 
 def check_up_axis(surfaces: Surfaces, ground: np.ndarray) -> list[Problem]:
@@ -70,9 +69,9 @@ def _has_ground_below(surfaces: Surfaces) -> bool:
     return ground_lowest <= lowest + 0.02 * size[2] and surfaces.level_m(ground) < lowest + 0.4 * size[2]
 
 
-def check_units(surfaces: Surfaces, ground: np.ndarray) -> list[Problem]:
+def check_units(surfaces: Surfaces) -> list[Problem]:
     """Warnings where heights and extent look like feet or kilometres, an error where no unit makes sense."""
-    heights = building_heights(surfaces, ground)
+    heights = building_heights(surfaces)
     width = float(np.ptp(surfaces.vertices[:, :2], axis=0).max())
     if width > ABSURD_EXTENT_M:
         return [
@@ -123,7 +122,7 @@ def check_ground(ground: np.ndarray, surfaces: Surfaces) -> list[Problem]:
 
 
 def check_closed(surfaces: Surfaces, ground: np.ndarray, names: Sequence[str]) -> list[Problem]:
-    """One warning about all meshes that are not watertight, one about meshes that meet in an edge."""
+    """One warning about all meshes that are not watertight, one about roofs apart from their walls."""
     problems = []
     opened = np.zeros(surfaces.shapes, dtype=bool)
     opened[surfaces.shape[surfaces.free_edges[1]]] = True
@@ -139,16 +138,14 @@ def check_closed(surfaces: Surfaces, ground: np.ndarray, names: Sequence[str]) -
                 "found by looking upwards. Holes in walls or roofs let rays in",
             )
         )
-    seams = surfaces.seams()
+    seams = np.unique(surfaces.seams())
     if len(seams):
-        problems.append(
-            Problem(
-                "warning",
-                "",
-                f"{len(seams)} meshes meet another mesh along an edge "
-                f"({listed([names[index] for index in seams])}), as walls and roofs of two materials do. "
-                "Sionna RT takes these edges for the free edges of thin sheets: they diffract only where edge "
-                "diffraction is switched on",
-            )
+        which = listed([names[index] for index in seams])
+        message = (
+            f"{len(seams)} meshes are roofs and walls of different materials that meet in an edge ({which}). "
+            "Sionna RT takes such an edge for two free edges of thin sheets: nothing diffracts there, or, with "
+            "its edge diffraction on, as over a knife edge instead of a corner. With one material, for example "
+            "--material metal=itu_marble, they are joined and diffract rightly"
         )
+        problems.append(Problem("warning", "", message))
     return problems

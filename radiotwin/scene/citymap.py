@@ -74,7 +74,7 @@ class CityMap:
         return cls(city.vertices, city.faces)
 
     def line_of_sight(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
-        """Whether nothing stands between the points.
+        """Whether nothing stands between the points (two points within one solid have nothing in between).
 
         Args:
             a_m, b_m: (n, 3) or broadcastable to it [m].

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
 
 from radiotwin.errors import BadInput
 from radiotwin.progress import progress
@@ -76,10 +78,11 @@ def import_city(
         problems.append(Problem("error", "", f"{path}: no shape could be read"))
         return ImportedCity([], [], None, np.zeros(0, dtype=bool), problems)
     surfaces, sense_problems = _outward(Surfaces([meshes[index] for index in kept]), names)
+    names, materials, surfaces, join_problems = _joined(names, materials, surfaces)
     ground = surfaces.ground_faces()
-    problems += sense_problems
+    problems += sense_problems + join_problems
     problems += checks.check_up_axis(surfaces, ground) if up is None else []
-    problems += checks.check_units(surfaces, ground) if scale is None else []
+    problems += checks.check_units(surfaces) if scale is None else []
     city = ImportedCity(names, materials, surfaces, ground, problems)
     if bbox is not None:
         city = _cut(city, bbox)
@@ -208,6 +211,32 @@ def _outward(surfaces: Surfaces, names: Sequence[str]) -> tuple[Surfaces, list[P
     return surfaces, problems
 
 
+def _joined(names: list[str], materials: list[Material | None], surfaces: Surfaces):
+    """Roofs and walls of one material made one mesh, so that Sionna RT finds the edge between them."""
+    pairs = surfaces.seams()
+    pairs = pairs[[materials[a] is not None and materials[a] == materials[b] for a, b in pairs]]
+    if len(pairs) == 0:
+        return names, materials, surfaces, []
+    graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(surfaces.shapes, surfaces.shapes))
+    building = connected_components(graph, directed=False)[1]
+    meshes, whole, first = surfaces.meshes(), [], []
+    for index in range(building.max() + 1):
+        members = np.flatnonzero(building == index)
+        mesh = trimesh.util.concatenate([trimesh.Trimesh(*meshes[one], process=False) for one in members])
+        whole.append(clean(mesh.vertices, mesh.faces)[:2] if len(members) > 1 else meshes[members[0]])
+        first.append(members[0])
+    message = (
+        f"{surfaces.shapes - len(whole)} mesh(es) were joined to others of the same material, roofs to walls, "
+        "so that the edge between them diffracts"
+    )
+    return (
+        [names[index] for index in first],
+        [materials[index] for index in first],
+        Surfaces(whole),
+        [Problem("fixed", "", message)],
+    )
+
+
 def _cut(city: ImportedCity, bbox: tuple[float, float, float, float]) -> ImportedCity:
     """Whole shapes, and single triangles of the ground, whose bounds reach into the box."""
     surfaces = city.surfaces
@@ -251,7 +280,7 @@ def _move_to_origin(city: ImportedCity) -> ImportedCity:
             )
         )
     if city.ground.any():
-        corners = city.surfaces.faces[city.ground]
+        corners = city.surfaces.faces[city.ground & (city.surfaces.area_vectors[:, 2] > 0)]
         lowest, highest = vertices[corners, 2].min(), vertices[corners, 2].max()
         datum = lowest if highest - lowest > 2 * FLAT_M else city.surfaces.level_m(city.ground)
         if datum != 0:

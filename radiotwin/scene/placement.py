@@ -218,7 +218,9 @@ def place_uavs(
         for low, high in ((x_min, x_max), (y_min, y_max))
     )
     x, y = np.meshgrid(x_min + lattice.step_m * np.arange(nx), y_min + lattice.step_m * np.arange(ny))
-    nearest = np.argsort(np.hypot(x - (x_min + x_max) / 2, y - (y_min + y_max) / 2).ravel(), kind="stable")
+    nearest = np.argsort(np.hypot(x - (x_min + x_max) / 2, y - (y_min + y_max) / 2).ravel(), kind="stable")[
+        :10_000
+    ]
     battery = max(20.0, float(round(0.8 * (nx + ny))))
     uavs = []
     for number in range(count):

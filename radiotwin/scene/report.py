@@ -4,11 +4,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from radiotwin.scene.problems import Problem
 
 _COLOURS = {"error": "bold red", "warning": "yellow", "fixed": "green"}
+_TITLE = {"title_justify": "left", "title_style": "bold"}
 
 
 @dataclass(frozen=True)
@@ -72,35 +75,29 @@ class BuildReport:
 
 def print_report(report: BuildReport, console: Console) -> None:
     """Print the report as tables, the problems last."""
-    x_min, x_max, y_min, y_max = report.extent_m
-    facts = Table(
-        title=f"Scene from {report.source}", show_header=False, title_justify="left", title_style="bold"
-    )
-    rows = [
-        ("shapes, triangles", f"{report.shapes:,}, {report.triangles:,}"),
-        (
-            "extent",
-            f"{x_max - x_min:.5g} × {y_max - y_min:.5g} m   (x {x_min:g} … {x_max:g}, y {y_min:g} … {y_max:g})",
-        ),
-        ("tallest building", f"{report.tallest_m:.1f} m   ({report.tallest})" if report.tallest else "none"),
-        ("built fraction", f"{report.built_fraction:.1%}"),
-        (
-            "lattice altitudes",
-            ", ".join(f"{altitude:g}" for altitude in report.altitudes_m)
-            + " m   (from 10 m above 95 % of the roofs)",
-        ),
-        ("devices, UAVs", f"{report.devices}, {report.uavs}"),
-    ]
-    for row in rows:
-        facts.add_row(*row)
+    facts = Table(title="Scene from " + escape(report.source), show_header=False, **_TITLE)
+    facts.add_row("shapes, triangles", f"{report.shapes:,}, {report.triangles:,}")
+    if report.altitudes_m:
+        x_min, x_max, y_min, y_max = report.extent_m
+        sides = f"x {x_min:g} … {x_max:g}, y {y_min:g} … {y_max:g}"
+        facts.add_row("extent", f"{x_max - x_min:.5g} × {y_max - y_min:.5g} m   ({sides})")
+        tallest = f"{report.tallest_m:.1f} m   ({report.tallest})" if report.tallest else "none"
+        facts.add_row("tallest building", tallest)
+        facts.add_row("built fraction", f"{report.built_fraction:.1%}")
+        altitudes = ", ".join(f"{altitude:g}" for altitude in report.altitudes_m)
+        facts.add_row("lattice altitudes", altitudes + " m   (from 10 m above 95 % of the roofs)")
+        facts.add_row("devices, UAVs", f"{report.devices}, {report.uavs}")
     console.print(facts)
     if report.materials:
         console.print(_material_table(report))
-    if not report.problems:
-        console.print("No problems found.", style="green")
+    console.print(_problem_table(report) if report.problems else "No problems found.")
+
+
+def _problem_table(report: BuildReport) -> Table:
+    table = Table(title="Problems", show_header=False, show_lines=True, **_TITLE)
     for problem in report.problems:
-        console.print(f"{problem.severity:>7}", style=_COLOURS[problem.severity], end="  ")
-        console.print(problem.message, markup=False, highlight=False)
+        table.add_row(Text(problem.severity, style=_COLOURS[problem.severity]), Text(problem.message))
+    return table
 
 
 def _material_table(report: BuildReport) -> Table:

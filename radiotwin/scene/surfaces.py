@@ -196,17 +196,18 @@ class Surfaces:
         return float(self.centres[up, 2][order][np.searchsorted(area, area[-1] / 2)])
 
     def seams(self) -> np.ndarray:
-        """Indices of meshes whose free edges coincide with free edges of another mesh."""
+        """(n, 2) pairs of meshes of which a roof of one and a wall of the other meet in an edge."""
         edges, owner = self.free_edges
         if len(edges) == 0:
-            return np.zeros(0, dtype=int)
+            return np.zeros((0, 2), dtype=int)
         _, place = np.unique(np.round(self.vertices / WELD_M).astype(np.int64), axis=0, return_inverse=True)
-        _, index = np.unique(_edge_keys(np.sort(place.reshape(-1)[edges], axis=1)), return_inverse=True)
-        shape = self.shape[owner]
-        first, last = np.full(index.max() + 1, self.shapes), np.full(index.max() + 1, -1)
-        np.minimum.at(first, index, shape)
-        np.maximum.at(last, index, shape)
-        return np.unique(shape[(first != last)[index]])
+        keys = _edge_keys(np.sort(place.reshape(-1)[edges], axis=1))
+        owner = owner[np.argsort(keys, kind="stable")]
+        _, start, counts = np.unique(np.sort(keys), return_index=True, return_counts=True)
+        first, second = owner[start[counts == 2]], owner[start[counts == 2] + 1]
+        upright = np.abs(self.area_vectors[:, 2]) < WALL_COSINE * self.areas
+        meets = (self.shape[first] != self.shape[second]) & (upright[first] != upright[second])
+        return np.unique(np.sort(self.shape[np.stack([first, second], axis=1)[meets]], axis=1), axis=0)
 
 
 def _labels(faces: np.ndarray, vertices: int) -> np.ndarray:

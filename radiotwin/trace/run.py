@@ -43,7 +43,8 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
     index = device_indices(scene, devices)
     positions_m = scene.lattice.positions_m
     device_m = scene.device_m[index]
-    store = BatchStore(scene.folder / "cache", _key(scene, settings))
+    key = _key(scene, settings)
+    store = BatchStore(scene.folder / "cache", key)
     raw_db = _solve_all(scene, settings, store, index)
 
     los = np.stack([scene.city.line_of_sight(one_m[None], positions_m) for one_m in device_m])
@@ -62,7 +63,7 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
     radio_map = RadioMap.build(
         [scene.config.devices[i].device for i in index], scene.lattice, gain_db, los,
         attributes={"source": "raytrace", "frequency_hz": frequency_hz, "gain_limit_db": limit_db,
-                    **_origin(scene), "scene": scene.config.name, "scene_hash": scene.content_hash(),
+                    **_origin(scene), "scene": scene.config.name, "scene_hash": key["scene"],
                     "trace_hash": store.hash, **settings.attributes(), **counts, **figures,
                     **library_versions(), "radiotwin_version": version("radiotwin")})
     radio_map.write(out_path)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from scipy.stats import norm
+from scipy.stats import norm, truncnorm
 
-from radiotwin.channel.likelihood import gaussian_nll, gaussian_nll_torch
+from radiotwin.channel.likelihood import gaussian_nll, gaussian_nll_torch, mean_if_detected
 
 
 def test_equals_density_of_the_seen_and_probability_of_the_rest():
@@ -36,6 +36,16 @@ def test_stays_finite_far_above_the_limit(mean_db):
     z = (mean_db + 120.0) / 1.0
     value = gaussian_nll(np.array([np.nan]), np.array([mean_db]), 1.0, -120.0)[0]
     assert value == pytest.approx(0.5 * z**2 + np.log(z * np.sqrt(2 * np.pi)), rel=1e-4)
+
+
+@pytest.mark.parametrize("mean_db", [-90.0, -118.0, -120.0, -135.0])
+def test_mean_of_the_detected_is_the_truncated_normals(mean_db):
+    expected = truncnorm.mean((-120.0 - mean_db) / 6.0, np.inf, loc=mean_db, scale=6.0)
+    assert mean_if_detected(np.array([mean_db]), 6.0, -120.0)[0] == pytest.approx(expected, abs=1e-6)
+
+
+def test_mean_of_the_detected_never_falls_below_the_limit():
+    assert mean_if_detected(np.array([-300.0]), 2.0, -120.0)[0] == pytest.approx(-120.0, abs=0.1)
 
 
 def test_torch_agrees_and_its_gradients_are_finite_differences():

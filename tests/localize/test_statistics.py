@@ -60,7 +60,9 @@ def test_credible_radius_covers(city, measured, on_free_ground, published_law):
     """60 devices heard from 60 places: 90 % within the radius, 80 to 98 % being what chance allows (binomial)."""
     rng = np.random.default_rng(5)
     xy_m = on_free_ground(60, rng)
-    receivers = np.column_stack([rng.uniform([0, 0], [600, 800], (60, 2)), rng.choice([55.0, 60.0, 65.0], 60)])
+    receivers = np.column_stack(
+        [rng.uniform([0, 0], [600, 800], (60, 2)), rng.choice([55.0, 60.0, 65.0], 60)]
+    )
     found = localize(
         *measured(xy_m, receivers, rng), published_law,
         devices=np.arange(60), bounds=BOUNDS, z_m=1.5, city=city, limit_db=-120.0, seed=1,

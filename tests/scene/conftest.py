@@ -39,6 +39,10 @@ CONCRETE = '<bsdf type="itu-radio-material" id="concrete"><string name="type" va
 class CityFile:
     """A scene file in a folder; `add` writes a mesh and its shape."""
 
+    box = staticmethod(box_mesh)
+    plane = staticmethod(plane_mesh)
+    ply = staticmethod(ascii_ply)
+
     def __init__(self, folder: Path):
         self.folder = folder
         self.path = folder / "town.xml"

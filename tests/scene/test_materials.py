@@ -18,8 +18,14 @@ def test_permittivity_of_ground_falls_with_frequency():
 
 
 @pytest.mark.parametrize(
-    "frequency_ghz, end_ghz, row", [(0.2, 1, (3.91, 0.0238, 0.16)), (60, 40, (3.91, 0.0238, 0.16)),
-                                    (100, 110, (4.15, 0.0006, 1.5712)), (400, 330, (4.15, 0.0006, 1.5712))])
+    "frequency_ghz, end_ghz, row",
+    [
+        (0.2, 1, (3.91, 0.0238, 0.16)),
+        (60, 40, (3.91, 0.0238, 0.16)),
+        (100, 110, (4.15, 0.0006, 1.5712)),
+        (400, 330, (4.15, 0.0006, 1.5712)),
+    ],
+)
 def test_out_of_range_is_taken_at_the_nearest_end(frequency_ghz, end_ghz, row):
     a, c, d = row
     assert permittivity("brick", frequency_ghz * 1e9) == (a, pytest.approx(c * end_ghz**d), False)

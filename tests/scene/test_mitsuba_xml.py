@@ -35,25 +35,36 @@ def test_missing_file(tmp_path):
 
 
 def test_operations_apply_one_after_the_other(tmp_path):
-    path = write(tmp_path, '<shape type="cube"><transform name="to_world"><translate value="1, 2, 3"/>'
-                 '<scale value="2"/><rotate value="0 0 1" angle="90"/>'
-                 '<matrix value="1 0 0 7  0 1 0 0  0 0 1 0  0 0 0 1"/></transform></shape>')
+    path = write(
+        tmp_path,
+        '<shape type="cube"><transform name="to_world"><translate value="1, 2, 3"/>'
+        '<scale value="2"/><rotate value="0 0 1" angle="90"/>'
+        '<matrix value="1 0 0 7  0 1 0 0  0 0 1 0  0 0 0 1"/></transform></shape>',
+    )
     matrix = read_mitsuba_xml(path).shapes[0].to_world
     # (1, 0, 0) -> (2, 2, 3) -> (4, 4, 6) -> (-4, 4, 6) -> (3, 4, 6)
     np.testing.assert_allclose(matrix @ [1, 0, 0, 1], [3, 4, 6, 1], atol=1e-12)
 
 
 def test_rotation_about_a_slanted_axis_permutes_the_axes(tmp_path):
-    path = write(tmp_path, '<shape type="cube"><transform><rotate x="1" y="1" z="1" angle="120"/></transform></shape>')
+    path = write(
+        tmp_path, '<shape type="cube"><transform><rotate x="1" y="1" z="1" angle="120"/></transform></shape>'
+    )
     matrix = read_mitsuba_xml(path).shapes[0].to_world
     np.testing.assert_allclose(matrix[:3, :3], [[0, 0, 1], [1, 0, 0], [0, 1, 0]], atol=1e-12)
 
 
-@pytest.mark.parametrize("step, message", [
-    ('<lookat origin="0,0,0" target="1,0,0" up="0,0,1"/>', "<lookat>.*translate, rotate, scale, matrix"),
-    ('<translate x="two"/>', "'two'"), ('<translate value="1 2"/>', "1 or 3 finite"),
-    ('<matrix value="1 2 3"/>', "9 or 16"), ('<rotate angle="30"/>', "no axis"), ('<scale value="nan"/>', "'nan'"),
-])
+@pytest.mark.parametrize(
+    "step, message",
+    [
+        ('<lookat origin="0,0,0" target="1,0,0" up="0,0,1"/>', "<lookat>.*translate, rotate, scale, matrix"),
+        ('<translate x="two"/>', "'two'"),
+        ('<translate value="1 2"/>', "1 or 3 finite"),
+        ('<matrix value="1 2 3"/>', "9 or 16"),
+        ('<rotate angle="30"/>', "no axis"),
+        ('<scale value="nan"/>', "'nan'"),
+    ],
+)
 def test_wrong_transform_names_the_line(tmp_path, step, message):
     path = write(tmp_path, f'<shape type="cube"><transform>\n{step}</transform></shape>')
     with pytest.raises(BadInput, match=f"line 3.*{message}"):
@@ -61,8 +72,11 @@ def test_wrong_transform_names_the_line(tmp_path, step, message):
 
 
 def test_parameters_and_their_prefixes(tmp_path):
-    path = write(tmp_path, '<default name="h" value="5"/><default name="height" value="$h"/><default name="h" value="9"/>'
-                 '<shape type="cube"><transform><scale z="$height"/><translate x="$h"/></transform></shape>')
+    path = write(
+        tmp_path,
+        '<default name="h" value="5"/><default name="height" value="$h"/><default name="h" value="9"/>'
+        '<shape type="cube"><transform><scale z="$height"/><translate x="$h"/></transform></shape>',
+    )
     matrix = read_mitsuba_xml(path).shapes[0].to_world
     assert matrix[2, 2] == 5 and matrix[0, 3] == 5
 
@@ -76,7 +90,11 @@ def test_undeclared_parameter(tmp_path):
 def test_included_file_finds_its_own_meshes(tmp_path):
     (tmp_path / "part").mkdir()
     (tmp_path / "part" / "m.ply").write_text("")
-    write(tmp_path / "part", '<shape type="ply" id="inner"><string name="filename" value="m.ply"/></shape>', "p.xml")
+    write(
+        tmp_path / "part",
+        '<shape type="ply" id="inner"><string name="filename" value="m.ply"/></shape>',
+        "p.xml",
+    )
     path = write(tmp_path, '<include filename="part/p.xml"/><shape type="cube" id="outer"/>')
     shapes = read_mitsuba_xml(path).shapes
     assert [shape.name for shape in shapes] == ["inner", "outer"]
@@ -90,6 +108,9 @@ def test_files_that_include_each_other(tmp_path):
 
 
 def test_merged_shapes_are_opened_and_cameras_passed_over(tmp_path):
-    path = write(tmp_path, '<sensor type="perspective"><film type="hdrfilm"/></sensor><integrator type="path"/>'
-                 '<shape type="merge"><shape type="cube" id="a"/><shape type="cube" id="b"/></shape>')
+    path = write(
+        tmp_path,
+        '<sensor type="perspective"><film type="hdrfilm"/></sensor><integrator type="path"/>'
+        '<shape type="merge"><shape type="cube" id="a"/><shape type="cube" id="b"/></shape>',
+    )
     assert [shape.name for shape in read_mitsuba_xml(path).shapes] == ["a", "b"]

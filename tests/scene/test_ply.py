@@ -68,14 +68,21 @@ def test_truncated_ascii_says_where(tmp_path):
         read_ply(tmp_path / "a.ply")
 
 
-@pytest.mark.parametrize("data, message", [
-    (b"", "not a PLY"), (b"solid box\n" * 20, "not a PLY"),
-    (header("binary_middle_endian", 1, 1), "line 2"),
-    (header("ascii", 1, 1).replace(b"property float x", b"property fload x"), "line 5"),
-    (header("ascii", 1, 1).replace(b"float z", b"float w") + b"0 0 0\n3 0 0 0\n", "no vertex z"),
-    (header("ascii", 1, 1).replace(b"vertex_indices", b"colours") + b"0 0 0\n3 0 0 0\n", "no face vertex_indices"),
-    (header("ascii", 1, 0) + b"0 0 zero\n", "row 1 of 'vertex'"),
-])
+@pytest.mark.parametrize(
+    "data, message",
+    [
+        (b"", "not a PLY"),
+        (b"solid box\n" * 20, "not a PLY"),
+        (header("binary_middle_endian", 1, 1), "line 2"),
+        (header("ascii", 1, 1).replace(b"property float x", b"property fload x"), "line 5"),
+        (header("ascii", 1, 1).replace(b"float z", b"float w") + b"0 0 0\n3 0 0 0\n", "no vertex z"),
+        (
+            header("ascii", 1, 1).replace(b"vertex_indices", b"colours") + b"0 0 0\n3 0 0 0\n",
+            "no face vertex_indices",
+        ),
+        (header("ascii", 1, 0) + b"0 0 zero\n", "row 1 of 'vertex'"),
+    ],
+)
 def test_what_is_no_ply(tmp_path, data, message):
     (tmp_path / "a.ply").write_bytes(data)
     with pytest.raises(BadInput, match=message):

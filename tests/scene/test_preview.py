@@ -16,7 +16,10 @@ def scene(town, tmp_path):
 def test_height_grid_lies_where_the_houses_are(scene):
     height_m, (x_min, _, y_min, _) = height_grid(scene, cells=200)
     cell_m = (scene.config.extent.x_max_m - x_min) / 200
-    row, column = int((60 - y_min) / cell_m), int((-60 - x_min) / cell_m)  # within house6: x -70..-50, y 50..70
+    row, column = (
+        int((60 - y_min) / cell_m),
+        int((-60 - x_min) / cell_m),
+    )  # within house6: x -70..-50, y 50..70
     assert height_m[row, column] == pytest.approx(20.0, abs=1e-3)
     assert (height_m > 1).mean() == pytest.approx(9 * 400 / 160**2, abs=0.01)
 
@@ -26,6 +29,6 @@ def test_picture_shows_heights_devices_and_starts(scene, tmp_path):
     picture = matplotlib.image.imread(tmp_path / "a.png")[..., :3]
     assert picture.shape[0] > 600 and picture.shape[1] > 600
     for colour in ("#d1495b", "#f08a00"):  # anchors, unknown devices
-        wanted = np.array([int(colour[i:i + 2], 16) / 255 for i in (1, 3, 5)])
+        wanted = np.array([int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)])
         assert (np.abs(picture - wanted).max(axis=2) < 0.03).sum() > 100
     assert len(np.unique((picture * 255).astype(int).reshape(-1, 3), axis=0)) > 50

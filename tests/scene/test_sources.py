@@ -16,21 +16,27 @@ def test_unknown_sionna_scene_lists_the_known_ones():
         find_source("sionna:atlantis")
 
 
-@pytest.mark.parametrize("name, message", [("nothing.xml", "not a file.*munich"), ("city.dae", "'.dae' is not read")])
+@pytest.mark.parametrize(
+    "name, message", [("nothing.xml", "not a file.*munich"), ("city.dae", "'.dae' is not read")]
+)
 def test_not_a_scene_file(tmp_path, name, message):
     (tmp_path / "city.dae").write_text("")
     with pytest.raises(BadInput, match=message):
         find_source(tmp_path / name)
 
 
-@pytest.mark.parametrize("source, name", [("sionna:etoile", "etoile"), ("data/my city (2).xml", "my_city__2_")])
+@pytest.mark.parametrize(
+    "source, name", [("sionna:etoile", "etoile"), ("data/my city (2).xml", "my_city__2_")]
+)
 def test_scene_name(source, name):
     assert scene_name(source) == name
 
 
 def test_building_needs_no_ray_tracer():
     """Rationale: everything but tracing must work where there is no LLVM; importing drjit there can abort."""
-    code = ("import sys; from radiotwin.scene.build import build_scene; "
-            "build_scene('sionna:simple_street_canyon', 'unused', check_only=True); "
-            "sys.exit(bool({'mitsuba', 'drjit', 'sionna.rt'} & set(sys.modules)))")
+    code = (
+        "import sys; from radiotwin.scene.build import build_scene; "
+        "build_scene('sionna:simple_street_canyon', 'unused', check_only=True); "
+        "sys.exit(bool({'mitsuba', 'drjit', 'sionna.rt'} & set(sys.modules)))"
+    )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -10,12 +10,22 @@ from radiotwin.scene.writer import CityShape, write_city
 def folder(tmp_path):
     own = Material("own", relative_permittivity=3.0, conductivity_s_per_m=0.1, scattering_coefficient=0.2)
     tower = trimesh.creation.box((10, 10, 40))
-    write_city(tmp_path, [
-        CityShape("ground", trimesh.Trimesh([[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]],
-                                            [[0, 1, 2], [0, 2, 3]]), itu_material("wet_ground")),
-        CityShape("tower", tower.apply_translation([0, 0, 20]), itu_material("itu_concrete", thickness_m=0.3)),
-        CityShape("shed", tower.copy().apply_translation([30, 0, -30]), own),
-    ])
+    write_city(
+        tmp_path,
+        [
+            CityShape(
+                "ground",
+                trimesh.Trimesh(
+                    [[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0]], [[0, 1, 2], [0, 2, 3]]
+                ),
+                itu_material("wet_ground"),
+            ),
+            CityShape(
+                "tower", tower.apply_translation([0, 0, 20]), itu_material("itu_concrete", thickness_m=0.3)
+            ),
+            CityShape("shed", tower.copy().apply_translation([30, 0, -30]), own),
+        ],
+    )
     return tmp_path
 
 
@@ -41,5 +51,7 @@ def test_sionna_rt_loads_it(folder):
     assert tower.relative_permittivity[0] == pytest.approx(5.24)
     assert tower.thickness[0] == pytest.approx(0.3)
     shed = scene.objects["shed"].radio_material
-    assert [float(value[0]) for value in (shed.relative_permittivity, shed.conductivity, shed.scattering_coefficient)
-            ] == pytest.approx([3.0, 0.1, 0.2])
+    assert [
+        float(value[0])
+        for value in (shed.relative_permittivity, shed.conductivity, shed.scattering_coefficient)
+    ] == pytest.approx([3.0, 0.1, 0.2])

@@ -1,0 +1,408 @@
+import tomllib
+from io import StringIO
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from radiotwin.errors import BadInput
+from radiotwin.scene import Scene
+from radiotwin.scene.build import BuildOptions, build_scene
+from radiotwin.scene.report import print_report
+
+
+def check(source, **options):
+    return build_scene(source, "unused", BuildOptions(**options), check_only=True)
+
+
+def found(report, severity):
+    return "\n".join(problem.message for problem in report.problems if problem.severity == severity)
+
+
+def transformed(town, matrix):
+    """The town's file with one more transform for all of its shapes."""
+    step = f'<transform name="to_world"><matrix value="{matrix}"/></transform>'
+    town.shapes = [shape.replace("<ref", f"{step}<ref") for shape in town.shapes]
+    return town
+
+
+def test_town(town, tmp_path):
+    report = build_scene(town.write(), tmp_path / "out", BuildOptions(devices=10, frequency_hz=5.8e9, seed=3))
+    assert (report.shapes, report.triangles) == (10, 2 + 9 * 12)
+    assert report.extent_m == (-80, 80, -80, 80)
+    assert (report.tallest_m, report.tallest) == (24.0, "house8")
+    assert report.built_fraction == pytest.approx(9 * 400 / 160**2, abs=0.002)
+    assert not report.tracing_would_fail and not report.problems
+    (use,) = report.materials
+    assert (use.name, use.kind, use.shapes, use.in_range) == ("concrete", "ITU concrete", 10, True)
+    assert use.conductivity_s_per_m == pytest.approx(0.0462 * 5.8**0.7822)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "scene.toml",
+        "city.xml",
+        "meshes",
+        "preview.png",
+    }
+    scene = Scene.load(tmp_path / "out")
+    assert scene.config.name == "town" and scene.config.radio.frequency_hz == 5.8e9
+    assert len(scene.config.devices) == 10 and len(scene.config.uavs) == 3
+    assert scene.city.height_at(-60.0, -60.0) == pytest.approx(8.0)
+
+
+def test_same_seed_same_scene_from_anywhere(town, tmp_path):
+    path = town.write()
+    build_scene(path, tmp_path / "a", BuildOptions(devices=6, seed=1))
+    build_scene(path, tmp_path / "b", BuildOptions(devices=6, seed=1))
+    (town.folder).rename(tmp_path / "gone")  # the scenes need nothing outside themselves
+    assert Scene.load(tmp_path / "a").content_hash() == Scene.load(tmp_path / "b").content_hash()
+
+
+def test_check_writes_nothing(town, tmp_path):
+    before = sorted(tmp_path.rglob("*")), town.write()
+    build_scene(town.path, tmp_path / "out", BuildOptions(devices=4), check_only=True)
+    assert sorted(path for path in tmp_path.rglob("*") if path != town.path) == [
+        path for path in before[0] if path != town.path
+    ]
+
+
+def test_truncated_ply(town, tmp_path):
+    town.add("torn", None, text=town.ply(*town.box((0, 5), (0, 5)))[:-40])
+    report = check(town.write())
+    assert report.tracing_would_fail and "mesh10.ply is truncated" in found(report, "error")
+    with pytest.raises(BadInput, match="tracing would fail[^$]*mesh10.ply is truncated"):
+        build_scene(town.path, tmp_path / "out")
+    assert not (tmp_path / "out").exists() and [path.name for path in tmp_path.iterdir()] == ["source"]
+
+
+def test_missing_mesh(town):
+    (town.folder / "mesh3.ply").unlink()
+    report = check(town.write())
+    assert "mesh3.ply does not exist (named in" in found(report, "error") and "line 6" in found(
+        report, "error"
+    )
+    assert report.shapes == 9
+
+
+def test_many_missing_meshes_are_summed_up(town):
+    for path in town.folder.glob("*.ply"):
+        path.unlink()
+    report = check(town.write())
+    assert len(report.problems) == 7 and "5 more shapes" in found(report, "error")
+    print_report(report, Console(quiet=True))
+
+
+def test_malformed_xml_is_raised_even_by_check(town):
+    town.path.write_text(town.write().read_text()[:-4])
+    with pytest.raises(BadInput, match=r"town\.xml, line \d+, column \d+"):
+        check(town.path)
+
+
+def test_no_shapes(empty_city):
+    with pytest.raises(BadInput, match="no shapes"):
+        check(empty_city.write())
+
+
+def test_unknown_material_and_its_remedy(town, tmp_path):
+    town.materials.append('<bsdf type="diffuse" id="mat-red"/>')
+    town.add("hut", town.box((0, 5), (0, 5)), material="mat-red")
+    assert "--material red=itu_concrete" in found(check(town.write()), "error")
+    report = build_scene(town.path, tmp_path / "out", BuildOptions(materials={"red": "itu_brick"}))
+    assert {use.name: use.shapes for use in report.materials} == {"concrete": 10, "brick": 1}
+    assert tomllib.loads((tmp_path / "out" / "scene.toml").read_text())["provenance"]["materials"] == (
+        "{'red': 'itu_brick'}"
+    )
+
+
+@pytest.mark.parametrize("frequency_hz", [-2.4e9, 0.0])
+def test_impossible_frequency(town, tmp_path, frequency_hz):
+    with pytest.raises(BadInput, match="frequency"):
+        build_scene(town.write(), tmp_path / "out", BuildOptions(frequency_hz=frequency_hz))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        ({"scale": 0.0}, "scale 0"),
+        ({"scale": float("nan")}, "scale"),
+        ({"up": "w"}, "'w'"),
+        ({"devices": -1}, "-1 devices"),
+        ({"bbox": (5, 0, 0, 5)}, "bbox"),
+        ({"bbox": (900, 900, 950, 950)}, "is empty; the city lies in x -100 to 100"),
+        ({"devices": 30_000}, "not enough ground"),
+    ],
+)
+def test_impossible_options(town, options, message):
+    with pytest.raises(BadInput, match=message):
+        check(town.write(), **options)
+
+
+def test_sub_gigahertz_scene_keeps_constants_that_sionna_can_load(town, tmp_path):
+    report = build_scene(town.write(), tmp_path / "out", BuildOptions(frequency_hz=868e6))
+    assert "1-100 GHz" in found(report, "warning") and not report.materials[0].in_range
+    xml = (tmp_path / "out" / "city.xml").read_text()
+    assert 'type="radio-material"' in xml and "itu-radio-material" not in xml
+
+
+def test_quads_become_triangles(empty_city, tmp_path):
+    empty_city.add("ground", empty_city.plane())
+    corners, _ = empty_city.box((0, 20), (0, 20))
+    empty_city.add(
+        "house",
+        (corners, [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]),
+    )
+    report = build_scene(empty_city.write(), tmp_path / "out")
+    assert "6 faces with more than three corners in 1 mesh(es) were cut" in found(report, "fixed")
+    assert report.triangles == 2 + 12
+    assert Scene.load(tmp_path / "out").city.inside([[10, 10, 5], [10, 10, 11], [30, 10, 5]]).tolist() == [
+        True,
+        False,
+        False,
+    ]
+
+
+def test_y_up(town, tmp_path):
+    path = transformed(town, "1 0 0 0  0 0 1 0  0 -1 0 0  0 0 0 1").write()  # (x, y, z) -> (x, z, -y)
+    report = check(path)
+    assert report.tracing_would_fail and "the axis y seems to point up" in found(report, "error")
+    assert "seems to point up" not in found(check(path, up="z"), "error")
+    report = build_scene(path, tmp_path / "out", BuildOptions(up="y"))
+    assert report.extent_m == (-80, 80, -80, 80) and (report.tallest_m, report.tallest) == (24.0, "house8")
+    assert Scene.load(tmp_path / "out").city.height_at(60.0, 60.0) == pytest.approx(24.0)
+
+
+def test_y_up_without_ground(town):
+    del town.shapes[0]
+    path = transformed(town, "1 0 0 0  0 0 1 0  0 -1 0 0  0 0 0 1").write()
+    assert "the axis y seems to point up" in found(check(path), "error")
+
+
+@pytest.mark.parametrize(
+    "factor, message, scale",
+    [(1 / 0.3048, None, None), (5 / 0.3048, "feet", 0.3048), (1e-3, "kilometres", 1000.0)],
+)
+def test_units(town, factor, message, scale):
+    """Buildings of 16 m in the middle are 52 ft, which a tall city in metres could have: not noticed, as documented."""
+    path = transformed(town, f"{factor} 0 0 0  0 {factor} 0 0  0 0 {factor} 0  0 0 0 1").write()
+    if message is None:
+        assert not check(path).problems
+        return
+    assert message in found(check(path), "warning")
+    report = check(path, scale=scale)
+    assert not report.problems
+    assert report.tallest_m == pytest.approx(24.0 * factor * scale)
+    assert not found(check(path, scale=1.0), "warning")
+
+
+def test_absurd_extent(town):
+    town.add("stray", town.box((4e6, 4e6 + 20), (0, 20)))
+    assert "km wide" in found(check(town.write()), "error")
+
+
+def test_city_far_from_the_origin_is_moved(town, tmp_path):
+    report = build_scene(
+        transformed(town, "1 0 0 691000  0 1 0 5335000  0 0 1 519  0 0 0 1").write(), tmp_path / "out"
+    )
+    assert "moved by (-691000, -5335000) m" in found(report, "fixed")
+    assert "the ground was at z = 519.000 m: moved to 0" in found(report, "fixed")
+    assert report.extent_m == (-80, 80, -80, 80) and report.tallest_m == pytest.approx(24.0, abs=0.01)
+    provenance = Scene.load(tmp_path / "out").config.provenance
+    assert provenance["moved_m"] == "-691000.000, -5335000.000, -519.000"
+
+
+def test_names_that_sionna_refuses(town, tmp_path):
+    town.add("Straße $5", town.box((0, 5), (0, 5)))
+    town.add("a/b", town.box((10, 15), (0, 5)))
+    town.add("house1", town.box((20, 25), (0, 5)))
+    town.add("mesh-merged-shapes", town.box((30, 35), (0, 5)))
+    report = build_scene(town.write(), tmp_path / "out")
+    assert "2 name(s) had characters" in found(report, "fixed") and "'a/b -> a_b'" in found(report, "fixed")
+    assert "2 shape(s) had the name of another" in found(report, "fixed")
+    files = {path.stem for path in (tmp_path / "out" / "meshes").iterdir()}
+    assert {"Stra_e__5", "a_b", "house1", "house1_2", "merged-shapes_2"} <= files
+
+
+def test_no_ground(town):
+    del town.shapes[0]
+    report = check(town.write())
+    assert "there is no ground" in found(report, "warning") and not report.tracing_would_fail
+
+
+def test_uneven_ground(empty_city):
+    corners, faces = empty_city.plane()
+    corners[2:, 2] = 30.0
+    empty_city.add("slope", (corners, faces)).add("house", empty_city.box((-10, 10), (-10, 10), (10, 35)))
+    empty_city.add("other", empty_city.box((30, 50), (-10, 10), (10, 40)))
+    report = check(empty_city.write())
+    assert "rises to 30.0 m" in found(report, "warning")
+    assert (report.tallest, report.tallest_m) == ("other", pytest.approx(25.0, abs=0.1))
+
+
+def test_degenerate_open_and_inward_meshes(town):
+    corners, faces = town.box((0, 5), (0, 5))
+    town.add("sliver", (corners, [*faces, [0, 0, 1]])).add(
+        "inward", (corners + 7, [face[::-1] for face in faces])
+    )
+    town.add("nothing", (corners, [[0, 0, 1]])).add("open", (corners + [14, 0, 0], faces[2:]))
+    report = check(town.write())
+    fixed, warning = found(report, "fixed"), found(report, "warning")
+    assert "2 degenerate triangles (without area) in 2 mesh(es) were left out ('sliver', 'nothing')" in fixed
+    assert "empty mesh and were left out ('nothing')" in fixed
+    assert "faced inwards" in fixed and "'inward'" in fixed
+    assert "1 of 13 meshes are not watertight ('open')" in warning
+
+
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_vertex_that_is_not_finite(town, value):
+    text = town.ply(*town.box((0, 5), (0, 5))).replace("\n5 5 10\n", f"\n5 {value} 10\n")
+    assert value in text
+    town.add("bad", None, text=text)
+    assert "vertex 8 is not finite" in found(check(town.write()), "error")
+
+
+def add_house_in_two(town, roof_material):
+    corners, faces = town.box((-30, -25), (0, 5), (0, 9))
+    town.add("walls", (corners, faces[0:8])).add("cover", (corners, faces[10:12]), material=roof_material)
+
+
+def test_roof_of_another_material_is_told(town):
+    town.materials.append(
+        '<bsdf type="itu-radio-material" id="tin"><string name="type" value="metal"/></bsdf>'
+    )
+    add_house_in_two(town, "tin")
+    report = check(town.write())
+    assert "2 meshes are roofs and walls of different materials" in found(report, "warning")
+    assert report.shapes == 12
+    assert "joined" in found(check(town.path, materials={"tin": "concrete"}), "fixed")
+
+
+@pytest.mark.llvm
+def test_joined_roof_diffracts_as_one_mesh_does(town, tmp_path):
+    """Rationale: Sionna RT finds no diffracting edge between two meshes.
+
+    Expected: roof and walls of one material, apart in the file, give the gain of a house made in one piece.
+    """
+    from sionna import rt
+
+    gains_db = []
+    for part, cut in (("one", slice(0, 0)), ("two", slice(10, 12))):
+        town.shapes, (corners, faces) = [], town.box((-40, 40), (-5, 5), (0, 20))
+        town.add("walls", (corners, [face for face in faces if face not in faces[cut]]))
+        if part == "two":
+            town.add("cover", (corners, faces[cut]))
+        report = build_scene(town.write(), tmp_path / part)
+        assert report.shapes == 1 and report.triangles == 12
+        scene = rt.load_scene(str(tmp_path / part / "city.xml"))
+        scene.frequency = 2.4e9
+        scene.tx_array = scene.rx_array = rt.PlanarArray(
+            num_rows=1, num_cols=1, pattern="iso", polarization="V"
+        )
+        scene.add(rt.Transmitter("t", [1.0, -30.0, 1.5]))
+        scene.add(rt.Receiver("r", [-2.0, 30.0, 30.0]))
+        paths = rt.PathSolver(deterministic=True)(
+            scene, max_depth=1, diffraction=True, samples_per_src=50_000
+        )
+        gains_db.append(10 * np.log10(np.square(np.array(paths.a)).sum()))
+    assert np.isfinite(gains_db[0]) and gains_db[1] == pytest.approx(gains_db[0], abs=0.01)
+
+
+def test_part_of_a_city(town, tmp_path):
+    report = build_scene(town.write(), tmp_path / "out", BuildOptions(bbox=(-75, -75, 0, 40)))
+    assert sorted(path.stem for path in (tmp_path / "out" / "meshes").iterdir()) == [
+        "ground",
+        "house0",
+        "house1",
+        "house3",
+        "house4",
+    ]
+    assert report.extent_m == (-75, 0, -75, 40)
+
+
+def test_other_files_are_never_erased(town, tmp_path):
+    out = tmp_path / "out"
+    build_scene(town.write(), out)
+    build_scene(town.path, out)  # a scene may be built again
+    (out / "truth.nc").write_text("precious")
+    with pytest.raises(BadInput, match="truth.nc"):
+        build_scene(town.path, out)
+    assert (out / "truth.nc").read_text() == "precious" and (out / "scene.toml").exists()
+
+
+def test_cube_scene_without_mesh_files(empty_city, tmp_path):
+    empty_city.add_xml(
+        '<shape type="rectangle" id="ground"><transform name="to_world"><scale value="60"/></transform>'
+        '<ref id="concrete"/></shape>'
+    )
+    empty_city.add_xml(
+        '<shape type="cube" id="tower"><transform name="to_world"><scale x="10" y="20" z="15"/>'
+        '<translate x="5" z="15"/></transform><ref id="concrete"/></shape>'
+    )
+    report = build_scene(empty_city.write(), tmp_path / "out")
+    assert report.tallest_m == 30.0 and not report.problems
+    city = Scene.load(tmp_path / "out").city
+    np.testing.assert_allclose(city.vertices.max(axis=0), [60, 60, 30])
+    assert city.inside([[14, 19, 29], [16, 19, 29]]).tolist() == [True, False]
+
+
+def test_report_is_printed(town):
+    console = Console(record=True, width=120, file=StringIO())
+    town.add("hut", town.box((0, 5), (0, 5)), material="[red]stone")
+    print_report(check(town.write()), console)
+    text = console.export_text()
+    assert "error" in text and "[red]stone" in text
+
+
+def test_street_canyon_of_sionna(tmp_path):
+    report = build_scene("sionna:simple_street_canyon", tmp_path / "out")
+    assert report.shapes == 7 and report.tallest_m == pytest.approx(50.97, abs=0.01)
+    assert {use.name for use in report.materials} == {"glass", "marble", "wood", "brick", "concrete"}
+
+
+def test_munich_of_sionna(tmp_path):
+    """Rationale: a real city of 2367 meshes, roofs apart from open-bottomed walls.
+
+    Expected: nothing but the warnings about open meshes and seams; known places are inside, streets are not.
+    """
+    report = build_scene(
+        "sionna:munich", tmp_path / "out", BuildOptions(bbox=(-400, -300, 200, 200), devices=10)
+    )
+    assert 500 < report.shapes < 1500 and 0.3 < report.built_fraction < 0.6
+    assert report.tallest.startswith("Frauenkirche") and report.tallest_m == pytest.approx(98.57, abs=0.01)
+    assert not report.tracing_would_fail
+    assert "not watertight" in found(report, "warning") and "roofs and walls" in found(report, "warning")
+    scene = Scene.load(tmp_path / "out")
+    x, y = np.meshgrid(np.arange(-400, 200, 7.0), np.arange(-300, 200, 7.0))
+    top_m = scene.city.height_at(x, y).ravel()
+    points = np.column_stack([x.ravel(), y.ravel(), top_m])
+    built = top_m > 3
+    assert scene.city.inside(points[built] - [0, 0, 1]).mean() > 0.999
+    assert not scene.city.inside(points[built] + [0, 0, 1]).any()
+    assert not scene.city.inside(points[top_m < 0.1] + [0, 0, 1.5]).any()
+
+
+@pytest.mark.llvm
+@pytest.mark.parametrize("frequency_hz", [868e6, 2.4e9, 28e9, 70e9])
+def test_sionna_rt_loads_what_is_built(town, tmp_path, frequency_hz):
+    """Every material that can be declared, at frequencies in and out of its range, with names that are refused."""
+    from sionna import rt
+
+    kinds = ["concrete", "brick", "marble", "floorboard", "medium_dry_ground", "metal"]
+    for number, kind in enumerate(kinds):
+        town.materials.append(f'<bsdf type="diffuse" id="mat-itu_{kind}"/>')
+        town.add(
+            f"itu_{kind}",
+            town.box((10 * number - 30, 10 * number - 25), (-20, -15)),
+            material=f"mat-itu_{kind}",
+        )
+    town.materials.append(
+        '<bsdf type="radio-material" id="glass"><float name="relative_permittivity" value="6"/></bsdf>'
+    )
+    town.add("$x", town.box((-30, -25), (20, 30)), material="glass").add(
+        "concrete", town.box((-20, -15), (20, 30))
+    )
+    build_scene(town.write(), tmp_path / "out", BuildOptions(frequency_hz=frequency_hz))
+    for merge in (True, False):
+        scene = rt.load_scene(str(tmp_path / "out" / "city.xml"), merge_shapes=merge)
+        scene.frequency = frequency_hz
+        constants = [material.relative_permittivity[0] for material in scene.radio_materials.values()]
+        assert len(constants) >= 7 and min(constants) >= 1.0
+    assert len(scene.objects) == 18

@@ -1,0 +1,28 @@
+"""The lattice: what lies on it, and in which order."""
+
+import numpy as np
+import pytest
+
+from radiotwin.errors import BadInput
+from radiotwin.scene.lattice import Lattice
+
+
+def test_both_borders_belong_to_it():
+    lattice = Lattice.over(0, 600, 0, 800, 20, [65, 55, 60])
+    assert lattice.shape == (3, 41, 31)
+    np.testing.assert_array_equal(lattice.z_m, [55, 60, 65])
+    assert lattice.x_m[-1] == 600 and lattice.y_m[-1] == 800 and lattice.step_m == 20
+
+
+def test_a_step_that_does_not_fit_stays_inside():
+    assert Lattice.over(0, 50, -10, 10, 20, [1]).shape == (1, 2, 3)
+
+
+def test_positions_and_their_indices_agree():
+    lattice = Lattice.over(-20, 20, 0, 60, 20, [50, 60])
+    np.testing.assert_array_equal(lattice.index_of(lattice.positions_m), np.arange(2 * 4 * 3))
+
+
+def test_a_position_off_the_lattice_is_refused():
+    with pytest.raises(BadInput, match="not on the lattice"):
+        Lattice.over(0, 40, 0, 40, 20, [50]).index_of(np.array([[20.0, 25.0, 50.0]]))

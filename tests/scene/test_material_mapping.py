@@ -1,0 +1,174 @@
+import pytest
+
+from radiotwin.errors import BadInput
+from radiotwin.scene.material_mapping import map_materials, safe_name, settle, unique_name
+from radiotwin.scene.materials import Material, itu_material
+from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
+
+
+def mapped(city, bsdf, identifier, overrides=None):
+    """(material, problems) of one cube made of `identifier` in a file that declares `bsdf`."""
+    city.materials.append(bsdf)
+    city.add_xml(f'<shape type="cube" id="a"><ref id="{identifier}" name="bsdf"/></shape>')
+    declared = read_mitsuba_xml(city.write())
+    materials, problems = map_materials(declared.shapes, declared.materials, overrides or {})
+    return materials[0], problems
+
+
+def test_itu_radio_material(empty_city):
+    material, problems = mapped(
+        empty_city,
+        '<bsdf type="itu-radio-material" id="mat-facade"><string name="type" '
+        'value="brick"/><float name="thickness" value="0.24"/>'
+        '<float name="scattering_coefficient" value="0.3"/></bsdf>',
+        "mat-facade",
+    )
+    assert material == Material("facade", itu="brick", thickness_m=0.24, scattering_coefficient=0.3)
+    assert problems == []
+
+
+@pytest.mark.parametrize(
+    "identifier, itu",
+    [
+        ("mat-itu_metal", "metal"),
+        ("itu_wet_ground", "wet_ground"),
+        ("itu-wood", "wood"),
+        ("mat-concrete", "concrete"),
+        ("brick", "brick"),
+    ],
+)
+@pytest.mark.parametrize("kind", ["diffuse", "twosided", "principled"])
+def test_older_forms(empty_city, identifier, itu, kind):
+    material, (problem,) = mapped(
+        empty_city,
+        f'<bsdf type="{kind}" id="{identifier}"><bsdf type="diffuse"><rgb '
+        'name="reflectance" value="1 0 0"/></bsdf></bsdf>',
+        identifier,
+    )
+    assert material == Material(itu, itu=itu)
+    assert problem.severity == "fixed" and identifier in problem.message
+
+
+def test_own_constants(empty_city):
+    material, problems = mapped(
+        empty_city,
+        '<bsdf type="radio-material" id="tile"><float name="relative_permittivity" '
+        'value="4.5"/><float name="conductivity" value="0.02"/></bsdf>',
+        "tile",
+    )
+    assert material == Material("tile", relative_permittivity=4.5, conductivity_s_per_m=0.02) and not problems
+
+
+def test_own_constants_under_an_itu_name_get_another(empty_city):
+    """Sionna RT stops at a radio-material called after an ITU material."""
+    material, _ = mapped(
+        empty_city,
+        '<bsdf type="radio-material" id="glass"><float name="relative_permittivity" value="6"/></bsdf>',
+        "glass",
+    )
+    assert material.name == "own-glass" and material.relative_permittivity == 6
+
+
+@pytest.mark.parametrize(
+    "bsdf, identifier, message",
+    [
+        (
+            '<bsdf type="diffuse" id="red"/>',
+            "red",
+            r"line 3: material 'red' \(type 'diffuse'\).*--material red=itu_concrete",
+        ),
+        (
+            '<bsdf type="itu-radio-material" id="m"><string name="type" value="cheese"/></bsdf>',
+            "m",
+            "'cheese'.*concrete",
+        ),
+        ('<bsdf type="itu-radio-material" id="m"/>', "m", "does not exist"),
+        ('<bsdf type="diffuse" id="mat-itu_cheese"/>', "mat-itu_cheese", "does not exist"),
+        ('<bsdf type="absorber-radio-material" id="m"/>', "m", "no radio constants"),
+        ("", "nowhere", "used but not declared.*--material nowhere"),
+        (
+            '<bsdf type="radio-material" id="m"><float name="relative_permittivity" value="0.5"/></bsdf>',
+            "m",
+            "at least 1",
+        ),
+        (
+            '<bsdf type="radio-material" id="m"><float name="conductivity" value="-1"/></bsdf>',
+            "m",
+            "at least 0",
+        ),
+        (
+            '<bsdf type="radio-material" id="m"><float name="scattering_coefficient" value="2"/></bsdf>',
+            "m",
+            "0 to 1",
+        ),
+    ],
+)
+def test_errors(empty_city, bsdf, identifier, message):
+    material, problems = mapped(empty_city, bsdf, identifier)
+    assert material is None
+    assert [problem.severity for problem in problems] == ["error"]
+    with pytest.raises(BadInput, match=message):
+        raise BadInput(problems[0].message)
+
+
+def test_no_number(empty_city):
+    with pytest.raises(BadInput, match="line 3.*'thick'"):
+        mapped(
+            empty_city,
+            '<bsdf type="radio-material" id="m"><float name="thickness" value="thick"/></bsdf>',
+            "m",
+        )
+
+
+@pytest.mark.parametrize("key", ["mat-red", "red"])
+def test_override(empty_city, key):
+    material, problems = mapped(
+        empty_city, '<bsdf type="diffuse" id="mat-red"/>', "mat-red", {key: "itu_brick"}
+    )
+    assert material == Material("brick", itu="brick") and not problems
+
+
+def test_override_of_what_is_not_used(empty_city):
+    with pytest.raises(BadInput, match="'blue'.*uses: concrete"):
+        mapped(empty_city, "", "concrete", {"blue": "itu_brick"})
+
+
+def test_override_with_what_does_not_exist(empty_city):
+    with pytest.raises(BadInput, match="'cheese'"):
+        mapped(empty_city, "", "concrete", {"concrete": "cheese"})
+
+
+def test_shape_without_material(empty_city):
+    declared = read_mitsuba_xml(empty_city.add_xml('<shape type="cube" id="bare"/>').write())
+    materials, (problem,) = map_materials(declared.shapes, declared.materials, {})
+    assert materials == [None] and problem.severity == "error" and "'bare'" in problem.message
+
+
+@pytest.mark.parametrize(
+    "text, safe",
+    [
+        ("a$b", "a_b"),
+        ("Straße 1/2", "Stra_e_1_2"),
+        ("a.b", "a_b"),
+        ("", "unnamed"),
+        ("x" * 300, "x" * 100),
+        ("wall-2_b", "wall-2_b"),
+    ],
+)
+def test_safe_name(text, safe):
+    assert safe_name(text) == safe
+
+
+def test_unique_name_counts_and_minds_case():
+    taken = {"wall"}
+    assert [unique_name("Wall", taken) for _ in range(2)] == ["Wall_2", "Wall_3"]
+
+
+def test_settle_names_what_is_out_of_range():
+    concrete, thick = itu_material("concrete"), itu_material("concrete", thickness_m=0.5)
+    written, problems = settle([concrete, thick, concrete], 5e9, {"concrete"})
+    assert {written[concrete].name, written[thick].name} == {"concrete_2", "concrete_3"} and not problems
+    written, problems = settle([concrete], 700e6, set())
+    assert written[concrete].relative_permittivity == 5.24
+    assert problems[0].severity == "warning" and "1-100 GHz" in problems[0].message
+    assert "5.24" in problems[0].message and "0.0462" in problems[0].message

@@ -1,0 +1,47 @@
+"""A scene that can be traced without LLVM: a law in place of Sionna RT."""
+
+import shutil
+
+import numpy as np
+import pytest
+
+from radiotwin.scene import Scene
+
+
+@pytest.fixture
+def own_scene(small_scene, tmp_path):
+    """A copy of `preset:small` whose cache belongs to one test."""
+    folder = tmp_path / "scene"
+    shutil.copytree(small_scene.folder, folder, ignore=shutil.ignore_patterns("cache"))
+    return Scene.load(folder)
+
+
+@pytest.fixture
+def law(monkeypatch, small_scene):
+    """Stands in for `PathGains`: free space, 25 dB less without LoS, no path there beyond 250 m. Counts its calls."""
+
+    class Law:
+        calls = 0
+        offset_db = 0.0
+
+        def __init__(self, xml_path, frequency_hz, settings):
+            self.step = settings.batch_receivers
+            self.wavelength_m = 299_792_458.0 / frequency_hz
+
+        def batches(self, n):
+            return [slice(start, min(start + self.step, n)) for start in range(0, n, self.step)]
+
+        def solve(self, device_m, points_m):
+            Law.calls += 1
+            distance_m = np.linalg.norm(points_m - device_m, axis=1)
+            los = small_scene.city.line_of_sight(device_m[None], points_m)
+            gain_db = 20 * np.log10(self.wavelength_m / (4 * np.pi * distance_m)) - 25 * ~los + Law.offset_db
+            return np.where(~los & (distance_m > 250), np.nan, gain_db)
+
+        def gains(self, device_m, points_m):
+            for part in self.batches(len(points_m)):
+                yield self.solve(device_m, points_m[part])
+
+    monkeypatch.setattr("radiotwin.trace.run.PathGains", Law)
+    monkeypatch.setattr("radiotwin.trace.points.PathGains", Law)
+    return Law

@@ -1,0 +1,77 @@
+"""Gains at any points: the file of points, and why nothing is detected."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.errors import BadInput
+from radiotwin.trace import SolverSettings, read_points, trace_gains, trace_points
+
+SETTINGS = SolverSettings(batch_receivers=4)
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+def test_reads_the_columns_it_needs(tmp_path):
+    path = write(tmp_path / "points.csv", "name, z_m, x_m,y_m\na,3,1,2\nb,30.5,-1e1,0\n")
+    assert read_points(path).tolist() == [[1, 2, 3], [-10, 0, 30.5]]
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("x_m,y_m\n1,2\n", "column 'z_m' is missing"),
+    ("x_m,y_m,z_m\n1,2,3\n1,two,3\n", "row 3, column y_m: 'two' is not a finite number"),
+    ("x_m,y_m,z_m\n1,2,inf\n", "row 2, column z_m: 'inf' is not a finite number"),
+    ("x_m,y_m,z_m\n1,,3\n", "row 2, column y_m: '' is not a finite number"),
+    ("x_m,y_m,z_m\nnan,2,3\n", "row 2, column x_m: 'nan' is not a finite number"),
+    ("x_m,y_m,z_m\n", "has no rows"),
+    ("", "cannot be read as CSV"),
+    ("x_m,y_m,z_m\n1,2,3,4,5\n1,2\n\"", "cannot be read as CSV|not a finite number"),
+])
+def test_bad_points_name_row_and_column(tmp_path, text, message):
+    path = write(tmp_path / "points.csv", text)
+    with pytest.raises(BadInput, match=message) as error:
+        read_points(path)
+    assert str(path) in str(error.value)
+
+
+def test_missing_file_is_bad_input(tmp_path):
+    with pytest.raises(BadInput, match="does not exist"):
+        read_points(tmp_path / "none.csv")
+
+
+def test_each_link_has_a_gain_or_a_reason(small_scene, law, tmp_path):
+    lattice_m = small_scene.lattice.positions_m[::9]
+    low_m = np.column_stack([lattice_m[:, :2], np.full(len(lattice_m), 2.0)])
+    points_m = np.concatenate([lattice_m, low_m])
+    out = tmp_path / "gains.csv"
+    table = trace_points(small_scene, points_m, SETTINGS, out, devices=["d3", "d0"])
+    assert list(table.columns) == ["device", "x_m", "y_m", "z_m", "gain_db", "los", "reason"]
+    assert list(dict.fromkeys(table["device"])) == ["d3", "d0"] and len(table) == 2 * len(points_m)
+    assert set(table["reason"]) == {"", "no path", "inside a building"}
+    assert (table["gain_db"].isna() == (table["reason"] != "")).all()
+    inside = np.tile(small_scene.city.inside(points_m), 2)
+    assert ((table["reason"] == "inside a building") == inside).all()
+    read = pd.read_csv(out, keep_default_na=False)
+    assert (read["gain_db"] == "").sum() == table["gain_db"].isna().sum()
+    assert (read["reason"] == table["reason"]).all()
+
+
+def test_weak_links_are_below_sensitivity(small_scene, law):
+    law.offset_db = -30.0
+    table = trace_points(small_scene, small_scene.lattice.positions_m, SETTINGS, devices=["d0"])
+    assert (table["reason"] == "below sensitivity").sum() > 10
+    assert table["gain_db"].min() >= small_scene.config.gain_limit_db
+
+
+def test_unknown_format_is_refused_before_the_work(small_scene, law, tmp_path):
+    with pytest.raises(BadInput, match="allowed are .csv"):
+        trace_points(small_scene, np.ones((1, 3)), SETTINGS, tmp_path / "gains.xlsx")
+    assert law.calls == 0
+
+
+def test_points_need_the_paths(small_scene):
+    with pytest.raises(BadInput, match="averages over lattice cells"):
+        trace_gains(small_scene, np.ones((1, 3)), np.ones((1, 3)), SolverSettings(solver="map"))

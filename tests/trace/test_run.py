@@ -1,0 +1,124 @@
+"""The orchestration of a trace: cache, resumption, censoring, attributes. Gains come from a law here."""
+
+import numpy as np
+import pytest
+
+from radiotwin.errors import BadInput, RunFailed
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.scene.config import write_config
+from radiotwin.trace import SolverSettings, trace_map
+
+SETTINGS = SolverSettings(batch_receivers=100)
+BATCHES = 6  # of 2 x 16 x 16 positions
+DEVICES = 7
+
+
+def with_radio(scene, **changes):
+    radio = scene.config.radio.model_copy(update=changes)
+    write_config(scene.config.model_copy(update={"radio": radio}), scene.folder / "scene.toml")
+    return Scene.load(scene.folder)
+
+
+def batch_files(scene):
+    return sorted((scene.folder / "cache").glob("trace-*/device-*-batch-*.npy"))
+
+
+def test_map_holds_the_gains_of_every_link(own_scene, law, tmp_path):
+    returned = trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
+    read = RadioMap.read(tmp_path / "truth.nc")
+    assert np.array_equal(read.gain_db, returned.gain_db, equal_nan=True)
+    assert read.devices == [device.device for device in own_scene.config.devices]
+    raw_db = np.stack([law(None, 2.4e9, SETTINGS).solve(device_m, own_scene.lattice.positions_m)
+                       for device_m in own_scene.device_m]).reshape(read.gain_db.shape)
+    detected = raw_db >= own_scene.config.gain_limit_db
+    assert 0.5 < detected.mean() < 1
+    assert np.array_equal(np.isfinite(read.gain_db), detected)
+    assert read.gain_db[detected] == pytest.approx(raw_db[detected], abs=1e-4)
+
+
+def test_attributes_say_what_was_done(own_scene, law, tmp_path):
+    attributes = trace_map(with_radio(own_scene, sensitivity_dbm=-110.0), SETTINGS, tmp_path / "truth.nc").dataset.attrs
+    assert attributes["source"] == "raytrace"
+    assert attributes["frequency_hz"] == 2.4e9
+    assert attributes["scene_hash"] == Scene.load(own_scene.folder).content_hash()
+    assert attributes["max_depth"] == SETTINGS.max_depth and attributes["combining"] == "power"
+    assert attributes["noise_floor_db"] == 0  # the law has none
+    assert attributes["sionna_rt_version"]
+    counts = [attributes[f"links_{name}"] for name in
+              ("detected", "without_path", "below_sensitivity", "inside_building")]
+    assert sum(counts) == DEVICES * 512
+    assert min(counts[:3]) > 0
+
+
+def test_rerun_solves_nothing_and_gives_the_same_file(own_scene, law, tmp_path):
+    trace_map(own_scene, SETTINGS, tmp_path / "first.nc")
+    solved = law.calls
+    assert solved >= DEVICES * BATCHES
+    trace_map(Scene.load(own_scene.folder), SETTINGS, tmp_path / "second.nc")
+    assert law.calls == solved
+    assert (tmp_path / "first.nc").read_bytes() == (tmp_path / "second.nc").read_bytes()
+
+
+def test_only_what_is_missing_or_damaged_is_solved_again(own_scene, law, tmp_path):
+    first = trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
+    files = batch_files(own_scene)
+    assert len(files) == DEVICES * BATCHES
+    files[3].unlink()
+    files[8].write_bytes(files[8].read_bytes()[:100])
+    np.save(files[11], np.zeros(3))
+    law.calls = 0
+    again = trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
+    assert law.calls == 3
+    assert again.gain_db.tobytes() == first.gain_db.tobytes()
+
+
+@pytest.mark.parametrize("change", [{"max_depth": 3}, {"seed": 2}, {"batch_receivers": 50}])
+def test_other_settings_are_solved_anew_beside_the_old(own_scene, law, tmp_path, change):
+    trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
+    old = batch_files(own_scene)
+    law.calls = 0
+    trace_map(own_scene, SolverSettings(**({"batch_receivers": 100} | change)), tmp_path / "truth.nc")
+    assert law.calls >= DEVICES * BATCHES
+    assert set(old) < set(batch_files(own_scene))
+
+
+def test_changed_geometry_is_solved_anew(own_scene, law, tmp_path):
+    trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
+    law.calls = 0
+    with open(own_scene.xml_path, "a") as xml:
+        xml.write("<!-- changed -->")
+    trace_map(Scene.load(own_scene.folder), SETTINGS, tmp_path / "truth.nc")
+    assert law.calls >= DEVICES * BATCHES
+
+
+def test_some_devices_are_the_rows_of_the_whole_map(own_scene, law, tmp_path):
+    part = trace_map(own_scene, SETTINGS, tmp_path / "part.nc", devices=["d4", "d1"])
+    whole = trace_map(own_scene, SETTINGS, tmp_path / "whole.nc")
+    assert part.devices == ["d4", "d1"]
+    assert np.array_equal(part.gain_db, whole.gain_db[[4, 1]], equal_nan=True)
+
+
+def test_unknown_device_is_bad_input(own_scene, law, tmp_path):
+    with pytest.raises(BadInput, match="'d99' is not in .*it has d0, d1"):
+        trace_map(own_scene, SETTINGS, tmp_path / "truth.nc", devices=["d99"])
+
+
+@pytest.mark.parametrize(("offset_db", "message"), [(5.0, "from free space"), (-3.0, "from free space"),
+                                                    (120.0, "more power")])
+def test_map_that_physics_does_not_allow_is_not_written(own_scene, law, tmp_path, offset_db, message):
+    law.offset_db = offset_db
+    with pytest.raises(RunFailed, match=message):
+        trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
+    assert not list(tmp_path.glob("*.nc"))
+
+
+def test_positions_inside_buildings_have_no_gain(own_scene, law, tmp_path):
+    lattice = own_scene.config.lattice.model_copy(update={"altitudes_m": [5.0]})
+    write_config(own_scene.config.model_copy(update={"lattice": lattice, "uavs": []}), own_scene.folder / "scene.toml")
+    scene = Scene.load(own_scene.folder)
+    inside = scene.city.inside(scene.lattice.positions_m)
+    assert inside.sum() > 20
+    radio_map = trace_map(scene, SETTINGS, tmp_path / "truth.nc")
+    assert np.isnan(radio_map.gain_db.reshape(DEVICES, -1)[:, inside]).all()
+    assert radio_map.dataset.attrs["links_inside_building"] == DEVICES * inside.sum()
