@@ -40,15 +40,14 @@ class Comparison:
         tables = []
         estimated = self.scores[self.scores["positions"] == "estimated"]
         for against, part in estimated.groupby("against", sort=False):
-            columns = {"model": "left"} | {f"{measure} {links}": "right" for measure in ("RMSE", "MAE", "bias")
-                                           for links in CLASSES}
+            columns = {"model": "left"} | dict.fromkeys(("RMSE", "MAE", "bias"), "right")
             rows = []
             for model, of_model in part.groupby("model", sort=False):
                 of_class = of_model.set_index("links")
-                rows.append([model, *(float(of_class.loc[links, f"{measure}_db"])
-                                      for measure in ("rmse", "mae", "bias") for links in CLASSES)])
+                rows.append([model, *("/".join(_short(of_class.loc[links, f"{measure}_db"]) for links in CLASSES)
+                                      for measure in ("rmse", "mae", "bias"))])
             links = part.groupby("links")["n"].max()
-            tables.append((f"Error on {against} [dB]  ({links['all']} links detected, {links['LoS']} LoS)",
+            tables.append((f"Error on {against} [dB]: all/LoS/NLoS of {links['all']}/{links['LoS']}/{links['NLoS']} links",
                            columns, rows))
         summary = self.location_summary()
         if len(summary):
@@ -66,6 +65,10 @@ class Comparison:
         if self.locations.empty or self.locations["error_m"].isna().all():
             return pd.DataFrame(columns=["model", "devices", "median_m", "p90_m", "worst_m"])
         return self.locations.groupby("model", sort=False)["error_m"].apply(summary).unstack().reset_index()
+
+
+def _short(value: float) -> str:
+    return "–" if np.isnan(value) else f"{value:.2f}"
 
 
 def split_flights(measurements: Measurements, held_out: int) -> tuple[Measurements, Measurements]:

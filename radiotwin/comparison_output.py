@@ -1,6 +1,7 @@
 """What a comparison leaves in its folder: tables as CSV and JSON, and figures."""
 
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,11 @@ SCHEMA = "radiotwin.comparison/1"
 SHOWN = ("log_distance", "segmented_nn")
 
 
-def judge_also(paths: list[Path], truth: RadioMap | None) -> tuple[dict[str, Twin], dict[str, RadioMap]]:
+def judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
+               ) -> tuple[dict[str, Twin], dict[str, RadioMap]]:
     """Twins and radio maps that a user wants in the tables, by the names of their files.
+
+    Warns where a twin has been fitted to one of the `held_out` flights already.
 
     Raises:
         BadInput: neither a twin's folder nor a radio map, or a map with no truth to hold it against.
@@ -27,6 +31,10 @@ def judge_also(paths: list[Path], truth: RadioMap | None) -> tuple[dict[str, Twi
     for path in paths:
         if path.is_dir():
             twins[str(path)] = Twin.load(path)
+            seen = sorted(set(twins[str(path)].provenance.get("flights", [])) & set(held_out))
+            if seen:
+                warnings.warn(f"{path} was fitted to {', '.join(seen[:4])}, which is held out here: its error on "
+                              "held-out flights is too good", stacklevel=2)
         elif truth is None:
             raise BadInput(f"{path}: a radio map can only be judged on a whole map; give --truth, too")
         else:

@@ -2,7 +2,9 @@
 
 import warnings
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 console = Console(highlight=False)
@@ -37,11 +39,11 @@ def print_rows(title: str, columns: dict[str, str], rows: list[list]) -> None:
         columns: heading -> `left` or `right`.
         rows: cells; floats are printed with two decimals, NaN as a dash.
     """
-    table = Table(title=title, title_justify="left", title_style="bold")
+    table = Table(title=escape(title), title_justify="left", title_style="bold", box=SIMPLE_HEAD, pad_edge=False)
     for heading, justify in columns.items():
-        table.add_column(heading, justify=justify)
+        table.add_column(escape(heading), justify=justify)
     for row in rows:
-        table.add_row(*(_text(cell) for cell in row))
+        table.add_row(*(escape(_text(cell)) for cell in row))
     console.print(table)
 
 

@@ -95,7 +95,7 @@ def compare(
     world = Scene.load(scene)
     train, test = split_flights(read_measurements(measurements, devices), held_out)
     truth_map = read_truth(world, truth) if truth else None
-    twins, maps = judge_also(also or [], truth_map)
+    twins, maps = judge_also(also or [], truth_map, test.flights)
     comparison = compare_models(train, test, world, truth_map, seed=seed, twins=twins, maps=maps)
     write_comparison(comparison, world, truth_map, out)
     print_comparison(comparison)

@@ -54,7 +54,7 @@ class Posterior:
         A mode is a connected patch of the scan's grid whose cells hold at least MODE_FLOOR of what the heaviest
         holds. Its position is the mean over it under the likelihood as it is: tempering widens a posterior, it does
         not move a composite likelihood's estimate. Where a device may not be at the mean (`allowed`: (p, 2) to (p,)
-        bool), or a crescent's mean falls beside it, it is the nearest of the patch's points.
+        bool), or a crescent's mean falls beside it, it is the patch's most likely point.
         """
         column, row = np.round((self.cell_m - self.cell_m.min(axis=0)) / self.width_m.max()).astype(int).T
         grid = np.zeros((row.max() + 1, column.max() + 1))
@@ -71,7 +71,7 @@ class Posterior:
             mean = share @ self.xy_m[mine] / share.sum()
             beside = np.abs(self.cell_m[mine] - mean).max(axis=1).min() > self.width_m.max() / 2
             if beside or not allowed(mean[None])[0]:
-                mean = self.xy_m[mine][np.argmin(np.linalg.norm(self.xy_m[mine] - mean, axis=1))]
+                mean = self.xy_m[mine][height.argmax()]
             found.append((mean, float(weights[k])))
         return found
 

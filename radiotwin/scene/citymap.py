@@ -10,9 +10,9 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
-import trimesh
 
 from radiotwin.errors import BadInput, RunFailed
+from radiotwin.scene.ply import read_ply
 
 SKIN_M = 0.01
 CHUNK = 1_000_000  # rays a call: bounds the memory of any query to about 100 MB
@@ -60,18 +60,16 @@ class CityMap:
             raise BadInput(f"{xml_path} does not exist; `radiotwin build-scene` makes a scene folder") from None
         except ElementTree.ParseError as error:
             raise BadInput(f"{xml_path} is not well-formed XML: {error}") from None
-        meshes = []
+        vertices, faces, count = [], [], 0
         for name in root.findall("./shape/string[@name='filename']"):
-            mesh_path = xml_path.parent / name.get("value", "")
-            try:
-                meshes.append(trimesh.load(mesh_path, force="mesh", process=False))
-            except Exception as error:  # trimesh raises whatever the parser of the day met
-                raise BadInput(f"{xml_path}: mesh {mesh_path} cannot be read ({error}); build the scene again "
-                               "with `radiotwin build-scene`") from None
-        if not meshes:
-            raise BadInput(f"{xml_path} names no meshes; build the scene with `radiotwin build-scene`")
-        city = trimesh.util.concatenate(meshes)
-        return cls(city.vertices, city.faces)
+            corners, polygons = read_ply(xml_path.parent / name.get("value", ""))
+            vertices.append(corners)
+            faces += [triangles + count for triangles in polygons]
+            count += len(corners)
+        if not faces or any(triangles.shape[1] != 3 for triangles in faces):
+            raise BadInput(f"{xml_path} names no meshes, or some that are not of triangles; build the scene with "
+                           "`radiotwin build-scene`")
+        return cls(np.concatenate(vertices), np.concatenate(faces))
 
     def line_of_sight(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
         """Whether nothing stands between the points (two points within one solid have nothing in between).

@@ -62,9 +62,12 @@ def read_ply(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
         (v, 3) vertices, and one (n, k) array of vertex indices for each number of corners k that occurs.
 
     Raises:
-        BadInput: not a PLY file, truncated, or without vertices or faces as its header should declare them.
+        BadInput: no such file, not a PLY file, truncated, or without vertices or faces as its header should declare them.
     """
-    data = path.read_bytes()
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise BadInput(f"{path} cannot be read: {error.strerror}; export the mesh again") from None
     order, elements, start = _read_header(path, data)
     columns = (
         _read_ascii(path, data[start:], elements)

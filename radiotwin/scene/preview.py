@@ -58,7 +58,7 @@ def draw_preview(scene: Scene, path: Path | str) -> None:
         figure.legend(loc="outside lower center", ncols=3, frameon=False)
     axes.set_title(f"{scene.config.name}   ({scene.config.radio.frequency_hz / 1e9:g} GHz)")
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110)
+        figure.savefig(temporary, dpi=110, bbox_inches="tight", pad_inches=0.15)
 
 
 def draw_heights(axes, height_m: np.ndarray, bounds: tuple[float, float, float, float]):

@@ -8,6 +8,10 @@ import numpy as np
 from radiotwin.trace.settings import DIFFRACTION_PROBABILITY, TABLE_SIZE, SolverSettings
 from radiotwin.trace.sionna_scene import candidate_search, import_sionna, load_city
 
+# Dr.Jit keeps freed memory for the next call, which takes the same sizes again but for the paths themselves.
+# Given back after every call, 40 % of the time goes into asking the system for it anew; never, it may pile up.
+CALLS_BETWEEN_FLUSHES = 10
+
 
 class PathGains:
     """Gains from one device to many points, found by shooting rays and the image method.
@@ -28,6 +32,7 @@ class PathGains:
 
     def __init__(self, xml_path: Path | str | None, frequency_hz: float, settings: SolverSettings):
         self.settings = settings
+        self._calls = 0
         self._city = load_city(xml_path, frequency_hz)
         rt = import_sionna()
         self._solver = rt.PathSolver(deterministic=True)
@@ -66,7 +71,9 @@ class PathGains:
                 diffraction=settings.diffraction, seed=settings.seed)
         power = self._combine(paths)[: len(points_m)]
         del paths
-        drjit.flush_malloc_cache()
+        self._calls += 1
+        if self._calls % CALLS_BETWEEN_FLUSHES == 0:
+            drjit.flush_malloc_cache()
         with np.errstate(divide="ignore"):
             return np.where(power > 0, 10 * np.log10(power), np.nan)
 

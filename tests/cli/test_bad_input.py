@@ -1,0 +1,125 @@
+"""Bad input: one clear message, exit status 2, no traceback, and no partial file."""
+
+import shutil
+
+import pandas as pd
+import pytest
+
+from radiotwin.measurements import read_measurements
+
+
+@pytest.fixture(scope="module")
+def good(run, tmp_path_factory):
+    """A scene, and a survey of two flights in it."""
+    folder = tmp_path_factory.mktemp("good")
+    assert run("build-scene preset:small -o scene", cwd=folder).returncode == 0
+    assert run("survey scene --truth segmented --flights 2 -o measurements.csv", cwd=folder).returncode == 0
+    return folder
+
+
+@pytest.fixture
+def here(good, tmp_path):
+    """A copy that a test may spoil."""
+    shutil.copytree(good, tmp_path, dirs_exist_ok=True)
+    return tmp_path
+
+
+def refuse(run, words, folder, *parts):
+    before = sorted(path.relative_to(folder) for path in folder.rglob("*"))
+    result = run(words, cwd=folder)
+    assert result.returncode == 2, (result.returncode, result.stderr)
+    assert "Traceback" not in result.stderr
+    for part in parts:
+        assert part in result.stderr
+    assert sorted(path.relative_to(folder) for path in folder.rglob("*")) == before, "something was left behind"
+
+
+def change(folder, edit):
+    """Rewrite the measurements with `edit(table)`."""
+    path = folder / "measurements.csv"
+    table = pd.read_csv(path, dtype=object)
+    edit(table).to_csv(path, index=False)
+
+
+FIT = "fit measurements.csv --scene scene -o twin"
+
+
+def test_a_missing_column(run, here):
+    change(here, lambda table: table.drop(columns="receiver_z_m"))
+    refuse(run, FIT, here, "measurements.csv", "receiver_z_m", "missing")
+
+
+def test_a_text_in_a_number_column(run, here):
+    change(here, lambda table: table.assign(gain_db=["loud", *table["gain_db"][1:]]))
+    refuse(run, FIT, here, "measurements.csv", "row 2", "gain_db", "loud")
+
+
+def test_an_infinite_gain(run, here):
+    change(here, lambda table: table.assign(gain_db=[*table["gain_db"][:-1], "-inf"]))
+    refuse(run, FIT, here, "column gain_db", "'-inf' is not finite", "leave the cell empty")
+
+
+def test_a_device_that_is_not_declared(run, here):
+    change(here, lambda table: table.assign(device=["d99", *table["device"][1:]]))
+    refuse(run, FIT, here, "row 2", "'d99' is not in", "devices.csv")
+
+
+def test_no_anchor(run, here):
+    devices = (here / "devices.csv").read_text().replace("anchor", "unknown")
+    (here / "devices.csv").write_text(devices)
+    refuse(run, FIT, here, "no anchor", "devices.csv")
+
+
+def test_one_flight_only(run, here):
+    change(here, lambda table: table[table["flight"] == "f0"])
+    refuse(run, "compare measurements.csv --scene scene -o comparison", here, "1 flight", "at least 2")
+
+
+def test_nothing_detected(run, here):
+    change(here, lambda table: table.assign(gain_db=""))
+    refuse(run, FIT, here, "nothing detected")
+
+
+def test_all_links_nlos(run, here):
+    """Anchors moved into a closed courtyard of their own: no receiver sees them, whatever the levels say."""
+    measurements = read_measurements(here / "measurements.csv")
+    from radiotwin.scene import Scene
+    scene = Scene.load(here / "scene")
+    seen = scene.city.line_of_sight(scene.device_m[measurements.device_index], measurements.receiver_m)
+    measurements.select(~seen).write(here / "measurements.csv")
+    refuse(run, FIT, here, "all links NLoS", "log_distance")
+
+
+def test_a_negative_frequency(run, here):
+    path = here / "scene" / "scene.toml"
+    path.write_text(path.read_text().replace("frequency_hz = 2400000000.0", "frequency_hz = -2.4e9"))
+    refuse(run, FIT, here, "scene.toml", "radio.frequency_hz = -2400000000.0")
+
+
+def test_a_device_inside_a_building(run, here):
+    path = here / "scene" / "scene.toml"
+    path.write_text(path.read_text().replace("x_m = 160.0, y_m = 120.0", "x_m = 130.0, y_m = 170.0"))
+    refuse(run, "survey scene --truth segmented -o s.csv", here, "scene.toml", "device 'd3'", "inside a building")
+
+
+@pytest.mark.parametrize(("words", "parts"), [
+    ("fit no.csv --scene scene -o twin", ["no.csv does not exist"]),
+    ("fit measurements.csv --scene nowhere -o twin", ["nowhere is not a folder"]),
+    ("fit measurements.csv --scene scene --model magic -o twin", ["'magic' is unknown; allowed are"]),
+    ("fit measurements.csv --scene scene -o scene", ["scene is not empty and not a twin's folder"]),
+    ("survey scene --truth traced -o s.csv", ["truth.nc does not exist", "radiotwin trace"]),
+    ("survey scene --truth segmented --pattern spiral -o s.csv", ["'spiral' is unknown; allowed are"]),
+    ("survey scene --truth segmented -o s.xlsx", ["unknown format"]),
+    ("map nothing --scene scene", ["not a twin's folder"]),
+    ("map nothing --scene scene -o map.bmp", ["unknown format '.bmp'; allowed are"]),
+    ("compare measurements.csv --scene scene --held-out 0", ["at least 1 is needed"]),
+    ("compare measurements.csv --scene scene --truth no.nc", ["no.nc does not exist"]),
+    ("build-scene preset:atlantis -o x", ["'atlantis' does not exist; allowed are rbm"]),
+    ("build-scene no.xml -o x", ["no.xml"]),
+    ("build-scene sionna:atlantis -o x", ["atlantis", "munich"]),
+    ("build-scene preset:small -o measurements.csv", ["measurements.csv is a file"]),
+    ("trace scene --quality best", ["quality 'best' is unknown; allowed are"]),
+    ("trace scene --devices d99", ["d99"]),
+])
+def test_options_that_cannot_be(run, here, words, parts):
+    refuse(run, words, here, *parts)
