@@ -41,7 +41,7 @@ lint: $(INSTALLED)
 	$(BIN)/ruff check
 
 bench: llvm
-	for benchmark in benchmarks/bench_*.py; do $(BIN)/python $$benchmark || exit 1; done
+	for benchmark in benchmarks/*.py; do $(BIN)/python $$benchmark || exit 1; done
 
 # The second run does nothing, until what is to be installed has changed.
 $(INSTALLED): pyproject.toml constraints.txt

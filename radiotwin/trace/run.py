@@ -6,16 +6,14 @@ from pathlib import Path
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.progress import progress
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.trace.batches import BatchStore
-from radiotwin.trace.cell_gains import CellGains
 from radiotwin.trace.gates import check_gains
-from radiotwin.trace.noise import FINER, noise_figures, sample_receivers
+from radiotwin.trace.lattice_gains import solve_finer, solve_lattice
+from radiotwin.trace.noise import noise_figures
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.sionna_scene import library_versions
-from radiotwin.trace.solver import PathGains
 
 
 def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
@@ -45,7 +43,7 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
     device_m = scene.device_m[index]
     key = _key(scene, settings)
     store = BatchStore(scene.folder / "cache", key)
-    raw_db = _solve_all(scene, settings, store, index)
+    raw_db = solve_lattice(scene, settings, store, index)
 
     los = np.stack([scene.city.line_of_sight(one_m[None], positions_m) for one_m in device_m])
     inside = scene.blocked.ravel()
@@ -55,11 +53,10 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
                           frequency_hz, settings.solver, settings.combining)
     limit_db = scene.config.gain_limit_db
     gain_db, counts = _censor(raw_db, inside, limit_db)
-    if settings.solver == "paths":
-        sample, finer_db = _solve_sample(scene, settings, store, index)
-        outside = ~inside[sample]
-        finer_db = np.where(finer_db >= limit_db, finer_db, np.nan)
-        figures |= noise_figures(gain_db[:, sample][:, outside].ravel(), finer_db[:, outside].ravel())
+    rows, columns, finer_db = solve_finer(scene, settings, store, index)
+    outside = ~inside[columns]
+    finer_db = np.where(finer_db >= limit_db, finer_db, np.nan)
+    figures |= noise_figures(gain_db[rows, columns][:, outside].ravel(), finer_db[:, outside].ravel())
     radio_map = RadioMap.build(
         [scene.config.devices[i].device for i in index], scene.lattice, gain_db, los,
         attributes={"source": "raytrace", "frequency_hz": frequency_hz, "gain_limit_db": limit_db,
@@ -91,65 +88,6 @@ def _key(scene: Scene, settings: SolverSettings) -> dict:
         "scene": scene.content_hash(), "lattice": {axis: getattr(lattice, axis).tolist() for axis in ("x_m", "y_m", "z_m")},
         "settings": settings.attributes(), "libraries": library_versions(),
     }
-
-
-def _solve_all(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int]) -> np.ndarray:
-    """(devices, positions) gain [dB], NaN where there is no path; what is missing in the store is solved."""
-    lattice = scene.lattice
-    positions_m = lattice.positions_m
-    if settings.solver == "paths":
-        step, label = settings.batch_receivers, "batch"
-    else:
-        step, label = len(lattice.y_m) * len(lattice.x_m), "altitude"
-    parts = [slice(start, min(start + step, len(positions_m))) for start in range(0, len(positions_m), step)]
-    gain_db = np.empty((len(index), len(positions_m)))
-    missing = []
-    for row, device in enumerate(index):
-        for number, part in enumerate(parts):
-            name = f"device-{device:03d}-{label}-{number:05d}"
-            known_db = store.get(name, part.stop - part.start)
-            if known_db is None:
-                missing.append((name, row, part))
-            else:
-                gain_db[row, part] = known_db
-    if not missing:
-        return gain_db
-    frequency_hz = scene.config.radio.frequency_hz
-    if settings.solver == "paths":
-        paths = PathGains(scene.xml_path, frequency_hz, settings)
-    else:
-        cells = CellGains(scene.xml_path, frequency_hz, settings, lattice)
-    with progress("tracing", total=sum(part.stop - part.start for _, _, part in missing)) as advance:
-        for name, row, part in missing:
-            device_m = scene.device_m[index[row]]
-            if settings.solver == "paths":
-                gain_db[row, part] = paths.solve(device_m, positions_m[part])
-            else:
-                gain_db[row, part] = cells.solve(device_m, positions_m[part.start, 2])
-            store.put(name, gain_db[row, part])
-            advance(part.stop - part.start)
-    return gain_db
-
-
-def _solve_sample(scene: Scene, settings: SolverSettings, store: BatchStore,
-                  index: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """A sample of positions (m,) and their gains (devices, m) [dB] with ten times the rays."""
-    sample = sample_receivers(len(scene.lattice.positions_m), settings.seed)
-    points_m = scene.lattice.positions_m[sample]
-    names = [f"device-{device:03d}-finer" for device in index]
-    known = [store.get(name, len(sample)) for name in names]
-    missing = [row for row, gain_db in enumerate(known) if gain_db is None]
-    if missing:
-        finer = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings.finer(FINER))
-        with progress("numerical noise", total=len(missing) * len(sample)) as advance:
-            for row in missing:
-                parts = []
-                for gain_db in finer.gains(scene.device_m[index[row]], points_m):
-                    parts.append(gain_db)
-                    advance(len(gain_db))
-                known[row] = np.concatenate(parts)
-                store.put(names[row], known[row])
-    return sample, np.stack(known)
 
 
 def _censor(raw_db: np.ndarray, inside: np.ndarray, limit_db: float) -> tuple[np.ndarray, dict[str, int]]:

@@ -42,6 +42,6 @@ def law(monkeypatch, small_scene):
             for part in self.batches(len(points_m)):
                 yield self.solve(device_m, points_m[part])
 
-    monkeypatch.setattr("radiotwin.trace.run.PathGains", Law)
+    monkeypatch.setattr("radiotwin.trace.lattice_gains.PathGains", Law)
     monkeypatch.setattr("radiotwin.trace.points.PathGains", Law)
     return Law

@@ -1,0 +1,83 @@
+"""Comparisons: the arithmetic of the tables, and that nobody is judged on what it has seen."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from radiotwin.compare import compare_models, score_map, split_flights
+from radiotwin.comparison_output import judge_also
+from radiotwin.errors import BadInput
+from radiotwin.survey import fly_survey, segmented_truth
+
+
+@pytest.fixture(scope="module")
+def truth(small_scene):
+    return segmented_truth(small_scene)
+
+
+@pytest.fixture(scope="module")
+def flown(small_scene, truth):
+    return fly_survey(small_scene, truth, flights=3, pattern="random-waypoint", seed=0, noise_db=0.0)
+
+
+@pytest.fixture(scope="module")
+def comparison(small_scene, truth, flown):
+    train, test = split_flights(flown, 1)
+    return compare_models(train, test, small_scene, truth, seed=0, models=("log_distance", "segmented_log_distance"))
+
+
+def test_the_last_flights_are_held_out_whole(flown):
+    train, test = split_flights(flown, 2)
+    assert train.flights == ["f0"] and test.flights == ["f1", "f2"]
+    assert len(train.table) + len(test.table) == len(flown.table)
+
+
+@pytest.mark.parametrize(("held_out", "message"), [(0, "at least 1"), (3, "at least 4 are needed")])
+def test_too_few_flights(flown, held_out, message):
+    with pytest.raises(BadInput, match=message):
+        split_flights(flown, held_out)
+
+
+def test_scores_are_what_the_predictions_say(comparison):
+    links = comparison.predictions
+    for model in ("log_distance", "segmented_log_distance"):
+        for name, mask in (("all", slice(None)), ("LoS", links["los"]), ("NLoS", ~links["los"])):
+            error_db = (links[model] - links["measured_db"])[mask].dropna()
+            row = comparison.scores.query("model == @model and links == @name and positions == 'estimated' "
+                                          "and against == 'held-out flights'").iloc[0]
+            assert row["n"] == len(error_db)
+            assert row["rmse_db"] == pytest.approx(np.sqrt((error_db**2).mean()))
+            assert row["mae_db"] == pytest.approx(error_db.abs().mean())
+            assert row["bias_db"] == pytest.approx(error_db.mean())
+
+
+def test_location_errors_are_distances(comparison, small_scene):
+    true_m = {d.device: (d.x_m, d.y_m) for d in small_scene.config.devices}
+    for row in comparison.locations.itertuples():
+        assert row.error_m == pytest.approx(np.hypot(*np.subtract((row.x_m, row.y_m), true_m[row.device])))
+    summary = comparison.location_summary().set_index("model")
+    errors = comparison.locations.query("model == 'log_distance'")["error_m"]
+    assert summary.loc["log_distance", "worst_m"] == errors.max()
+    assert summary.loc["log_distance", "median_m"] == errors.median()
+
+
+def test_a_map_against_itself_has_no_error_and_a_shifted_one_has_its_shift(truth):
+    shifted = dataclasses.replace(truth, dataset=truth.dataset.assign(gain_db=truth.dataset["gain_db"] + 3))
+    assert [row["rmse_db"] for row in score_map("same", truth, truth)] == [0, 0, 0]
+    for row in score_map("shifted", shifted, truth):
+        assert row["bias_db"] == pytest.approx(3, abs=1e-4) and row["n"] > 0
+
+
+def test_a_map_of_other_devices_is_refused(truth):
+    other = dataclasses.replace(truth, dataset=truth.dataset.isel(x=slice(3)))
+    with pytest.raises(BadInput, match="make both for the same scene"):
+        score_map("other", other, truth)
+
+
+def test_a_twin_that_has_seen_the_held_out_flight_is_named(comparison, tmp_path, flown):
+    comparison.twins["log_distance"].save(tmp_path / "twin")
+    with pytest.warns(UserWarning, match="too good"):
+        judge_also([tmp_path / "twin"], None, ["f1"])
+    with pytest.raises(BadInput, match="--truth"):
+        judge_also([tmp_path / "map.nc"], None, ["f2"])

@@ -1,0 +1,88 @@
+"""The twin: what it learns from, what it keeps, and that it comes back from its folder as it was."""
+
+import json
+
+import numpy as np
+import pytest
+
+from radiotwin.errors import BadInput
+from radiotwin.measurements import Measurements
+from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.twin import Twin, fit_twin
+
+
+@pytest.fixture(scope="module")
+def flown(small_scene):
+    return fly_survey(small_scene, segmented_truth(small_scene), flights=2, pattern="random-waypoint", seed=0,
+                      noise_db=0.0)
+
+
+@pytest.fixture(scope="module")
+def twin(small_scene, flown):
+    return fit_twin(flown, small_scene, model="segmented_log_distance", seed=0)
+
+
+@pytest.mark.parametrize("model", ["log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging"])
+def test_saved_and_loaded_it_predicts_the_same(small_scene, flown, tmp_path, model):
+    twin = fit_twin(flown, small_scene, model=model, seed=0)
+    twin.save(tmp_path / "twin")
+    again = Twin.load(tmp_path / "twin")
+    assert again.devices == twin.devices and again.provenance == twin.provenance
+    here, there = (t.radio_map(small_scene) for t in (twin, again))
+    np.testing.assert_array_equal(here.gain_db, there.gain_db)
+    np.testing.assert_array_equal(here.dataset["sigma_db"], there.dataset["sigma_db"])
+
+
+def test_positions_of_unknown_devices_are_not_read(small_scene, flown, twin):
+    """A file may hold them; a twin that learned from them would be worth nothing."""
+    wrong = flown.devices.copy()
+    wrong.loc[wrong["role"] == "unknown", ["x_m", "y_m"]] = 7.0
+    again = fit_twin(Measurements(flown.table, wrong), small_scene, model="segmented_log_distance", seed=0)
+    assert again.devices == twin.devices
+
+
+def test_anchors_keep_their_places(flown, twin):
+    for device, declared_m in zip(twin.devices, flown.device_m):
+        if device.role == "anchor":
+            assert (device.x_m, device.y_m, device.z_m) == tuple(declared_m) and device.credible_radius_m == 0
+
+
+def test_a_device_never_measured_is_reported_not_guessed(small_scene, flown, tmp_path):
+    heard = (flown.table["device"] != "d3").to_numpy()
+    twin = fit_twin(flown.select(heard), small_scene, model="segmented_log_distance", seed=0)
+    lost = next(device for device in twin.devices if device.device == "d3")
+    assert not lost.located and np.isnan(lost.x_m)
+    assert "d3" not in twin.radio_map(small_scene).devices
+    twin.save(tmp_path / "twin")
+    again = next(device for device in Twin.load(tmp_path / "twin").devices if device.device == "d3")
+    assert np.isnan(again.x_m) and again.credible_radius_m == np.inf
+
+
+def test_a_level_in_dbm_is_turned_into_gain_by_the_transmit_power(small_scene, flown, twin):
+    """RSSI with 0 dBm transmitted has the numbers of the gain; the map must be the same."""
+    rssi = Measurements(flown.table.rename(columns={"gain_db": "rssi_dbm"}), flown.devices)
+    again = fit_twin(rssi, small_scene, model="segmented_log_distance", seed=0)
+    assert again.level == "rssi_dbm"
+    np.testing.assert_array_equal(again.radio_map(small_scene).gain_db, twin.radio_map(small_scene).gain_db)
+
+
+def test_a_damaged_twin_is_bad_input(twin, tmp_path):
+    with pytest.raises(BadInput, match="not a twin's folder"):
+        Twin.load(tmp_path)
+    twin.save(tmp_path / "twin")
+    path = tmp_path / "twin" / "twin.json"
+    text = path.read_text()
+    for broken in (text[:100], text.replace('"devices"', '"gadgets"')):
+        path.write_text(broken)
+        with pytest.raises(BadInput, match="damaged"):
+            Twin.load(tmp_path / "twin")
+    path.write_text(json.dumps(json.loads(text) | {"schema": "radiotwin.twin/99"}))
+    with pytest.raises(BadInput, match="schema is"):
+        Twin.load(tmp_path / "twin")
+
+
+def test_a_missing_height_is_bad_input(small_scene, flown):
+    table = flown.table.copy()
+    table.loc[4, "receiver_z_m"] = np.nan
+    with pytest.raises(BadInput, match="height is empty"):
+        fit_twin(Measurements(table, flown.devices), small_scene, model="segmented_log_distance", seed=0)
