@@ -174,7 +174,20 @@ def score_map(name: str, candidate: RadioMap, truth: RadioMap) -> list[dict]:
                        f"{truth.gain_db.shape[1:]}; make both for the same scene")
     ours, theirs = ([m.devices.index(device) for device in common] for m in (candidate, truth))
     return _scores(name, "whole map", "estimated", truth.gain_db[theirs].astype(float).ravel(),
-                   candidate.gain_db[ours].astype(float).ravel(), truth.los[theirs].ravel())
+                   comparable_db(candidate, truth)[ours].ravel(), truth.los[theirs].ravel())
+
+
+def comparable_db(candidate: RadioMap, truth: RadioMap) -> np.ndarray:
+    """What a map says of the links that are detected: its mean given detection, where the truth is a map of values.
+
+    Returns:
+        (device, z, y, x) gain [dB]
+    """
+    gain_db = candidate.gain_db.astype(float)
+    if "sigma_db" not in candidate.dataset or "sigma_db" in truth.dataset:
+        return gain_db
+    return mean_if_detected(gain_db, candidate.dataset["sigma_db"].values.astype(float),
+                            truth.dataset.attrs.get("gain_limit_db", -np.inf))
 
 
 def _los(scene: Scene, true_m: np.ndarray, links: Measurements) -> np.ndarray:

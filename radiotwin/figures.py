@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from radiotwin.compare import Comparison
+from radiotwin.compare import Comparison, comparable_db
 from radiotwin.files import atomic_path
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
@@ -72,9 +72,9 @@ def draw_maps(truth: RadioMap, models: dict[str, RadioMap], scene: Scene, device
     axes[0, 0].set_title("truth")
     axes[1, 0].set_axis_off()
     axes[1, 0].text(0.02, 0.5, f"device {device}\nat {truth.lattice.z_m[0]:g} m altitude\n\ntop: channel gain\n"
-                    "bottom: model − truth\n\nwhite: not detected", transform=axes[1, 0].transAxes, fontsize=11)
+                    "bottom: model − truth\n\nwhite: not detected\n\nmodels: the mean of\nwhat is detected", transform=axes[1, 0].transAxes, fontsize=11)
     for column, (name, radio_map) in enumerate(models.items(), start=1):
-        model_db = radio_map.gain_db[radio_map.devices.index(device), 0]
+        model_db = comparable_db(radio_map, truth)[radio_map.devices.index(device), 0]
         _draw_level(axes[0, column], model_db, radio_map, outline, GAIN_COLOURS, low_db, high_db)
         axes[0, column].set_title(LABELS.get(name, name))
         error_db = model_db - true_db

@@ -75,7 +75,7 @@ class Twin:
     def radio_map(self, scene: Scene) -> RadioMap:
         """Mean and standard deviation of the level over a scene's lattice, for all devices that have a position.
 
-        The mean is given below sensitivity, too; attribute `limit_db` says where detection ends.
+        The mean is given below sensitivity, too; attribute `gain_limit_db` says where detection ends.
         """
         known = np.flatnonzero(np.isfinite(self.device_m).all(axis=1))
         receiver_m = scene.lattice.positions_m
@@ -93,7 +93,7 @@ class Twin:
         if self.level == "rssi_dbm":
             mean_db -= scene.config.radio.tx_power_dbm
         attributes = {"source": f"twin:{self.channel.name}", "frequency_hz": scene.config.radio.frequency_hz,
-                      "limit_db": scene.config.gain_limit_db, "scene_hash": scene.content_hash(),
+                      "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene.content_hash(),
                       "radiotwin_version": radiotwin.__version__}
         return RadioMap.build([self.devices[i].device for i in known], scene.lattice, mean_db, los, sigma_db, attributes)
 
@@ -206,7 +206,7 @@ def _locate(measurements, scene, channel, unknown, limit_db, seed, start):
     return localize(
         links.receiver_m, links.device_index, links.level_db, channel, devices=unknown,
         bounds=scene.config.extent.bounds, z_m=measurements.device_m[unknown, 2],
-        city=scene.city if channel.uses_map else None, limit_db=limit_db, seed=seed, start_m=start_m)
+        city=scene.city, limit_db=limit_db, seed=seed, start_m=start_m)
 
 
 def _anchor(row) -> TwinDevice:

@@ -9,8 +9,15 @@ import trimesh
 
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder
-from radiotwin.scene.config import (DeviceConfig, Extent, LatticeConfig, MissionConfig, SceneConfig, UavConfig,
-                                    write_config)
+from radiotwin.scene.config import (
+    DeviceConfig,
+    Extent,
+    LatticeConfig,
+    MissionConfig,
+    SceneConfig,
+    UavConfig,
+    write_config,
+)
 from radiotwin.scene.generator import CityParameters, building_meshes, draw_buildings
 from radiotwin.scene.materials import Material
 from radiotwin.scene.writer import CityShape, write_city
@@ -62,7 +69,7 @@ PRESETS = {
         CityParameters(300, 300, avenue_width_m=40, avenue_spacing_m=160, street_width_m=20, block_mean_m=70,
                        block_min_m=60, side_min_m=40, mean_height_m=18, first_block_m=(-100, -60)),
         seed=0,
-        devices=_devices("(80,40)* (280,60) (80,200) (160,120) (280,280)* (200,200) (80,280)*"),
+        devices=_devices("(80,40)* (280,60) (80,200) (160,120) (280,280) (200,200)* (80,280)*"),
         start_m=(80, 120), terminal_m=(80, 120), battery=40, data_units=8_000, altitudes_m=(55, 60)),
 }
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+
 def noise_figures(gain_db: np.ndarray, finer_db: np.ndarray) -> dict[str, float]:
     """Difference between two solutions of the same links.
 

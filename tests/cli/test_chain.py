@@ -30,7 +30,7 @@ def test_the_scene_is_self_contained(chain):
 
 def test_the_twin_finds_the_devices(chain):
     twin = json.loads((chain / "twin" / "twin.json").read_text())
-    true_m = {"d1": (280, 60), "d2": (80, 200), "d3": (160, 120), "d5": (200, 200)}
+    true_m = {"d1": (280, 60), "d2": (80, 200), "d3": (160, 120), "d4": (280, 280)}
     found = {d["device"]: (d["x_m"], d["y_m"]) for d in twin["devices"] if d["role"] == "unknown"}
     assert found.keys() == true_m.keys()
     errors_m = [np.hypot(*np.subtract(found[name], true_m[name])) for name in true_m]

@@ -1,0 +1,26 @@
+"""Batches on disk."""
+
+import numpy as np
+import pytest
+
+from radiotwin.trace.batches import BatchStore
+
+
+def test_array_comes_back_to_the_bit(tmp_path):
+    array = np.random.default_rng(0).normal(size=7)
+    array[3] = np.nan
+    BatchStore(tmp_path, {"a": 1}).put("batch", array)
+    assert BatchStore(tmp_path, {"a": 1}).get("batch", 7).tobytes() == array.tobytes()
+
+
+def test_keys_do_not_see_each_other(tmp_path):
+    BatchStore(tmp_path, {"a": 1}).put("batch", np.zeros(3))
+    assert BatchStore(tmp_path, {"a": 2}).get("batch", 3) is None
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize("content", [b"", b"\x93NUMPY\x01", b"no array"])
+def test_damaged_file_counts_as_missing(tmp_path, content):
+    store = BatchStore(tmp_path, {})
+    (store.folder / "batch.npy").write_bytes(content)
+    assert store.get("batch", 3) is None
