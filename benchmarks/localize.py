@@ -100,10 +100,12 @@ def main() -> None:
 
     print(f"{len(unknown)} devices, {len(observations.receiver_m)} receiver positions, {bounds} m")
     print(
-        f"localize               {search_s:8.2f} s   error median {np.median(error_m):5.2f} m, worst {error_m.max():5.2f} m"
+        f"localize               {search_s:8.2f} s   "
+        f"error median {np.median(error_m):5.2f} m, worst {error_m.max():5.2f} m"
     )
     print(
-        f"exhaustive 1 m scan    {scan_s:8.2f} s   error median {np.median(scan_error_m):5.2f} m, worst {scan_error_m.max():5.2f} m"
+        f"exhaustive 1 m scan    {scan_s:8.2f} s   "
+        f"error median {np.median(scan_error_m):5.2f} m, worst {scan_error_m.max():5.2f} m"
     )
     print(f"ratio of seconds       {scan_s / search_s:8.2f}")
     print(f"log-likelihood by which the scan beats the estimate, worst device: {deficit.max():.2f} nats")

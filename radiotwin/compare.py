@@ -47,8 +47,8 @@ class Comparison:
                 rows.append([model, *("/".join(_short(of_class.loc[links, f"{measure}_db"]) for links in CLASSES)
                                       for measure in ("rmse", "mae", "bias"))])
             links = part.groupby("links")["n"].max()
-            tables.append((f"Error on {against} [dB]: all/LoS/NLoS of {links['all']}/{links['LoS']}/{links['NLoS']} links",
-                           columns, rows))
+            counts = "/".join(str(links[name]) for name in CLASSES)
+            tables.append((f"Error on {against} [dB]: all/LoS/NLoS of {counts} links", columns, rows))
         summary = self.location_summary()
         if len(summary):
             tables.append(("Error of the unknown devices' positions [m]",
@@ -81,8 +81,8 @@ def split_flights(measurements: Measurements, held_out: int) -> tuple[Measuremen
     if held_out < 1:
         raise BadInput(f"held-out flights = {held_out}: at least 1 is needed to compare on")
     if len(flights) <= held_out:
-        raise BadInput(f"{len(flights)} flight{'s' * (len(flights) != 1)} in the measurements ({', '.join(flights[:4])}), "
-                       f"{held_out} to be held out: at least {held_out + 1} are needed, so that models are judged on a "
+        some = "1 flight" if len(flights) == 1 else f"{len(flights)} flights"
+        raise BadInput(f"{some} in the measurements ({', '.join(flights[:4])}), {held_out} to be held out: at least {held_out + 1} are needed, so that models are judged on a "
                        "flight that they were not fitted to; survey more flights, or hold out fewer")
     test = measurements.table["flight"].isin(flights[-held_out:]).to_numpy()
     return measurements.select(~test), measurements.select(test)

@@ -16,6 +16,8 @@ from radiotwin.trace import SolverSettings, trace_map
 
 PART_M = 300.0  # side of the part that is taken of a large city
 DEVICES = 7
+# Roofs of the walls' material: Sionna RT finds no edge to diffract at between meshes of different materials.
+ONE_MATERIAL = {"sionna:munich": {"metal": "itu_marble", "wood": "itu_brick"}}
 FLIGHTS, HELD_OUT = 6, 1
 
 
@@ -64,7 +66,8 @@ def _scene(source: str, folder: Path, seed: int, say) -> Scene:
     if source.startswith("preset:"):
         build_preset(source.removeprefix("preset:"), folder)
     else:
-        build_scene(source, folder, BuildOptions(bbox=_middle(source, folder), devices=DEVICES, seed=seed))
+        build_scene(source, folder, BuildOptions(bbox=_middle(source, folder), devices=DEVICES, seed=seed,
+                                                 materials=ONE_MATERIAL.get(source)))
     return Scene.load(folder)
 
 

@@ -72,7 +72,8 @@ def draw_maps(truth: RadioMap, models: dict[str, RadioMap], scene: Scene, device
     axes[0, 0].set_title("truth")
     axes[1, 0].set_axis_off()
     axes[1, 0].text(0.02, 0.5, f"device {device}\nat {truth.lattice.z_m[0]:g} m altitude\n\ntop: channel gain\n"
-                    "bottom: model − truth\n\nwhite: not detected\n\nmodels: the mean of\nwhat is detected", transform=axes[1, 0].transAxes, fontsize=11)
+                    "bottom: model − truth\n\nwhite: not detected\n\nmodels: the mean of\nwhat is detected",
+                    transform=axes[1, 0].transAxes, fontsize=11)
     for column, (name, radio_map) in enumerate(models.items(), start=1):
         model_db = comparable_db(radio_map, truth)[radio_map.devices.index(device), 0]
         _draw_level(axes[0, column], model_db, radio_map, outline, GAIN_COLOURS, low_db, high_db)
@@ -137,7 +138,8 @@ def draw_estimates(comparison: Comparison, models: list[str], scene: Scene, path
             ax.plot(x_m, y_m, "*", color="#f08a00", markersize=14, markeredgecolor="white", label="true position")
             if np.isfinite([device.x_m, device.y_m]).all():
                 ax.plot([x_m, device.x_m], [y_m, device.y_m], color=NLOS_COLOUR, linewidth=1)
-                ax.plot(device.x_m, device.y_m, "x", color=NLOS_COLOUR, markersize=8, markeredgewidth=2, label="estimate")
+                ax.plot(device.x_m, device.y_m, "x", color=NLOS_COLOUR, markersize=8, markeredgewidth=2,
+                        label="estimate")
                 ax.add_artist(_circle(device, 2 * (bounds[1] - bounds[0])))
         errors = comparison.locations.query("model == @model")["error_m"]
         ax.set_title(f"{LABELS.get(model, model)}: median error {errors.median():.1f} m")

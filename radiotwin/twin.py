@@ -95,7 +95,8 @@ class Twin:
         attributes = {"source": f"twin:{self.channel.name}", "frequency_hz": scene.config.radio.frequency_hz,
                       "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene.content_hash(),
                       "radiotwin_version": radiotwin.__version__}
-        return RadioMap.build([self.devices[i].device for i in known], scene.lattice, mean_db, los, sigma_db, attributes)
+        names = [self.devices[i].device for i in known]
+        return RadioMap.build(names, scene.lattice, mean_db, los, sigma_db, attributes)
 
     def save(self, folder: Path | str) -> None:
         """Write the twin's folder, whole or not at all.
@@ -188,7 +189,8 @@ def _fit_channel(measurements, device_m, scene, channel: ChannelModel, limit_db,
 
 
 def _check_heights(measurements: Measurements) -> None:
-    for table, column, what in ((measurements.table, "receiver_z_m", "receiver"), (measurements.devices, "z_m", "device")):
+    for table, column, what in ((measurements.table, "receiver_z_m", "receiver"),
+                                (measurements.devices, "z_m", "device")):
         if table[column].isna().any():
             row = int(np.flatnonzero(table[column].isna())[0])
             raise BadInput(f"row {row + 2}, column {column}: the {what}'s height is empty; with a 3D map every "

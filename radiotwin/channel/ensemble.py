@@ -29,7 +29,8 @@ PATIENCE = 300  # steps without a better member, then training ends
 class TrainingData:
     """n links in the units of the network.
 
-    inputs: (n, INPUTS); target: (n,) residual over the line in class sigmas, or the limit's where `censored`; los: (n,);
+    inputs: (n, INPUTS); target: (n,) residual over the line in class sigmas, or the limit's where
+    `censored`; los: (n,);
     fold: (n,) in 0..MEMBERS-1, the member that does not train on the link.
     """
 

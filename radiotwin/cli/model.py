@@ -81,7 +81,8 @@ def compare(
     held_out: Annotated[int, typer.Option(help="Flights, the last ones, that no model is fitted to.")] = 1,
     devices: Annotated[Path | None, typer.Option(help="Table of devices [devices.csv beside the file].")] = None,
     also: Annotated[list[Path] | None, typer.Option(
-        help="A twin's folder, or (with --truth) a radio map, to be judged beside the models; may be repeated.")] = None,
+        help="A twin's folder, or (with --truth) a radio map, to be judged beside the models; may be repeated.")
+        ] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
 ) -> None:
     """Hold all channel models against flights they have not seen, and against the truth map where there is one."""

@@ -15,7 +15,8 @@ def add_commands(app: typer.Typer) -> None:
 
 def demo(
     scene: Annotated[str, typer.Option(
-        help="preset:small, or any source of `build-scene`, of which a part of 300 x 300 m is taken.")] = "preset:small",
+        help="preset:small, or any source of `build-scene`, of which a part of 300 x 300 m is taken.")
+        ] = "preset:small",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for everything that is made.")] = Path("demo"),
     seed: Annotated[int, typer.Option(min=0)] = 0,
 ) -> None:

@@ -42,7 +42,8 @@ class Likelihood:
         limit_db: float | None,
         chunk_links: int = CHUNK_LINKS,
     ):
-        """devices: (k,) positions in observations.devices, by which the methods know them; limit_db may be None only where nothing is `missed`."""
+        """devices: (k,) positions in observations.devices, by which the methods know them; limit_db may be None
+        only where nothing is `missed`."""
         self.devices, self.z_m, self._channel, self._city = devices, z_m, channel, city
         self.receiver_m, self._limit_db, self._chunk_links = observations.receiver_m, limit_db, chunk_links
         self._all = observations.devices

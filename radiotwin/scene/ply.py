@@ -62,7 +62,8 @@ def read_ply(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
         (v, 3) vertices, and one (n, k) array of vertex indices for each number of corners k that occurs.
 
     Raises:
-        BadInput: no such file, not a PLY file, truncated, or without vertices or faces as its header should declare them.
+        BadInput: no such file, not a PLY file, truncated, or without vertices or faces as its header should
+            declare them.
     """
     try:
         data = path.read_bytes()

@@ -83,9 +83,9 @@ def device_indices(scene: Scene, devices: list[str] | None) -> list[int]:
 
 
 def _key(scene: Scene, settings: SolverSettings) -> dict:
-    lattice = scene.lattice
     return {
-        "scene": scene.content_hash(), "lattice": {axis: getattr(lattice, axis).tolist() for axis in ("x_m", "y_m", "z_m")},
+        "scene": scene.content_hash(),
+        "lattice": {axis: getattr(scene.lattice, axis).tolist() for axis in ("x_m", "y_m", "z_m")},
         "settings": settings.attributes(), "libraries": library_versions(),
     }
 

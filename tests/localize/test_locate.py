@@ -119,7 +119,8 @@ def test_a_start_helps_a_search_that_is_too_coarse(
     def worst_m(start_m):
         found = localize(
             *data, published_law,
-            devices=np.arange(20), bounds=(0, 600, 0, 800), z_m=1.5, city=city, limit_db=-120.0, seed=0, start_m=start_m,
+            devices=np.arange(20), bounds=(0, 600, 0, 800), z_m=1.5, city=city, limit_db=-120.0, seed=0,
+            start_m=start_m,
             settings=LocalizeSettings(scan_step_m=80.0, swarms=1, particles=3, iterations=2),
         )  # fmt: skip
         return max(np.hypot(e.x_m - x, e.y_m - y) for e, (x, y) in zip(found, xy_m))
