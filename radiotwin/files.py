@@ -10,6 +10,14 @@ from pathlib import Path
 from radiotwin.errors import BadInput
 
 
+def require_writable(path: Path | str) -> None:
+    """Raise BadInput unless a file can be written at `path`; to be asked before long work, not after it."""
+    path = Path(path)
+    if path.is_dir():
+        raise BadInput(f"{path} is a folder; give the name of a file")
+    _prepare_parent(path)
+
+
 def _prepare_parent(path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -27,9 +35,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         BadInput: the folder cannot be made or written, or `path` is a folder.
     """
     path = Path(path)
-    if path.is_dir():
-        raise BadInput(f"{path} is a folder; give the name of a file")
-    _prepare_parent(path)
+    require_writable(path)
     handle, name = tempfile.mkstemp(prefix=f".{path.stem[:40]}-", suffix="".join(path.suffixes), dir=path.parent)
     os.close(handle)
     temporary = Path(name)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from radiotwin.cli.console import console, print_rows, say, show_warnings_plainly
+from radiotwin.cli.console import console, say, show_warnings_plainly
 from radiotwin.errors import BadInput
 
 SceneFolder = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder, as `build-scene` makes it.")]
@@ -59,7 +59,8 @@ def build_scene(
 def trace(
     folder: SceneFolder,
     out: Annotated[Path | None, typer.Option(
-        "--out", "-o", help="Radio map [SCENE/truth.nc]; with --points a CSV file [gains.csv].")] = None,
+        "--out", "-o", help="Radio map [SCENE/truth.nc, with --devices truth-A-B.nc]; with --points a CSV file "
+                            "[gains.csv].")] = None,
     quality: Annotated[str, typer.Option(help="fast, default or high.")] = "default",
     solver: Annotated[str, typer.Option(help="paths (gain at points) or map (mean over lattice cells).")] = "paths",
     combining: Annotated[str, typer.Option(help="power (sum of the paths' powers) or coherent (of their fields).")
@@ -83,12 +84,14 @@ def trace(
         detected = int(table["gain_db"].notna().sum())
         say(f"wrote {out}: {len(table)} links, {detected} detected")
         return
-    out = out or folder / "truth.nc"
-    attributes = trace_map(scene, settings, out, names).dataset.attrs
-    print_rows(f"Truth map {out}", {"": "left", "value": "right"},
-               [[name, str(round(value, 3) if isinstance(value, float) else value)]
-                for name, value in attributes.items()
-                if name.startswith("links_") or name.startswith("noise_floor") or name in ("quality", "finite_links")])
+    out = out or folder / ("-".join(["truth", *(names or [])])[:100] + ".nc")
+    facts = trace_map(scene, settings, out, names).dataset.attrs
+    say(f"wrote {out}: {facts['links']} links, {facts['links_detected']} detected, {facts['links_below_sensitivity']} "
+        f"below sensitivity, {facts['links_without_path']} without a path, {facts['links_inside_building']} inside "
+        "buildings")
+    if "noise_floor_db" in facts:
+        say(f"numerical noise: {facts['noise_floor_db']:.2f} dB RMS against ten times the rays; nine links in ten are "
+            f"within {facts['noise_floor_p90_db']:.2f} dB")
 
 
 def survey(

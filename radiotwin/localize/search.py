@@ -53,8 +53,8 @@ class Search:
         settings: LocalizeSettings,
         rng: np.random.Generator,
     ):
-        """devices: (k,) positions in observations.devices of those at z_m [m], by which the methods know them. Draws from
-        rng."""
+        """devices: (k,) positions in observations.devices of those at z_m [m], by which the methods know
+        them. Draws from rng."""
         self.devices, self.z_m = devices, z_m
         self._bounds, self._city, self._settings = bounds, city, settings
         known_as = np.array([observations.devices[k].device for k in devices])

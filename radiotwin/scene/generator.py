@@ -7,7 +7,6 @@ Trajectory Planning in IoT Networks", GLOBECOM Workshops 2023. The cities are ou
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 import trimesh
 
 
@@ -119,8 +118,3 @@ def building_meshes(boxes: np.ndarray) -> list[trimesh.Trimesh]:
     solids = [trimesh.creation.box(bounds=[[x0, y0, 0.0], [x1, y1, height]]) for x0, y0, x1, y1, height in boxes]
     union = trimesh.boolean.union(solids, engine="manifold")
     return sorted(union.split(), key=lambda mesh: tuple(mesh.bounds[0]))
-
-
-def built_fraction(boxes: np.ndarray, width_m: float, depth_m: float) -> float:
-    """Share of the ground that buildings stand on."""
-    return shapely.union_all(shapely.box(*boxes[:, :4].T)).area / (width_m * depth_m)

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_path
+from radiotwin.files import atomic_path, require_writable
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
 from radiotwin.trace.run import device_indices
@@ -65,6 +65,8 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings, o
     """
     if out_path is not None and not str(out_path).endswith((".csv", ".csv.gz")):
         raise BadInput(f"{out_path}: unknown format; allowed are .csv and .csv.gz")
+    if out_path is not None:
+        require_writable(out_path)
     index = device_indices(scene, devices)
     inside = scene.city.inside(points_m)
     gain_db = trace_gains(scene, scene.device_m[index], points_m, settings)

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from radiotwin.errors import BadInput
+from radiotwin.files import require_writable
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.trace.batches import BatchStore
@@ -39,6 +40,7 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
         RunFailed: no usable libLLVM, or gains that physics does not allow. Nothing is written then.
     """
     index = device_indices(scene, devices)
+    require_writable(out_path)
     positions_m = scene.lattice.positions_m
     device_m = scene.device_m[index]
     key = _key(scene, settings)
