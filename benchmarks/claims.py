@@ -44,8 +44,9 @@ def summarise(record: dict) -> None:
     for model, part in locations.groupby("model", sort=False):
         error_m = part["error_m"]
         within = (error_m <= part["credible_radius_m"]).mean()
-        print(f"{model:24s} n {len(error_m):3d}  median {error_m.median():6.2f}  90 % {np.quantile(error_m, 0.9):7.2f}  "
-              f"worst {error_m.max():7.2f}  above 50 m {(error_m > 50).mean():5.1%}  within radius {within:4.0%}")
+        print(f"{model:24s} n {len(error_m):3d}  median {error_m.median():6.2f}  "
+              f"90 % {np.quantile(error_m, 0.9):7.2f}  worst {error_m.max():7.2f}  "
+              f"above 50 m {(error_m > 50).mean():5.1%}  within radius {within:4.0%}")
 
 
 def main() -> None:

@@ -1,11 +1,11 @@
 """Channel models held against each other: on flights that none has seen, and on the whole truth map."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
-from radiotwin.channel import MODELS, make_links
+from radiotwin.channel import MODELS
 from radiotwin.channel.likelihood import mean_if_detected
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
@@ -27,7 +27,8 @@ class Comparison:
             (the channel alone); `links` is all, LoS or NLoS by the true positions where they are known.
         locations: one row for each (model, unknown device): error_m, credible_radius_m, located.
         twins: the fitted twins by model.
-        predictions: held-out links with `measured_db`, `los` and a column of predictions for each model.
+        predictions: held-out links with `measured_db`, `los` (1, 0, or NaN where the true position is not known) and
+            a column of predictions for each model.
     """
 
     scores: pd.DataFrame
@@ -82,8 +83,9 @@ def split_flights(measurements: Measurements, held_out: int) -> tuple[Measuremen
         raise BadInput(f"held-out flights = {held_out}: at least 1 is needed to compare on")
     if len(flights) <= held_out:
         some = "1 flight" if len(flights) == 1 else f"{len(flights)} flights"
-        raise BadInput(f"{some} in the measurements ({', '.join(flights[:4])}), {held_out} to be held out: at least {held_out + 1} are needed, so that models are judged on a "
-                       "flight that they were not fitted to; survey more flights, or hold out fewer")
+        raise BadInput(f"{some} in the measurements ({', '.join(flights[:4])}), {held_out} to be held out: at least "
+                       f"{held_out + 1} are needed, so that models are judged on a flight that they were not fitted "
+                       "to; survey more flights, or hold out fewer")
     test = measurements.table["flight"].isin(flights[-held_out:]).to_numpy()
     return measurements.select(~test), measurements.select(test)
 
@@ -101,67 +103,93 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene, truth:
         models: keys of `radiotwin.channel.MODELS`.
         twins: fitted already, judged beside the models, by the name that they get in the tables.
         maps: made already, judged on the truth map.
+
+    Raises:
+        BadInput: nothing detected to judge on, a truth of another scene, or what `fit_twin` refuses.
     """
-    true_m = true_positions(scene, train)
+    _check(test, scene, truth, twins or {})
     fitted = {}
     with progress("comparing models", total=len(models)) as advance:
         for model in models:
             fitted[model] = fit_twin(train, scene, model=model, seed=seed)
             advance(1)
     fitted |= twins or {}
+    true_m = true_positions(scene, train)
     los = _los(scene, true_m, test)
     predictions = test.table[["flight", "receiver", "device"]].assign(measured_db=test.level_db, los=los)
     scores, locations = [], []
     for model, twin in fitted.items():
-        predicted_db = predict(twin, scene, test.receiver_m, test.device_index, limit_db=twin.limit_db)
-        predictions[model] = predicted_db
-        scores += _scores(model, "held-out flights", "estimated", test.level_db, predicted_db, los)
-        if np.isfinite(true_m).all():
-            ideal_db = predict(twin, scene, test.receiver_m, test.device_index, true_m, twin.limit_db)
-            scores += _scores(model, "held-out flights", "true", test.level_db, ideal_db, los)
+        predictions[model] = predict(twin, scene, test)
+        scores += _scores(model, "held-out flights", "estimated", test.level_db, predictions[model].to_numpy(), los)
         if truth is not None:
-            scores += _map_scores(model, twin, scene, truth, true_m)
+            scores += score_map(model, twin.radio_map(scene), truth)
+        if all(device.device in true_m for device in twin.devices):
+            ideal = _moved(twin, true_m)
+            scores += _scores(model, "held-out flights", "true", test.level_db, predict(ideal, scene, test), los)
+            if truth is not None:
+                scores += score_map(model, ideal.radio_map(scene), truth, positions="true")
         locations += _location_rows(model, twin, true_m)
     for name, candidate in (maps or {}).items():
         scores += score_map(name, candidate, truth)
     return Comparison(pd.DataFrame(scores), pd.DataFrame(locations), fitted, predictions)
 
 
-def true_positions(scene: Scene, measurements: Measurements) -> np.ndarray:
-    """(k, 3) positions of the measurements' devices [m] as the scene declares them, NaN where it does not."""
-    declared = {d.device: (d.x_m, d.y_m, d.z_m) for d in scene.config.devices}
-    return np.array([declared.get(name, (np.nan,) * 3) for name in measurements.devices["device"]])
+def _check(test: Measurements, scene: Scene, truth: RadioMap | None, twins: dict[str, Twin]) -> None:
+    if not np.isfinite(test.level_db).any():
+        raise BadInput(f"nothing was detected on the held-out flights ({', '.join(test.flights[:4])}), so no error can be "
+                       "computed; hold out other flights")
+    if truth is not None:
+        scene.check_map(truth)
+    for name, twin in twins.items():
+        if twin.level != test.level_column:
+            raise BadInput(f"{name} predicts {twin.level}, the measurements hold {test.level_column}; "
+                           "they cannot be compared")
 
 
-def predict(twin: Twin, scene: Scene, receiver_m, device, device_m=None, limit_db: float | None = None) -> np.ndarray:
-    """Mean level of links.
+def true_positions(scene: Scene, measurements: Measurements) -> dict[str, tuple[float, float, float]]:
+    """Device -> (x, y, z) [m]: anchors as the measurements declare them, others as the scene does where it does."""
+    known = {d.device: (d.x_m, d.y_m, d.z_m) for d in scene.config.devices}
+    known |= {row.device: (row.x_m, row.y_m, row.z_m) for row in measurements.devices.itertuples()
+              if row.role == "anchor"}
+    return {name: known[name] for name in measurements.devices["device"] if name in known}
+
+
+def predict(twin: Twin, scene: Scene, measurements: Measurements) -> np.ndarray:
+    """What a twin expects of measured links.
 
     Only detected links can be held against a prediction, and near the limit only the strong ones were detected: the
     mean of all would lie below the mean of those, most for the model with the widest scatter. So every model is
     asked for the mean of what is detected (a truncated normal distribution).
 
-    Args:
-        twin: model and device positions.
-        scene: with the 3D map.
-        receiver_m, device: (n, 3) positions [m] and (n,) rows of the twin's devices.
-        device_m: (k, 3) other device positions [m].
-        limit_db: of detection; None: the mean of all links.
-
     Returns:
-        (n,) levels [dB]; NaN for devices without a position.
+        (n,) levels [dB]; NaN for devices that the twin does not know, or could not locate.
     """
-    device_m = twin.device_m if device_m is None else device_m
-    known = np.isfinite(device_m).all(axis=1)[device]
-    predicted_db = np.full(len(device), np.nan)
-    if known.any():
-        links = make_links(device_m, receiver_m[known], device[known], scene.city)
+    row_of = {device.device: row for row, device in enumerate(twin.devices)
+              if np.isfinite([device.x_m, device.y_m]).all()}
+    row = np.array([row_of.get(name, -1) for name in measurements.devices["device"]])[measurements.device_index]
+    predicted_db = np.full(len(row), np.nan)
+    if (row >= 0).any():
+        links = twin.links(measurements.receiver_m[row >= 0], row[row >= 0], scene.city)
         mean_db, sigma_db = twin.channel.predict(links)
-        predicted_db[known] = mean_db if limit_db is None else mean_if_detected(mean_db, sigma_db, limit_db)
+        limit_db = -np.inf if twin.limit_db is None else twin.limit_db
+        predicted_db[row >= 0] = mean_if_detected(mean_db, sigma_db, limit_db)
     return predicted_db
 
 
-def score_map(name: str, candidate: RadioMap, truth: RadioMap) -> list[dict]:
+def _moved(twin: Twin, position_m: dict[str, tuple[float, float, float]]) -> Twin:
+    """The twin with its devices at other positions."""
+    devices = [replace(device, **dict(zip(("x_m", "y_m", "z_m"), position_m[device.device])))
+               for device in twin.devices]
+    return replace(twin, devices=devices)
+
+
+def score_map(name: str, candidate: RadioMap, truth: RadioMap, positions: str = "estimated") -> list[dict]:
     """Rows of scores for a radio map against the truth, on the devices and positions of both.
+
+    Args:
+        name: in the rows.
+        candidate, truth: maps on one lattice.
+        positions: `estimated` or `true`, in the rows.
 
     Raises:
         BadInput: the maps have no device in common, or different lattices.
@@ -173,7 +201,7 @@ def score_map(name: str, candidate: RadioMap, truth: RadioMap) -> list[dict]:
                        f"{candidate.gain_db.shape[1:]} positions, the truth has {truth.devices} on "
                        f"{truth.gain_db.shape[1:]}; make both for the same scene")
     ours, theirs = ([m.devices.index(device) for device in common] for m in (candidate, truth))
-    return _scores(name, "whole map", "estimated", truth.gain_db[theirs].astype(float).ravel(),
+    return _scores(name, "whole map", positions, truth.gain_db[theirs].astype(float).ravel(),
                    comparable_db(candidate, truth)[ours].ravel(), truth.los[theirs].ravel())
 
 
@@ -190,34 +218,19 @@ def comparable_db(candidate: RadioMap, truth: RadioMap) -> np.ndarray:
                             truth.dataset.attrs.get("gain_limit_db", -np.inf))
 
 
-def _los(scene: Scene, true_m: np.ndarray, links: Measurements) -> np.ndarray:
-    """(n,) bool by the true positions; links of devices that the scene does not declare count as NLoS."""
-    los = np.zeros(len(links.table), dtype=bool)
-    known = np.isfinite(true_m).all(axis=1)[links.device_index]
-    los[known] = scene.city.line_of_sight(true_m[links.device_index[known]], links.receiver_m[known])
+def _los(scene: Scene, true_m: dict, links: Measurements) -> np.ndarray:
+    """(n,) 1 with LoS, 0 without, NaN for links of devices whose true position nobody knows."""
+    device_m = np.array([true_m.get(name, (np.nan,) * 3) for name in links.devices["device"]])[links.device_index]
+    los = np.full(len(device_m), np.nan)
+    known = np.isfinite(device_m).all(axis=1)
+    los[known] = scene.city.line_of_sight(device_m[known], links.receiver_m[known])
     return los
-
-
-def _map_scores(model: str, twin: Twin, scene: Scene, truth: RadioMap, true_m: np.ndarray) -> list[dict]:
-    names = [device.device for device in twin.devices]
-    rows = [truth.devices.index(name) for name in names]
-    receiver_m = truth.lattice.positions_m
-    index = np.repeat(np.arange(len(names)), len(receiver_m))
-    everywhere_m = np.tile(receiver_m, (len(names), 1))
-    gain_db, los = truth.gain_db[rows].astype(float).ravel(), truth.los[rows].ravel()
-    # A map of means and deviations has all its means; one of gains has only what is detected.
-    limit_db = None if "sigma_db" in truth.dataset else scene.config.gain_limit_db
-    scores = []
-    for positions, device_m in (("estimated", None), ("true", true_m)):
-        predicted_db = predict(twin, scene, everywhere_m, index, device_m, limit_db)
-        scores += _scores(model, "whole map", positions, gain_db, predicted_db, los)
-    return scores
 
 
 def _scores(model, against, positions, measured_db, predicted_db, los) -> list[dict]:
     rows = []
     usable = np.isfinite(measured_db) & np.isfinite(predicted_db)
-    for links, mask in zip(CLASSES, (usable, usable & los, usable & ~los)):
+    for links, mask in zip(CLASSES, (usable, usable & (los == 1), usable & (los == 0))):
         error_db = predicted_db[mask] - measured_db[mask]
         measures = {"rmse_db": np.sqrt(np.mean(error_db**2)), "mae_db": np.mean(np.abs(error_db)),
                     "bias_db": np.mean(error_db)} if len(error_db) else \
@@ -227,8 +240,12 @@ def _scores(model, against, positions, measured_db, predicted_db, los) -> list[d
     return rows
 
 
-def _location_rows(model: str, twin: Twin, true_m: np.ndarray) -> list[dict]:
-    return [{"model": model, "device": device.device, "x_m": device.x_m, "y_m": device.y_m,
-             "error_m": float(np.hypot(device.x_m - x_m, device.y_m - y_m)),
-             "credible_radius_m": device.credible_radius_m, "located": device.located}
-            for device, (x_m, y_m, _) in zip(twin.devices, true_m) if device.role == "unknown"]
+def _location_rows(model: str, twin: Twin, true_m: dict) -> list[dict]:
+    rows = []
+    for device in twin.devices:
+        if device.role == "unknown":
+            x_m, y_m, _ = true_m.get(device.device, (np.nan,) * 3)
+            rows.append({"model": model, "device": device.device, "x_m": device.x_m, "y_m": device.y_m,
+                         "error_m": float(np.hypot(device.x_m - x_m, device.y_m - y_m)),
+                         "credible_radius_m": device.credible_radius_m, "located": device.located})
+    return rows

@@ -57,9 +57,11 @@ def _scene(source: str, folder: Path, seed: int, say) -> Scene:
     """The scene that an earlier run left, else a new one."""
     if (folder / "scene.toml").is_file():
         scene = Scene.load(folder)
-        if scene.config.provenance.get("source") != source:
-            raise BadInput(f"{folder} holds a scene from {scene.config.provenance.get('source')!r}, not from "
-                           f"{source!r}; choose another folder with --out")
+        found = scene.config.provenance
+        same_seed = source.startswith("preset:") or found.get("seed") == str(seed)
+        if found.get("source") != source or not same_seed:
+            raise BadInput(f"{folder} holds a scene from {found.get('source')!r} with seed {found.get('seed')}, not from "
+                           f"{source!r} with seed {seed}; choose another folder with --out")
         say(f"1 using the scene that is in {folder}")
         return scene
     say(f"1 building a scene from {source}")

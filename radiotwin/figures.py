@@ -81,9 +81,10 @@ def draw_maps(truth: RadioMap, models: dict[str, RadioMap], scene: Scene, device
         error_db = model_db - true_db
         error_image = _draw_level(axes[1, column], error_db, truth, outline, DIFFERENCE_COLOURS, -25, 25)
         axes[1, column].set_title(f"difference, RMSE {np.sqrt(np.nanmean(error_db**2)):.1f} dB", fontsize=10)
-    true_m = dict(zip([d.device for d in scene.config.devices], scene.device_m))[device]
+    true_m = dict(zip([d.device for d in scene.config.devices], scene.device_m))
     for ax in (*axes[0], *axes[1, 1:]):
-        ax.plot(*true_m[:2], "^", color="white", markeredgecolor="black", markersize=9)
+        if device in true_m:
+            ax.plot(*true_m[device][:2], "^", color="white", markeredgecolor="black", markersize=9)
     figure.colorbar(gain_image, ax=axes[0], label="channel gain [dB]", shrink=0.85)
     figure.colorbar(error_image, ax=axes[1], label="model − truth [dB]", shrink=0.85, extend="both")
     _save(figure, path)
@@ -131,10 +132,10 @@ def draw_estimates(comparison: Comparison, models: list[str], scene: Scene, path
     for ax, model in zip(axes.flat, models):
         image = draw_heights(ax, height_m, bounds)
         for device in comparison.twins[model].devices:
-            x_m, y_m, _ = true_m[device.device]
             if device.role == "anchor":
-                ax.plot(x_m, y_m, "^", color="black", markersize=8, label="anchor")
+                ax.plot(device.x_m, device.y_m, "^", color="black", markersize=8, label="anchor")
                 continue
+            x_m, y_m, _ = true_m[device.device]
             ax.plot(x_m, y_m, "*", color="#f08a00", markersize=14, markeredgecolor="white", label="true position")
             if np.isfinite([device.x_m, device.y_m]).all():
                 ax.plot([x_m, device.x_m], [y_m, device.y_m], color=NLOS_COLOUR, linewidth=1)

@@ -5,9 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from radiotwin.compare import compare_models, score_map, split_flights
+from radiotwin.compare import compare_models, predict, score_map, split_flights
 from radiotwin.comparison_output import judge_also
 from radiotwin.errors import BadInput
+from radiotwin.measurements import Measurements
+from radiotwin.scene import Scene
 from radiotwin.survey import fly_survey, segmented_truth
 
 
@@ -42,7 +44,7 @@ def test_too_few_flights(flown, held_out, message):
 def test_scores_are_what_the_predictions_say(comparison):
     links = comparison.predictions
     for model in ("log_distance", "segmented_log_distance"):
-        for name, mask in (("all", slice(None)), ("LoS", links["los"]), ("NLoS", ~links["los"])):
+        for name, mask in (("all", slice(None)), ("LoS", links["los"] == 1), ("NLoS", links["los"] == 0)):
             error_db = (links[model] - links["measured_db"])[mask].dropna()
             row = comparison.scores.query("model == @model and links == @name and positions == 'estimated' "
                                           "and against == 'held-out flights'").iloc[0]
@@ -81,3 +83,56 @@ def test_a_twin_that_has_seen_the_held_out_flight_is_named(comparison, tmp_path,
         judge_also([tmp_path / "twin"], None, ["f1"])
     with pytest.raises(BadInput, match="--truth"):
         judge_also([tmp_path / "map.nc"], None, ["f2"])
+
+
+def test_twins_are_matched_by_the_names_of_their_devices(comparison, small_scene, truth, flown):
+    """Another order of devices, and one device fewer, change nothing for the others."""
+    twin = comparison.twins["segmented_log_distance"]
+    turned = dataclasses.replace(twin, devices=twin.devices[::-1])
+    fewer = dataclasses.replace(twin, devices=twin.devices[:-1])
+    _, test = split_flights(flown, 1)
+    np.testing.assert_allclose(predict(turned, small_scene, test), predict(twin, small_scene, test))
+    missing = (test.table["device"] == "d6").to_numpy()
+    alone_db = predict(fewer, small_scene, test)
+    assert np.isnan(alone_db[missing]).all()
+    np.testing.assert_allclose(alone_db[~missing], predict(twin, small_scene, test)[~missing])
+    again = compare_models(test, test, small_scene, truth, seed=0, models=(), twins={"twin": twin, "turned": turned})
+    by_model = again.scores.set_index(["model", "against", "positions", "links"])["rmse_db"]
+    np.testing.assert_allclose(by_model["twin"], by_model["turned"])
+
+
+def test_power_received_is_held_against_a_map_of_gain(small_scene):
+    """20 dBm transmitted: levels 20 dB above the gain, errors the same."""
+    radio = small_scene.config.radio.model_copy(update={"tx_power_dbm": 20.0, "sensitivity_dbm": -100.0})
+    loud = Scene(small_scene.folder, small_scene.config.model_copy(update={"radio": radio}))
+    truth = segmented_truth(loud)
+    flown = fly_survey(loud, truth, flights=2, pattern="random-waypoint", seed=0, noise_db=0.0)
+    table = flown.table.assign(rssi_dbm=flown.table["gain_db"] + 20.0).drop(columns="gain_db")
+    results = []
+    for measurements in (flown, Measurements(table, flown.devices)):
+        train, test = split_flights(measurements, 1)
+        scores = compare_models(train, test, loud, truth, seed=0, models=("segmented_log_distance",)).scores
+        results.append(scores["bias_db"].to_numpy())
+    np.testing.assert_allclose(*results, atol=0.05)
+    assert np.abs(results[0]).max() < 2
+
+
+def test_nothing_detected_on_the_held_out_flight(small_scene, truth, flown):
+    train, test = split_flights(flown, 1)
+    silent = Measurements(test.table.assign(gain_db=np.nan), test.devices)
+    with pytest.raises(BadInput, match="nothing was detected on the held-out"):
+        compare_models(train, silent, small_scene, truth, seed=0)
+
+
+def test_a_truth_of_another_scene_is_refused(small_scene, truth, flown):
+    stale = dataclasses.replace(truth, dataset=truth.dataset.assign_attrs(scene_hash="0" * 64))
+    with pytest.raises(BadInput, match="radiotwin trace"):
+        compare_models(*split_flights(flown, 1), small_scene, stale, seed=0)
+
+
+def test_devices_whose_position_nobody_knows_are_in_neither_class(small_scene, flown):
+    """Own data in a scene that declares no devices: anchors have LoS or not, the others count in `all` alone."""
+    bare = Scene(small_scene.folder, small_scene.config.model_copy(update={"devices": []}))
+    scores = compare_models(*split_flights(flown, 1), bare, None, seed=0, models=("log_distance",)).scores
+    n = scores.set_index("links")["n"]
+    assert 0 < n["LoS"] and 0 < n["NLoS"] and n["LoS"] + n["NLoS"] < n["all"]

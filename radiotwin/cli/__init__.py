@@ -4,6 +4,7 @@ Whatever is heavy is imported inside the commands, so that `--help` answers at o
 """
 
 import os
+import signal
 import sys
 
 import typer
@@ -14,7 +15,9 @@ from radiotwin.cli.console import complain
 from radiotwin.errors import BadInput, RunFailed
 
 app = typer.Typer(
-    name="radiotwin", no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode="rich",
+    name="radiotwin", no_args_is_help=True, pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # else every [default] in a help text is taken for markup
+   
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Radio digital twins of cities, learnt from measurements. A scene is built, traced and surveyed; a twin is "
          "fitted to the measurements, mapped and compared.")
@@ -35,8 +38,17 @@ def _options(version: bool = typer.Option(False, "--version", callback=_show_ver
     """Options before the command."""
 
 
+class _Interrupted(BaseException):
+    """Ctrl-C. Typer would swallow a KeyboardInterrupt without a word."""
+
+
+def _interrupt(*_) -> None:
+    raise _Interrupted
+
+
 def main() -> None:
-    """Run the command line; exit status 0 done, 1 failed while running, 2 bad input."""
+    """Run the command line; exit status 0 done, 1 failed while running, 2 bad input, 130 interrupted."""
+    signal.signal(signal.SIGINT, _interrupt)
     try:
         app()
     except BadInput as error:
@@ -45,7 +57,7 @@ def main() -> None:
     except RunFailed as error:
         complain(str(error))
         sys.exit(1)
-    except KeyboardInterrupt:
+    except _Interrupted:
         complain("interrupted; what was finished is kept, run the same command again to go on")
         sys.exit(130)
     except BrokenPipeError:  # the reader of a pipe has gone, as `head` does

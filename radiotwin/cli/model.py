@@ -26,7 +26,7 @@ def fit(
         help="segmented_nn, segmented_log_distance, log_distance or regression_kriging.")] = "segmented_nn",
     devices: Annotated[Path | None, typer.Option(help="Table of devices [devices.csv beside the file].")] = None,
     start: Annotated[Path | None, typer.Option(help="An earlier twin, to start the search from.")] = None,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the fits and the search.")] = 0,
 ) -> None:
     """Learn the channel from the anchors, then find the unknown devices: the twin."""
     from radiotwin.measurements import read_measurements
@@ -64,7 +64,7 @@ def map_(
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin
 
-    out = out or twin.with_name(f"{twin.name}.nc")
+    out = out or twin.resolve().with_suffix(".nc")
     check_format(out)
     world = Scene.load(scene)
     radio_map = Twin.load(twin).radio_map(world)
@@ -83,7 +83,7 @@ def compare(
     also: Annotated[list[Path] | None, typer.Option(
         help="A twin's folder, or (with --truth) a radio map, to be judged beside the models; may be repeated.")
         ] = None,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the fits and the search.")] = 0,
 ) -> None:
     """Hold all channel models against flights they have not seen, and against the truth map where there is one."""
     from radiotwin.cli.world import read_truth

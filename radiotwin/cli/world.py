@@ -23,16 +23,16 @@ def build_scene(
                              "(rbm, rdm, small).")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Scene folder to write [scenes/NAME].")] = None,
     check: Annotated[bool, typer.Option("--check", help="Report only; exit status 2 if tracing would fail.")] = False,
-    frequency_hz: Annotated[float, typer.Option(help="Frequency of the scene's radio.")] = 2.4e9,
+    frequency_hz: Annotated[float | None, typer.Option(help="Frequency of the scene's radio [2.4e9].")] = None,
     material: Annotated[list[str] | None, typer.Option(
         metavar="NAME=ITU", help="Take the file's material NAME for an ITU material; may be repeated.")] = None,
     scale: Annotated[float | None, typer.Option(help="Factor from the file's unit to metres (feet: 0.3048).")] = None,
     up: Annotated[str | None, typer.Option(help="Axis of the file that points up: x, y or z.")] = None,
     bbox: Annotated[str | None, typer.Option(
         metavar="XMIN,YMIN,XMAX,YMAX", help="Keep only this part of the city [m].")] = None,
-    devices: Annotated[int, typer.Option(min=0, help="Devices to place on free ground.")] = 0,
-    uavs: Annotated[int, typer.Option(min=0, help="UAVs to place near the middle.")] = 3,
-    seed: Annotated[int, typer.Option(min=0, help="Of the placement.")] = 0,
+    devices: Annotated[int | None, typer.Option(min=0, help="Devices to place on free ground [0].")] = None,
+    uavs: Annotated[int | None, typer.Option(min=0, help="UAVs to place near the middle [3].")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the placement [0].")] = None,
 ) -> None:
     """Turn a city model into a scene folder, and report what is in it and what is wrong with it."""
     from radiotwin.scene.build import BuildOptions
@@ -42,13 +42,17 @@ def build_scene(
     from radiotwin.scene.sources import scene_name
 
     show_warnings_plainly()
+    given = {"frequency_hz": frequency_hz, "materials": _pairs(material or []) or None, "scale": scale, "up": up,
+             "bbox": _box(bbox), "devices": devices, "uavs": uavs, "seed": seed}
+    given = {name: value for name, value in given.items() if value is not None}
     if source.startswith("preset:"):
+        if given:
+            raise BadInput(f"{source} is built as it is published; the option for {', '.join(given)} cannot be used "
+                           "with it. Build it without, then change scene.toml")
         name = source.removeprefix("preset:")
         report = build_preset_scene(name, out or Path("scenes") / name, check_only=check)
     else:
-        options = BuildOptions(frequency_hz=frequency_hz, materials=_pairs(material or []), scale=scale, up=up,
-                               bbox=_box(bbox), devices=devices, uavs=uavs, seed=seed)
-        report = build(source, out or Path("scenes") / scene_name(source), options, check_only=check)
+        report = build(source, out or Path("scenes") / scene_name(source), BuildOptions(**given), check_only=check)
     print_report(report, console)
     if report.folder:
         say(f"wrote {report.folder}: scene.toml, city.xml, meshes/, preview.png")

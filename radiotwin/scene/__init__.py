@@ -78,6 +78,18 @@ class Scene:
                     raise BadInput(f"{path}: uav {uav.uav!r}: its {end} ({x_m:g}, {y_m:g}, {uav.altitude_m:g}) m "
                                    "is inside a building; move it or raise altitude_m")
 
+    def check_map(self, radio_map) -> None:
+        """Raise BadInput unless a `RadioMap` was made for this scene as it is now, with all its devices."""
+        attributes = radio_map.dataset.attrs
+        names = [device.device for device in self.config.devices]
+        missing = [name for name in names if name not in radio_map.devices]
+        same_lattice = radio_map.gain_db.shape[1:] == self.lattice.shape and \
+            np.allclose(radio_map.lattice.positions_m, self.lattice.positions_m)
+        if missing or not same_lattice or attributes.get("scene_hash") != self.content_hash():
+            what = f"it lacks device {missing[0]!r}" if missing else "geometry, radio, devices or lattice differ"
+            raise BadInput(f"the radio map was not made for the scene as it is now in {self.folder} ({what}); run "
+                           "`radiotwin trace` again")
+
     def content_hash(self) -> str:
         """SHA-256 over what decides a gain map: geometry, materials, frequency, sensitivity and device positions."""
         digest = hashlib.sha256()

@@ -115,13 +115,7 @@ class CityMap:
         Returns:
             (n,) bool
         """
-        points_m = np.atleast_2d(np.asarray(points_m, dtype=float))
-        above = points_m.copy()
-        above[:, 2] = np.maximum(self._top_m, points_m[:, 2] + 1.0)
-        depth = np.zeros(len(points_m), dtype=int)
-        for _, crossing, ray in self._crossings(points_m, above):
-            np.subtract.at(depth, ray, crossing)
-        return depth > 0
+        return self._depth(np.atleast_2d(np.asarray(points_m, dtype=float))) > 0
 
     def metres_inside(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
         """Length of each segment that lies within buildings.
@@ -134,7 +128,7 @@ class CityMap:
         """
         a_m, b_m = np.broadcast_arrays(np.atleast_2d(a_m).astype(float), np.atleast_2d(b_m).astype(float))
         length = np.linalg.norm(b_m - a_m, axis=1)
-        depth = self.inside(a_m).astype(int)
+        depth = np.maximum(self._depth(a_m), 0)
         metres = np.zeros(len(a_m))
         last = np.zeros(len(a_m))
         for distance, crossing, ray in self._crossings(a_m, b_m):
@@ -142,6 +136,15 @@ class CityMap:
             last[ray] = distance
             depth[ray] = np.maximum(depth[ray] + crossing, 0)
         return metres + np.where(depth > 0, length - last, 0.0)
+
+    def _depth(self, points_m: np.ndarray) -> np.ndarray:
+        """(n,) how many solids each point lies in."""
+        above = points_m.copy()
+        above[:, 2] = np.maximum(self._top_m, points_m[:, 2] + 1.0)
+        depth = np.zeros(len(points_m), dtype=int)
+        for _, crossing, ray in self._crossings(points_m, above):
+            np.subtract.at(depth, ray, crossing)
+        return depth
 
     def _crossings(self, a_m: np.ndarray, b_m: np.ndarray):
         """Yield the 1st, 2nd, … surface along each segment: distance from a, +1 entering or -1 leaving, ray."""

@@ -38,7 +38,9 @@ class Lattice:
 
     @property
     def step_m(self) -> float:
-        return float(self.x_m[1] - self.x_m[0])
+        """Distance of neighbours [m]; 0 for a single position."""
+        axis = self.x_m if len(self.x_m) > 1 else self.y_m
+        return float(axis[1] - axis[0]) if len(axis) > 1 else 0.0
 
     @cached_property
     def positions_m(self) -> np.ndarray:

@@ -5,11 +5,14 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
+from radiotwin.progress import progress
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.scene.config import UavConfig
 from radiotwin.survey.grid import MOVE_COST, FlightGrid
 from radiotwin.survey.patterns import PATTERNS
+
+MOST_FLIGHTS = 100_000
 
 
 def fly_survey(scene: Scene, truth: RadioMap, *, flights: int, pattern: str, seed: int,
@@ -29,23 +32,28 @@ def fly_survey(scene: Scene, truth: RadioMap, *, flights: int, pattern: str, see
     """
     _check(scene, truth, flights, pattern, noise_db)
     limit_db = scene.config.gain_limit_db
-    gain_db = truth.gain_db.reshape(len(truth.devices), -1).astype(float)
-    shadowing_db = truth.dataset["sigma_db"].values.reshape(gain_db.shape) if "sigma_db" in truth.dataset else None
+    rows = [truth.devices.index(device.device) for device in scene.config.devices]
+    gain_db = truth.gain_db[rows].reshape(len(rows), -1).astype(float)
+    shadowing_db = None
+    if "sigma_db" in truth.dataset:
+        shadowing_db = truth.dataset["sigma_db"].values[rows].reshape(gain_db.shape)
     slot_s, start_s, parts = scene.config.mission.slot_s, 0.0, []
-    for flight in range(flights):
-        longest = 0
-        for number, uav in enumerate(scene.config.uavs):
-            rng = np.random.default_rng([seed, flight, number])
-            cells = fly(scene, uav, pattern, rng)
-            index = _lattice_index(scene, uav, cells)
-            level_db = gain_db[:, index] + rng.normal(0, noise_db, (len(gain_db), len(index)))
-            if shadowing_db is not None:
-                level_db += rng.normal(0, 1, level_db.shape) * shadowing_db[:, index]
-            level_db[level_db < limit_db] = np.nan
-            time_s = start_s + slot_s * np.arange(len(index))
-            parts.append(_table(scene, f"f{flight}", uav.uav, index, level_db, time_s, _heading_deg(cells)))
-            longest = max(longest, len(index))
-        start_s += slot_s * longest
+    with progress("flying", total=flights) as advance:
+        for flight in range(flights):
+            longest = 0
+            for number, uav in enumerate(scene.config.uavs):
+                rng = np.random.default_rng([seed, flight, number])
+                cells = fly(scene, uav, pattern, rng)
+                index = _lattice_index(scene, uav, cells)
+                level_db = gain_db[:, index] + rng.normal(0, noise_db, (len(gain_db), len(index)))
+                if shadowing_db is not None:
+                    level_db += rng.normal(0, 1, level_db.shape) * shadowing_db[:, index]
+                level_db[level_db < limit_db] = np.nan
+                time_s = start_s + slot_s * np.arange(len(index))
+                parts.append(_table(scene, f"f{flight}", uav.uav, index, level_db, time_s, _heading_deg(cells)))
+                longest = max(longest, len(index))
+            start_s += slot_s * longest
+            advance(1)
     return Measurements(pd.concat(parts, ignore_index=True), declared_devices(scene))
 
 
@@ -103,16 +111,15 @@ def _check(scene: Scene, truth: RadioMap, flights: int, pattern: str, noise_db: 
     path = scene.folder / "scene.toml"
     if pattern not in PATTERNS:
         raise BadInput(f"pattern {pattern!r} is unknown; allowed are {', '.join(PATTERNS)}")
-    if flights < 1:
-        raise BadInput(f"flights = {flights}: at least one flight is needed")
-    if not noise_db >= 0:
-        raise BadInput(f"noise_db = {noise_db}: a standard deviation is 0 or more")
+    if not 1 <= flights <= MOST_FLIGHTS:
+        raise BadInput(f"flights = {flights}: allowed is 1 to {MOST_FLIGHTS}")
+    if not 0 <= noise_db < np.inf:
+        raise BadInput(f"noise_db = {noise_db}: a standard deviation is a finite number, 0 or more")
     if not scene.config.uavs:
-        raise BadInput(f"{path}: declares no UAV; add at least one [[uavs]] table")
+        raise BadInput(f"{path}: declares no UAV; add at least one [[uavs]] table, or build the scene with "
+                       "--uavs N")
     if not scene.config.devices:
-        raise BadInput(f"{path}: declares no device; add [[devices]] tables, or build the scene with --devices N")
-    if truth.dataset.attrs.get("scene_hash") != scene.content_hash() or \
-            truth.gain_db.shape[1:] != scene.lattice.shape or \
-            not np.allclose(truth.lattice.positions_m, scene.lattice.positions_m):
-        raise BadInput(f"the radio map was not made for the scene as it is now in {scene.folder} (geometry, radio, "
-                       "devices or lattice changed since); run `radiotwin trace` again")
+        raise BadInput(f"{path}: declares no device; add some, each as a table\n\n"
+                       "[[devices]]\ndevice = 'd0'\nx_m = 10.0\ny_m = 20.0\nz_m = 1.5\nrole = 'anchor'\n\n"
+                       "or build the scene with --devices N")
+    scene.check_map(truth)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from radiotwin.survey.grid import HOVER_COST, MOVE_COST, FlightGrid
+from radiotwin.survey.grid import HOVER_COST, MOVE_COST, UNREACHABLE, FlightGrid
 
 Cell = tuple[int, int]
 
@@ -25,7 +25,7 @@ def lawnmower(grid: FlightGrid, start: Cell, battery: float, rng: np.random.Gene
     corners = _lanes(grid.allowed.shape, battery, rng)
     cells = [start]
     for corner in corners:
-        if not grid.allowed[corner]:
+        if grid.steps_home(corner) == UNREACHABLE:
             continue
         for cell in grid.path(cells[-1], corner, rng):
             if MOVE_COST * (len(cells) + grid.steps_home(cell)) > battery:

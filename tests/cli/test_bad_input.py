@@ -81,7 +81,7 @@ def test_nothing_detected(run, here):
 
 
 def test_all_links_nlos(run, here):
-    """Anchors moved into a closed courtyard of their own: no receiver sees them, whatever the levels say."""
+    """Only links that the map says are blocked: what a survey with exchanged axes looks like."""
     measurements = read_measurements(here / "measurements.csv")
     from radiotwin.scene import Scene
     scene = Scene.load(here / "scene")

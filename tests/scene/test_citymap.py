@@ -109,3 +109,13 @@ def test_a_damaged_scene_is_bad_input(tmp_path):
         '<scene><shape type="ply"><string name="filename" value="meshes/no.ply"/></shape></scene>')
     with pytest.raises(BadInput, match="no.ply cannot be read: No such file"):
         CityMap.from_xml(tmp_path / "city.xml")
+
+
+def test_metres_inside_count_overlapping_solids_once():
+    """From within two solids out of the one and then of the other."""
+    boxes = [trimesh.creation.box(bounds=[[0, 0, 0], [10, 10, 10]]),
+             trimesh.creation.box(bounds=[[2, 2, 0], [6, 6, 10.5]])]
+    both = trimesh.util.concatenate(boxes)
+    city = CityMap(both.vertices, both.faces)
+    np.testing.assert_allclose(city.metres_inside([[3, 3, 5.0], [-1, 3, 5]], [[13, 3, 5.0], [13, 3, 5]]), [7, 10],
+                               atol=0.1)

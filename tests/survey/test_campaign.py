@@ -81,9 +81,10 @@ def test_heading_is_clockwise_from_north_and_time_goes_on(small_scene, truth):
 
 @pytest.mark.parametrize(("options", "message"), [
     ({"pattern": "spiral"}, "pattern 'spiral' is unknown; allowed are"),
-    ({"flights": 0}, "at least one flight"),
+    ({"flights": 0}, "allowed is 1 to"),
     ({"noise_db": -1.0}, "0 or more"),
     ({"noise_db": float("nan")}, "0 or more"),
+    ({"noise_db": float("inf")}, "0 or more"),
 ])
 def test_options_that_cannot_be(small_scene, truth, options, message):
     with pytest.raises(BadInput, match=message):
@@ -101,3 +102,11 @@ def test_a_battery_that_does_not_reach_home_is_refused(small_scene, truth):
     scene = Scene(small_scene.folder, small_scene.config.model_copy(update={"uavs": [uav]}))
     with pytest.raises(BadInput, match="does not reach"):
         survey(scene, truth)
+
+
+def test_devices_are_matched_by_name(small_scene, truth):
+    turned = dataclasses.replace(truth, dataset=truth.dataset.isel(device=slice(None, None, -1)))
+    assert survey(small_scene, turned).table.equals(survey(small_scene, truth).table)
+    fewer = dataclasses.replace(truth, dataset=truth.dataset.isel(device=slice(3)))
+    with pytest.raises(BadInput, match="lacks device 'd3'"):
+        survey(small_scene, fewer)

@@ -59,11 +59,11 @@ def test_one_impossible_los_link_fails(links):
         check(*links)
 
 
-@pytest.mark.parametrize(("count", "passes"), [(2, True), (3, False)])
-def test_tracer_and_map_may_disagree_on_half_a_percent_of_los(links, count, passes):
+@pytest.mark.parametrize(("count", "passes"), [(3, True), (4, False)])
+def test_tracer_and_map_may_disagree_on_a_few_links(links, count, passes):
     links[0][:count] = np.nan
     if passes:
-        assert check(*links)["los_below_free_space_share"] == pytest.approx(0.004)
+        assert check(*links)["los_below_free_space_share"] == pytest.approx(count / 500)
     else:
         with pytest.raises(RunFailed, match="do not see the same city"):
             check(*links)
