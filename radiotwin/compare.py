@@ -136,8 +136,8 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene, truth:
 
 def _check(test: Measurements, scene: Scene, truth: RadioMap | None, twins: dict[str, Twin]) -> None:
     if not np.isfinite(test.level_db).any():
-        raise BadInput(f"nothing was detected on the held-out flights ({', '.join(test.flights[:4])}), so no error can be "
-                       "computed; hold out other flights")
+        raise BadInput(f"nothing was detected on the held-out flights ({', '.join(test.flights[:4])}), so no error can "
+                       "be computed; hold out other flights")
     if truth is not None:
         scene.check_map(truth)
     for name, twin in twins.items():

@@ -60,8 +60,8 @@ def _scene(source: str, folder: Path, seed: int, say) -> Scene:
         found = scene.config.provenance
         same_seed = source.startswith("preset:") or found.get("seed") == str(seed)
         if found.get("source") != source or not same_seed:
-            raise BadInput(f"{folder} holds a scene from {found.get('source')!r} with seed {found.get('seed')}, not from "
-                           f"{source!r} with seed {seed}; choose another folder with --out")
+            raise BadInput(f"{folder} holds a scene from {found.get('source')!r} with seed {found.get('seed')}, not "
+                           f"from {source!r} with seed {seed}; choose another folder with --out")
         say(f"1 using the scene that is in {folder}")
         return scene
     say(f"1 building a scene from {source}")

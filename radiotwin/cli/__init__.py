@@ -17,7 +17,7 @@ from radiotwin.errors import BadInput, RunFailed
 app = typer.Typer(
     name="radiotwin", no_args_is_help=True, pretty_exceptions_enable=False,
     rich_markup_mode=None,  # else every [default] in a help text is taken for markup
-   
+
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Radio digital twins of cities, learnt from measurements. A scene is built, traced and surveyed; a twin is "
          "fitted to the measurements, mapped and compared.")

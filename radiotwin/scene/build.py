@@ -104,6 +104,9 @@ def build_scene(
     path = find_source(source)
     if not check_only:
         check_target(out_folder)
+        if path.resolve().is_relative_to(out_folder.resolve()):
+            raise BadInput(f"{source} lies in {out_folder}, which the new scene would replace; choose another output "
+                           "folder")
     city = import_city(path, options.materials or {}, options.scale, options.up, options.bbox)
     errors = [problem.message for problem in city.problems if problem.severity == "error"]
     if errors and not check_only:
@@ -214,6 +217,12 @@ def _provenance(city: ImportedCity, source: str, options: BuildOptions) -> dict[
     return known
 
 
+def _kind(name: str, itu: str | None) -> str:
+    if itu is None:
+        return "own constants"
+    return "ITU" if itu == name else f"ITU {itu}"
+
+
 def _report(
     city: ImportedCity, shapes: list[CityShape], plan: _Plan, source: str, folder: Path | None
 ) -> BuildReport:
@@ -222,7 +231,7 @@ def _report(
     declared = dict(zip((shape.material for shape in shapes), city.materials))
     for material, count in Counter(shape.material for shape in shapes).most_common():
         origin = declared[material]
-        kind = f"ITU {origin.itu}" if origin.itu else "own constants"
+        kind = _kind(material.name, origin.itu)
         uses.append(MaterialUse(material.name, kind, count, *constants(origin, frequency_hz)))
     return BuildReport(
         source,

@@ -20,7 +20,7 @@ class MaterialUse:
 
     Attributes:
         name: in `city.xml`.
-        kind: `ITU concrete`, or `own constants`.
+        kind: `ITU` of that name, `ITU concrete`, or `own constants`.
         shapes: how many shapes are made of it.
         relative_permittivity, conductivity_s_per_m: at the scene's frequency.
         in_range: False where the ITU table does not cover the frequency.

@@ -34,7 +34,7 @@ def test_town(town, tmp_path):
     assert report.built_fraction == pytest.approx(9 * 400 / 160**2, abs=0.002)
     assert not report.tracing_would_fail and not report.problems
     (use,) = report.materials
-    assert (use.name, use.kind, use.shapes, use.in_range) == ("concrete", "ITU concrete", 10, True)
+    assert (use.name, use.kind, use.shapes, use.in_range) == ("concrete", "ITU", 10, True)
     assert use.conductivity_s_per_m == pytest.approx(0.0462 * 5.8**0.7822)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
         "scene.toml",
@@ -406,3 +406,12 @@ def test_sionna_rt_loads_what_is_built(town, tmp_path, frequency_hz):
         constants = [material.relative_permittivity[0] for material in scene.radio_materials.values()]
         assert len(constants) >= 7 and min(constants) >= 1.0
     assert len(scene.objects) == 18
+
+
+def test_a_source_inside_the_output_is_not_replaced(tmp_path):
+    """`build-scene D/city.xml -o D` would leave nothing of the user's own files."""
+    build_scene("sionna:simple_street_canyon", tmp_path / "scene")
+    before = (tmp_path / "scene" / "city.xml").read_bytes()
+    with pytest.raises(BadInput, match="choose another output"):
+        build_scene(tmp_path / "scene" / "city.xml", tmp_path / "scene")
+    assert (tmp_path / "scene" / "city.xml").read_bytes() == before
