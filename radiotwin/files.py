@@ -1,30 +1,24 @@
 """Outputs that are either whole or absent: written under a temporary name, then renamed."""
 
+import errno
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from radiotwin.errors import BadInput
+
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 def require_writable(path: Path | str) -> None:
     """Raise BadInput unless a file can be written at `path`; to be asked before long work, not after it."""
     path = Path(path)
-    if path.is_dir():
-        raise BadInput(f"{path} is a folder; give the name of a file")
-    _prepare_parent(path)
-
-
-def _prepare_parent(path: Path) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadInput(f"cannot write {path}: {error.strerror}; choose another output path") from error
-    if not os.access(path.parent, os.W_OK):
-        raise BadInput(f"cannot write {path}: no permission in {path.parent}; choose another output path")
+    _refuse_folder(path)
+    with _parent_of(path), _reported(path), tempfile.NamedTemporaryFile(prefix=_prefix(path), dir=path.parent):
+        pass
 
 
 @contextmanager
@@ -32,21 +26,25 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     """Yield a temporary path beside `path` (same suffixes); rename it on success, remove it on failure.
 
     Raises:
-        BadInput: the folder cannot be made or written, or `path` is a folder.
+        BadInput: the folder cannot be made or written, the disk is full, or `path` is no ordinary file.
     """
     path = Path(path)
-    require_writable(path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem[:40]}-", suffix="".join(path.suffixes), dir=path.parent)
-    os.close(handle)
-    temporary = Path(name)
-    try:
-        yield temporary
-        umask = os.umask(0)
-        os.umask(umask)
-        temporary.chmod(0o666 & ~umask)  # mkstemp makes private files; an output is an ordinary one
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    _refuse_folder(path)
+    with _parent_of(path):
+        with _reported(path):
+            handle, name = tempfile.mkstemp(prefix=_prefix(path), suffix="".join(path.suffixes), dir=path.parent)
+            os.close(handle)
+        temporary = Path(name)
+        try:
+            with _reported(path, _DISK_ERRORS):
+                yield temporary
+            with _reported(path):
+                umask = os.umask(0)
+                os.umask(umask)
+                temporary.chmod(0o666 & ~umask)  # mkstemp makes private files; an output is an ordinary one
+                os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -54,22 +52,77 @@ def atomic_folder(path: Path | str) -> Iterator[Path]:
     """Yield an empty temporary folder beside `path`; it takes the place of `path` on success only.
 
     Raises:
-        BadInput: the parent cannot be written, or `path` is a file.
+        BadInput: the parent cannot be written, the disk is full, or `path` is a file.
     """
     path = Path(path)
-    if path.is_file():
-        raise BadInput(f"{path} is a file; give the name of a folder")
-    _prepare_parent(path)
-    temporary = Path(tempfile.mkdtemp(prefix=f".{path.name[:40]}-", dir=path.parent))
-    temporary.chmod(0o755)
+    with _reported(path):
+        if path.exists() and not path.is_dir():
+            raise BadInput(f"{path} is a file; give the name of a folder")
+    with _parent_of(path):
+        with _reported(path):
+            temporary = Path(tempfile.mkdtemp(prefix=_prefix(path), dir=path.parent))
+            temporary.chmod(0o755)
+        try:
+            with _reported(path, _DISK_ERRORS):
+                yield temporary
+            with _reported(path):
+                _swap(temporary, path)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _swap(new: Path, path: Path) -> None:
+    """Put the folder `new` at `path`; the old one goes when the new one is there, and comes back when it fails."""
+    if not path.exists():
+        os.replace(new, path)
+        return
+    aside = Path(tempfile.mkdtemp(prefix=_prefix(path), dir=path.parent))
+    old = aside / "old"
     try:
-        yield temporary
-        if path.exists():
-            old = Path(tempfile.mkdtemp(prefix=f".{path.name[:40]}-old-", dir=path.parent))
-            os.replace(path, old)
-            os.replace(temporary, path)
-            shutil.rmtree(old)
-        else:
-            os.replace(temporary, path)
+        os.replace(path, old)
+        try:
+            os.replace(new, path)
+        except OSError:
+            os.replace(old, path)
+            raise
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        if path.exists():
+            shutil.rmtree(aside, ignore_errors=True)
+
+
+@contextmanager
+def _parent_of(path: Path) -> Iterator[None]:
+    """Make the folders above `path`; of the new ones, those go again that got no file."""
+    with _reported(path):
+        new = [folder for folder in path.parents if not folder.exists()]
+    try:
+        with _reported(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
+        yield
+    finally:
+        for folder in new:
+            with suppress(OSError):  # not empty, or never made
+                folder.rmdir()
+
+
+@contextmanager
+def _reported(path: Path, numbers: tuple[int, ...] | None = None) -> Iterator[None]:
+    """Turn an OSError, or only those with these numbers, into BadInput about `path`."""
+    try:
+        yield
+    except OSError as error:
+        if numbers is not None and error.errno not in numbers:
+            raise
+        raise BadInput(f"cannot write {path}: {error.strerror or error}; choose another output path") from error
+
+
+def _refuse_folder(path: Path) -> None:
+    with _reported(path):
+        if path.is_dir():
+            raise BadInput(f"{path} is a folder; give the name of a file")
+        if path.exists() and not path.is_file():
+            raise BadInput(f"{path} is not an ordinary file; give the name of a file")
+
+
+def _prefix(path: Path) -> str:
+    return f".{path.stem[:40]}-"

@@ -1,5 +1,8 @@
 """Measured levels of links, and the devices they belong to: two tables, checked at the border."""
 
+import csv
+import gzip
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,6 +21,8 @@ DEVICE_REQUIRED = ["device", "x_m", "y_m", "z_m", "role"]
 DEVICE_OPTIONAL = ["frequency_hz", "tx_power_dbm", "azimuth_deg", "tilt_deg"]
 TEXT = {"flight", "receiver", "device", "role"}
 ROLES = ("anchor", "unknown")
+GREATEST_LEVEL_DB = 300.0
+GREATEST_COORDINATE_M = 1e7
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +77,17 @@ class Measurements:
         return Measurements(self.table[np.asarray(mask)].reset_index(drop=True), self.devices)
 
     def write(self, path: Path | str) -> None:
-        """Write the links to `path` (.csv, .csv.gz, .parquet) and the devices to `devices.csv` beside it."""
+        """Write the links to `path` (.csv, .csv.gz, .parquet) and the devices to `devices.csv` beside it.
+
+        Raises:
+            BadInput: `path` cannot be written, or a `devices.csv` with other devices lies beside it.
+        """
         path = Path(path)
         _check_suffix(path)
+        if path.name == "devices.csv":
+            raise BadInput(f"{path}: this name is for the devices' table, which is written beside the links; give the "
+                           "links another name, such as measurements.csv")
+        self._check_replaceable(path.parent / "devices.csv")
         with atomic_path(path.parent / "devices.csv") as devices, atomic_path(path) as links:
             self.devices.to_csv(devices, index=False)
             if path.suffix == ".parquet":
@@ -82,6 +95,19 @@ class Measurements:
                 self.table.to_parquet(links, index=False)
             else:
                 self.table.to_csv(links, index=False, compression="gzip" if path.suffix == ".gz" else None)
+
+    def _check_replaceable(self, path: Path) -> None:
+        """A table of the same devices may be replaced; any other one may be its user's only copy."""
+        if not path.exists():
+            return
+        try:
+            same = sorted(read_devices(path)["device"]) == sorted(self.devices["device"])
+        except BadInput:
+            same = False
+        if not same:
+            raise BadInput(f"{path} exists and is not a table of this survey's devices "
+                           f"({_some(self.devices['device'])}); it is not overwritten: choose another output folder, "
+                           "or move it away")
 
 
 def read_measurements(path: Path | str, devices_path: Path | str | None = None) -> Measurements:
@@ -100,6 +126,9 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
     if len(levels) != 1:
         raise BadInput(f"{path}: needs exactly one of the columns {LEVELS}, it has {levels or 'neither'}")
     devices_path = Path(devices_path) if devices_path else path.parent / "devices.csv"
+    if not devices_path.is_file():
+        raise BadInput(f"{devices_path} does not exist; the table of devices needs the columns "
+                       f"{', '.join(DEVICE_REQUIRED)} (role: {' or '.join(ROLES)}); --devices names another file")
     devices = read_devices(devices_path)
     if table.empty:
         raise BadInput(f"{path}: has no rows; it needs at least one measured link")
@@ -136,13 +165,11 @@ def _read_table(path: Path, required: list[str], optional: list[str], may_be_emp
     if not path.is_file():
         raise BadInput(f"{path} does not exist")
     try:
-        if path.suffix == ".parquet":
-            _needs_pyarrow(path)
-            raw = pd.read_parquet(path)
-        else:
-            raw = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True)
+        raw = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
     except BadInput:
         raise
+    except UnicodeDecodeError:
+        raise BadInput(f"{path} is not text in UTF-8; allowed is comma-separated, UTF-8") from None
     except Exception as error:  # pandas, gzip and pyarrow each have their own
         raise BadInput(f"{path} cannot be read as {''.join(path.suffixes)}: {error}") from None
     missing = [name for name in required if name not in raw]
@@ -156,6 +183,43 @@ def _read_table(path: Path, required: list[str], optional: list[str], may_be_emp
         else:
             table[name] = _numbers(path, name, table[name], name in may_be_empty)
     return table
+
+
+def _read_parquet(path: Path) -> pd.DataFrame:
+    _needs_pyarrow(path)
+    from pyarrow.parquet import read_schema
+
+    _check_header(path, read_schema(path).names)
+    return pd.read_parquet(path)
+
+
+def _read_csv(path: Path) -> pd.DataFrame:
+    """All cells as text. The fields are counted before, because pandas fills short rows with blanks, and a blank level
+    means "not detected"."""
+    rows = _fields(path)
+    header = [name.strip() for name in next(rows, [])]
+    _check_header(path, header)
+    if len(header) == 1 and not header[0].isidentifier():
+        raise BadInput(f"{path}: its header {header[0][:60]!r} is one single column; allowed is comma-separated, UTF-8")
+    for number, fields in enumerate(rows, start=2):
+        if len(fields) != len(header):
+            raise BadInput(f"{path}: row {number} has {len(fields)} fields, the header has {len(header)}; every row "
+                           "needs as many commas as the header")
+    return pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True, header=0, names=header,
+                       index_col=False, encoding="utf-8-sig")
+
+
+def _fields(path: Path) -> Iterator[list[str]]:
+    """The fields of each line that is not blank."""
+    opener = gzip.open if path.suffix == ".gz" else open
+    with opener(path, "rt", encoding="utf-8-sig", newline="") as file:
+        yield from filter(None, csv.reader(file, skipinitialspace=True))
+
+
+def _check_header(path: Path, names: list[str]) -> None:
+    for number, name in enumerate(names):
+        if name in names[:number]:
+            raise BadInput(f"{path}: row 1: column {name!r} stands there twice; every name must be unique")
 
 
 def _numbers(path: Path, name: str, column: pd.Series, may_be_empty: bool) -> pd.Series:
@@ -173,6 +237,16 @@ def _numbers(path: Path, name: str, column: pd.Series, may_be_empty: bool) -> pd
             if name in LEVELS else "is not finite")
     if not may_be_empty:
         _refuse(path, name, column, empty, "is empty")
+    if name in LEVELS:
+        _refuse(path, name, column, numbers.abs() > GREATEST_LEVEL_DB,
+                f"is no level; allowed are -{GREATEST_LEVEL_DB:g} to {GREATEST_LEVEL_DB:g}")
+    if name == "gain_db":
+        _refuse(path, name, column, numbers > 0,
+                "is above 0 dB, which no channel gain is; received power [dBm] goes into a column rssi_dbm")
+    if name.endswith("_m"):
+        _refuse(path, name, column, numbers.abs() > GREATEST_COORDINATE_M,
+                f"is too far away; allowed are -{GREATEST_COORDINATE_M:g} to {GREATEST_COORDINATE_M:g} m in the "
+                "scene's frame")
     return numbers
 
 

@@ -64,9 +64,9 @@ class RadioMap:
                 dataset = file.load()
         except Exception as error:  # h5py raises OSError, KeyError, ValueError by the kind of damage
             raise BadInput(f"{path} is not a readable NetCDF-4 file ({error}); make it again") from None
-        if "gain_db" not in dataset or dataset["gain_db"].dims != DIMS or "los" not in dataset:
-            raise BadInput(f"{path} is not a radio map: it needs gain_db and los with dims {DIMS}, "
-                           f"it has {dict(dataset.sizes)} and {list(dataset.data_vars)}")
+        problem = _problem(dataset)
+        if problem:
+            raise BadInput(f"{path} is not a radio map: {problem}; `radiotwin trace` or `radiotwin map` makes one")
         dataset["los"] = dataset["los"].astype(bool)
         return cls(dataset)
 
@@ -93,3 +93,33 @@ class RadioMap:
     def los(self) -> np.ndarray:
         """(device, z, y, x) bool"""
         return self.dataset["los"].values
+
+
+def _problem(dataset: xr.Dataset) -> str | None:
+    """What keeps a dataset from being a radio map."""
+    for name in ("gain_db", "los", "sigma_db"):
+        if name not in dataset.data_vars:
+            if name == "sigma_db":
+                continue
+            return f"it lacks {name}; it has {list(dataset.data_vars)}"
+        if dataset[name].dims != DIMS:
+            return f"{name} has the dims {dataset[name].dims}, it needs {DIMS}"
+        if dataset[name].dtype.kind not in ("biuf" if name == "los" else "iuf"):
+            return f"{name} holds {dataset[name].dtype}, not numbers"
+    for axis in DIMS:
+        if axis not in dataset.coords or dataset.sizes[axis] == 0:
+            return f"the coordinate {axis} is missing or empty"
+    for axis in "xyz":
+        values = dataset[axis].values
+        if values.dtype.kind not in "iuf" or not np.isfinite(values).all() or not (np.diff(values) > 0).all():
+            return f"the coordinate {axis} must hold finite numbers in ascending order [m]"
+    names = dataset["device"].values.astype(str).tolist()
+    if len(set(names)) < len(names):
+        return f"two devices have one name in {names}"
+    if np.isinf(dataset["gain_db"].values).any():
+        return "gain_db is infinite somewhere, where nothing is detected it must be NaN"
+    if dataset["los"].dtype != bool and not np.isin(dataset["los"].values, (0, 1)).all():
+        return "los holds other values than 0 and 1"
+    if "sigma_db" in dataset and (dataset["sigma_db"].values < 0).any():
+        return "sigma_db is negative somewhere"
+    return None

@@ -61,6 +61,16 @@ def test_select_keeps_the_devices(write):
     (HEADER + "0,f,u,0,0,5,c,-80\n", r"row 2, column device: 'c' is not in .*devices.csv"),
     (HEADER + "0,f,u,0,0,5,,-80\n", r"row 2, column device: '' is empty"),
     (HEADER, r"no rows"),
+    (HEADER + "0,f,u,0,0,5,a,3.5\n", r"row 2, column gain_db: '3.5' is above 0 dB.*rssi_dbm"),
+    (HEADER + "0,f,u,0,0,5,a,-301\n", r"row 2, column gain_db: '-301' is no level; allowed are -300 to 300"),
+    (HEADER.replace("gain_db", "rssi_dbm") + "0,f,u,0,0,5,a,1e3\n", r"row 2, column rssi_dbm: '1e3' is no level"),
+    (HEADER + "0,f,u,0,0,5,a,-80\n0,f,u,0,-2e7,5,a,-80\n",
+     r"row 3, column receiver_y_m: '-2e7' is too far away; allowed are -1e\+07 to 1e\+07 m"),
+    (HEADER.replace("time_s", "gain_db") + "-1,f,u,0,0,5,a,-80\n", r"row 1: column 'gain_db' stands there twice"),
+    (HEADER + "0,f,u,0,0,5,a,-80\n0,f,u,0,0,5,a\n", r"row 3 has 7 fields, the header has 8"),
+    (HEADER + "0,f,u,0,0,5,a,-80,1\n", r"row 2 has 9 fields, the header has 8"),
+    (HEADER.replace(",", ";") + "0;f;u;0;0;5;a;-80,5\n", r"comma-separated, UTF-8"),
+    (HEADER.replace(",", "\t") + "0\tf\tu\t0\t0\t5\ta\t-80\n", r"comma-separated, UTF-8"),
 ])
 def test_bad_rows_name_file_row_and_column(write, text, message):
     path = write(text)
@@ -73,6 +83,8 @@ def test_bad_rows_name_file_row_and_column(write, text, message):
     ("device,x_m,y_m,z_m\na,1,2,3\n", "column 'role' is missing"),
     ("device,x_m,y_m,z_m,role\na,1,2,3,anchr\n", r"row 2, column role: 'anchr'; allowed are"),
     ("device,x_m,y_m,z_m,role\na,,2,3,anchor\n", r"row 2: anchor 'a' has no x_m, y_m"),
+    ("device,x_m,y_m,z_m,role\na,1,2,3e7,anchor\n", r"row 2, column z_m: '3e7' is too far away"),
+    ("device,x_m,y_m,x_m,role\na,1,2,3,anchor\n", r"row 1: column 'x_m' stands there twice"),
     ("device,x_m,y_m,z_m,role\na,1,2,3,anchor\na,1,2,3,anchor\n", r"row 3, column device: 'a' stands there twice"),
 ])
 def test_bad_devices(write, devices, message):
@@ -95,3 +107,53 @@ def test_files_that_are_not_tables(tmp_path, write):
     (tmp_path / "m.csv.gz").write_bytes(b"not gzip")
     with pytest.raises(BadInput, match="cannot be read"):
         read_measurements(tmp_path / "m.csv.gz")
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "latin-1"])
+def test_another_encoding_is_named(write, encoding):
+    path = write(HEADER + ROWS)
+    path.write_bytes((HEADER + ROWS.replace("f0", "Flügel")).encode(encoding))
+    with pytest.raises(BadInput, match="comma-separated, UTF-8"):
+        read_measurements(path)
+
+
+def test_a_byte_order_mark_and_blank_lines_do_no_harm(write):
+    path = write(HEADER + ROWS)
+    path.write_bytes(b"\xef\xbb\xbf" + (HEADER + "\n" + ROWS).encode())
+    np.testing.assert_array_equal(read_measurements(path).level_db, [-80.5, np.nan, -90])
+
+
+def test_a_parquet_file_with_one_name_twice(write, tmp_path):
+    pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    write(HEADER + ROWS)
+    parquet.write_table(pyarrow.table([[1.0], [2.0]], names=["gain_db", "gain_db"]), tmp_path / "m.parquet")
+    with pytest.raises(BadInput, match="column 'gain_db' stands there twice"):
+        read_measurements(tmp_path / "m.parquet")
+
+
+def test_a_missing_table_of_devices_says_what_it_needs(write):
+    path = write(HEADER + ROWS)
+    (path.parent / "devices.csv").unlink()
+    with pytest.raises(BadInput, match=r"devices\.csv does not exist; .*device, x_m, y_m, z_m, role .*--devices"):
+        read_measurements(path)
+
+
+def test_links_do_not_take_the_name_of_the_devices(write, tmp_path):
+    measurements = read_measurements(write(HEADER + ROWS))
+    with pytest.raises(BadInput, match="give the links another name"):
+        measurements.write(tmp_path / "new" / "devices.csv")
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize("other", ["device,x_m,y_m,z_m,role\na,1,2,3,anchor\n", "my gadgets\nphone\n"])
+def test_a_table_of_other_devices_is_not_overwritten(write, tmp_path, other):
+    measurements = read_measurements(write(HEADER + ROWS))
+    (tmp_path / "out").mkdir()
+    devices = tmp_path / "out" / "devices.csv"
+    devices.write_text(other)
+    with pytest.raises(BadInput, match="is not overwritten"):
+        measurements.write(tmp_path / "out" / "m.csv")
+    assert devices.read_text() == other and list((tmp_path / "out").iterdir()) == [devices]
+    devices.write_text("device,x_m,y_m,z_m,role\nb,,,9,unknown\na,1,2,3,anchor\n")
+    measurements.write(tmp_path / "out" / "m.csv")
+    assert read_measurements(tmp_path / "out" / "m.csv").devices.equals(measurements.devices)

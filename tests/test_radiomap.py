@@ -50,3 +50,35 @@ def test_what_is_not_a_radio_map_is_bad_input(tmp_path):
     xr.Dataset({"t": ("x", [1.0])}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
     with pytest.raises(BadInput, match="not a radio map"):
         RadioMap.read(tmp_path / "other.nc")
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    (lambda d: d.drop_vars("los"), "lacks los"),
+    (lambda d: d.assign(los=d["los"].isel(z=0)), "los has the dims"),
+    (lambda d: d.assign(los=(d["los"].dims, np.full(d["los"].shape, "yes"))), "los holds .*not numbers"),
+    (lambda d: d.assign(los=d["los"] * 7), "los holds other values"),
+    (lambda d: d.assign(gain_db=d["gain_db"].transpose("z", "device", "y", "x")), "gain_db has the dims"),
+    (lambda d: d.assign(gain_db=(d["gain_db"].dims, np.full(d["los"].shape, "-80"))), "gain_db holds .*not numbers"),
+    (lambda d: d.assign(gain_db=d["gain_db"] - np.inf), "gain_db is infinite"),
+    (lambda d: d.assign(sigma_db=d["gain_db"].isel(device=0)), "sigma_db has the dims"),
+    (lambda d: d.assign(sigma_db=d["gain_db"]), "sigma_db is negative"),
+    (lambda d: d.drop_vars("y"), "coordinate y is missing"),
+    (lambda d: d.isel(x=slice(0, 0)), "coordinate x is missing or empty"),
+    (lambda d: d.assign_coords(x=[0.0, 20.0, np.nan]), "coordinate x must hold finite numbers in ascending"),
+    (lambda d: d.assign_coords(x=[0.0, 20.0, 20.0]), "coordinate x must hold finite numbers in ascending"),
+    (lambda d: d.assign_coords(z=["low", "high"]), "coordinate z must hold finite numbers in ascending"),
+    (lambda d: d.assign_coords(device=["a", "a"]), "two devices have one name"),
+])
+def test_a_part_that_is_not_as_it_must_be_is_named(tmp_path, change, message):
+    dataset = change(example().dataset)
+    for name in dataset.variables:
+        dataset[name].encoding = {}
+    dataset.to_netcdf(tmp_path / "map.nc", engine="h5netcdf")
+    with pytest.raises(BadInput, match=f"map.nc is not a radio map: .*{message}"):
+        RadioMap.read(tmp_path / "map.nc")
+
+
+def test_one_position_is_a_map_too(tmp_path):
+    one = Lattice.over(0, 10, 0, 10, 20, [50])
+    RadioMap.build(["a"], one, np.zeros((1, 1)), np.ones((1, 1)), np.ones((1, 1))).write(tmp_path / "map.nc")
+    assert RadioMap.read(tmp_path / "map.nc").lattice.shape == (1, 1, 1)

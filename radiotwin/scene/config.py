@@ -5,12 +5,15 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, field_validator, model_validator
 
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 
 SCHEMA = "radiotwin.scene/1"
+MOST_POSITIONS = 10_000_000
+Number = Annotated[float, Strict()]
+"""An integer will do, too, but not `true` or a text."""
 Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.+-]+$")]
 
 
@@ -21,21 +24,35 @@ class _Table(BaseModel):
 class RadioConfig(_Table):
     """One radio for all links; a device's own frequency or power may come with later formats."""
 
-    frequency_hz: float = Field(2.4e9, gt=0, ge=1e6, le=450e9)
-    bandwidth_hz: float = Field(1e6, gt=0)
-    tx_power_dbm: float = Field(0.0, ge=-100, le=100)
-    noise_dbm: float = Field(-102.0, ge=-200, le=50)
-    sensitivity_dbm: float = Field(-120.0, ge=-250, le=50)
-    snr_threshold_db: float = Field(10.0, ge=-50, le=100)
+    frequency_hz: Number = 2.4e9
+    bandwidth_hz: Number = Field(1e6, gt=0)
+    tx_power_dbm: Number = Field(0.0, ge=-100, le=100)
+    noise_dbm: Number = Field(-102.0, ge=-200, le=50)
+    sensitivity_dbm: Number = Field(-120.0, ge=-250, le=50)
+    snr_threshold_db: Number = Field(10.0, ge=-50, le=100)
+
+    @field_validator("frequency_hz")
+    @classmethod
+    def _in_the_models_range(cls, frequency_hz):
+        if not 1e6 <= frequency_hz <= 450e9:
+            raise ValueError("allowed is 1e6 Hz to 450e9 Hz (1 MHz to 450 GHz); the unit is Hz")
+        return frequency_hz
+
+    @model_validator(mode="after")
+    def _something_is_detected(self):
+        if self.sensitivity_dbm >= self.tx_power_dbm:
+            raise ValueError(f"sensitivity_dbm = {self.sensitivity_dbm:g} must lie below tx_power_dbm = "
+                             f"{self.tx_power_dbm:g}, or nothing is ever detected")
+        return self
 
 
 class Extent(_Table):
     """The part of the plane that UAVs fly over and devices are searched in."""
 
-    x_min_m: float
-    x_max_m: float
-    y_min_m: float
-    y_max_m: float
+    x_min_m: Number
+    x_max_m: Number
+    y_min_m: Number
+    y_max_m: Number
 
     @model_validator(mode="after")
     def _not_empty(self):
@@ -50,25 +67,33 @@ class Extent(_Table):
 
 
 class LatticeConfig(_Table):
-    step_m: float = Field(20.0, gt=0)
-    altitudes_m: list[Annotated[float, Field(gt=0)]] = Field(min_length=1)
+    step_m: Number = Field(20.0, gt=0)
+    altitudes_m: list[Annotated[Number, Field(gt=0)]] = Field(min_length=1)
+
+    @field_validator("altitudes_m")
+    @classmethod
+    def _unique(cls, altitudes_m):
+        for altitude_m in altitudes_m:
+            if altitudes_m.count(altitude_m) > 1:
+                raise ValueError(f"{altitude_m:g} stands there twice; every altitude must be unique")
+        return altitudes_m
 
 
 class Origin(_Table):
     """WGS84 position of the local frame's origin."""
 
-    latitude_deg: float = Field(ge=-90, le=90)
-    longitude_deg: float = Field(ge=-180, le=180)
-    altitude_m: float = 0.0
+    latitude_deg: Number = Field(ge=-90, le=90)
+    longitude_deg: Number = Field(ge=-180, le=180)
+    altitude_m: Number = 0.0
 
 
 class DeviceConfig(_Table):
     """The true position of a device; `role` says whether a survey may tell it."""
 
     device: Name
-    x_m: float
-    y_m: float
-    z_m: float = Field(1.5, gt=0)
+    x_m: Number
+    y_m: Number
+    z_m: Number = Field(1.5, gt=0)
     role: Literal["anchor", "unknown"] = "unknown"
 
 
@@ -76,18 +101,18 @@ class UavConfig(_Table):
     """A UAV flies at one altitude, from its start to its terminal, on `battery` units (move 1, hover 0.5)."""
 
     uav: Name
-    altitude_m: float = Field(gt=0)
-    start_x_m: float
-    start_y_m: float
-    terminal_x_m: float
-    terminal_y_m: float
-    battery: float = Field(gt=0)
+    altitude_m: Number = Field(gt=0)
+    start_x_m: Number
+    start_y_m: Number
+    terminal_x_m: Number
+    terminal_y_m: Number
+    battery: Number = Field(gt=0, le=100_000)
 
 
 class MissionConfig(_Table):
-    data_units: float = Field(16_000.0, gt=0, description="data waiting at each device")
-    rate_scale: float = Field(100.0, gt=0, description="data units per slot and bit/s/Hz")
-    slot_s: float = Field(2.0, gt=0, description="duration of one move or hover")
+    data_units: Number = Field(16_000.0, gt=0, description="data waiting at each device")
+    rate_scale: Number = Field(100.0, gt=0, description="data units per slot and bit/s/Hz")
+    slot_s: Number = Field(2.0, gt=0, description="duration of one move or hover")
 
 
 class SceneConfig(_Table):
@@ -112,6 +137,13 @@ class SceneConfig(_Table):
             double = {name for name in names if names.count(name) > 1}
             if double:
                 raise ValueError(f"{kind} {sorted(double)[0]!r} is declared twice; every name must be unique")
+        self._check_size()
+        for device in self.devices:
+            x_min_m, x_max_m, y_min_m, y_max_m = self.extent.bounds
+            if not (x_min_m <= device.x_m <= x_max_m and y_min_m <= device.y_m <= y_max_m):
+                raise ValueError(f"device {device.device!r} at ({device.x_m:g}, {device.y_m:g}) m lies outside the "
+                                 f"extent (x {x_min_m:g} to {x_max_m:g} m, y {y_min_m:g} to {y_max_m:g} m); move it "
+                                 "or widen the extent")
         for uav in self.uavs:
             if uav.altitude_m not in self.lattice.altitudes_m:
                 raise ValueError(f"uav {uav.uav!r}: altitude_m = {uav.altitude_m:g} is not one of "
@@ -119,6 +151,15 @@ class SceneConfig(_Table):
             for end in ("start", "terminal"):
                 self._check_on_lattice(uav, end)
         return self
+
+    def _check_size(self) -> None:
+        x_min_m, x_max_m, y_min_m, y_max_m = self.extent.bounds
+        width_m, depth_m, altitudes = x_max_m - x_min_m, y_max_m - y_min_m, len(self.lattice.altitudes_m)
+        positions = (width_m / self.lattice.step_m + 1) * (depth_m / self.lattice.step_m + 1) * altitudes
+        if positions > MOST_POSITIONS:
+            raise ValueError(f"lattice.step_m = {self.lattice.step_m:g} over an extent of {width_m:g} x {depth_m:g} m "
+                             f"and {altitudes} altitudes makes {positions:.3g} positions; allowed are "
+                             f"{MOST_POSITIONS:,}: widen the step or narrow the extent")
 
     def _check_on_lattice(self, uav: UavConfig, end: str) -> None:
         for axis, low, high in (("x", self.extent.x_min_m, self.extent.x_max_m),
@@ -187,6 +228,14 @@ def read_config(path: Path | str) -> SceneConfig:
 
 
 def write_config(config: SceneConfig, path: Path | str) -> None:
-    """Write `scene.toml`; every number that a later step uses is in it, defaults included."""
+    """Write `scene.toml`; every number that a later step uses is in it, defaults included.
+
+    Devices and UAVs are tables of their own, which tomli_w would fold into one array: so another `[[devices]]` table
+    can be appended by hand.
+    """
+    data = config.model_dump(by_alias=True, exclude_none=True)
+    lists = {name: data.pop(name) for name in ("uavs", "devices")}
+    parts = [tomli_w.dumps(data)]
+    parts += [f"[[{name}]]\n{tomli_w.dumps(table)}" for name, tables in lists.items() for table in tables]
     with atomic_path(path) as temporary:
-        temporary.write_text(tomli_w.dumps(config.model_dump(by_alias=True, exclude_none=True)), encoding="utf-8")
+        temporary.write_text("\n".join(parts), encoding="utf-8")

@@ -1,5 +1,7 @@
 """scene.toml: round trip, and one clear message for every kind of mistake."""
 
+from pathlib import Path
+
 import pytest
 
 from radiotwin.errors import BadInput
@@ -54,8 +56,42 @@ def test_presets_come_back_from_their_file(tmp_path, name):
     assert read_config(tmp_path / "scene.toml") == config
 
 
+@pytest.mark.parametrize("name", ["rbm", "rdm"])
+def test_the_scenes_that_ship_are_read(name):
+    config = read_config(Path(__file__).parents[2] / "scenes" / name / "scene.toml")
+    assert config == preset_config(name)
+
+
+@pytest.mark.parametrize("devices", [0, 1, 7])
+def test_a_device_can_be_appended_by_hand(tmp_path, devices):
+    config = preset_config("small")
+    config = config.model_copy(update={"devices": config.devices[:devices]})
+    write_config(config, tmp_path / "scene.toml")
+    with (tmp_path / "scene.toml").open("a") as file:
+        file.write("[[devices]]\ndevice = 'mine'\nx_m = 5\ny_m = 6\n")
+    again = read_config(tmp_path / "scene.toml")
+    assert again.devices[:-1] == config.devices and again.uavs == config.uavs
+    assert again.devices[-1].device == "mine" and again.devices[-1].x_m == 5
+
+
+def test_the_greatest_lattice_is_allowed(tmp_path):
+    text = GOOD.split("[[devices]]")[0].replace("x_max_m = 100", "x_max_m = 9999").replace("y_max_m = 60", "y_max_m = 999")
+    assert read_config(write(tmp_path, text.replace("step_m = 20", "step_m = 1"))).lattice.step_m == 1
+    with pytest.raises(BadInput, match="positions; allowed"):
+        read_config(write(tmp_path, text.replace("step_m = 20", "step_m = 1").replace("999\n", "1000\n")))
+
+
 @pytest.mark.parametrize(("old", "new", "message"), [
-    ("frequency_hz = 3.5e9", "frequency_hz = -1", r"radio\.frequency_hz = -1: .*greater than or equal to 1000000"),
+    ("frequency_hz = 3.5e9", "frequency_hz = -1", r"radio\.frequency_hz = -1: allowed is 1e6 Hz to 450e9 Hz .*GHz"),
+    ("frequency_hz = 3.5e9", "frequency_hz = 3.5e12", r"radio\.frequency_hz = 3500000000000.0: allowed is 1e6 Hz"),
+    ("frequency_hz = 3.5e9", "frequency_hz = true", r"radio\.frequency_hz = True: .*valid number"),
+    ("frequency_hz = 3.5e9", "tx_power_dbm = -120", r"radio: sensitivity_dbm = -120 must lie below tx_power_dbm"),
+    ("altitudes_m = [50]", "altitudes_m = [50, true]", r"lattice\.altitudes_m\.1 = True: .*valid number"),
+    ("altitudes_m = [50]", "altitudes_m = [50, 60, 50.0]", r"lattice\.altitudes_m.*50 stands there twice"),
+    ("step_m = 20", "step_m = 0.01", r"lattice\.step_m = 0\.01 over an extent of 100 x 60 m .*10,000,000"),
+    ("step_m = 20", "step_m = 1e-300", r"lattice\.step_m = 1e-300 over"),
+    ("x_m = 1\n", "x_m = 100.5\n", r"device 'd0' at \(100\.5, 2\) m lies outside the extent \(x 0 to 100 m, y 0 to"),
+    ("battery = 10\n", "battery = 100001\n", r"uavs\.0\.battery = 100001: .*100000"),
     ("frequency_hz = 3.5e9", "frequency_hz = inf", r"radio\.frequency_hz = inf"),
     ("frequency_hz = 3.5e9", 'frequency_hz = "high"', r"radio\.frequency_hz = 'high'.*number"),
     ("frequency_hz = 3.5e9", "frequenzy_hz = 1e9", r"radio\.frequenzy_hz: unknown key"),
