@@ -1,16 +1,19 @@
 """The twin: a channel learned from anchors, the positions of all devices, and where both come from."""
 
 import json
+import warnings
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 import radiotwin
 from radiotwin.channel import MODELS, ChannelModel, Links, check_fit_data, load_channel, make_links, save_channel
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder
-from radiotwin.localize import localize
+from radiotwin.localize import LocalizeSettings, localize
 from radiotwin.measurements import Measurements
 from radiotwin.progress import progress
 from radiotwin.radiomap import RadioMap
@@ -43,6 +46,40 @@ class TwinDevice:
     located: bool
     credible_radius_m: float
     second_mode: tuple[float, float, float] | None
+
+
+class _DeviceRecord(BaseModel):
+    """A device in `twin.json`; null where a position or a radius is not known."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+
+    device: str
+    x_m: float | None
+    y_m: float | None
+    z_m: float | None
+    role: Literal["anchor", "unknown"]
+    located: bool
+    credible_radius_m: float | None
+    second_mode: Annotated[list[float], Field(min_length=3, max_length=3)] | None
+
+
+class _TwinFile(BaseModel):
+    """What is read of `twin.json`."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
+
+    devices: list[_DeviceRecord] = Field(min_length=1)
+    level: Literal["gain_db", "rssi_dbm"]
+    limit_db: float | None
+    provenance: dict
+
+    @field_validator("devices")
+    @classmethod
+    def _unique(cls, devices: list[_DeviceRecord]) -> list[_DeviceRecord]:
+        names = [device.device for device in devices]
+        if len(set(names)) < len(names):
+            raise ValueError("a device stands there twice")
+        return devices
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +144,7 @@ class Twin:
         folder = Path(folder)
         if folder.is_dir() and any(folder.iterdir()) and not (folder / "twin.json").is_file():
             raise BadInput(f"{folder} is not empty and not a twin's folder; choose another output folder")
-        record = {"schema": SCHEMA, "channel": {"model": self.channel.name, "file": CHANNEL_FILE},
+        record = {"schema": SCHEMA, "channel": {"model": self.channel.name, "file": CHANNEL_FILE},  # for people; the name is fixed
                   "level": self.level, "limit_db": self.limit_db,
                   "devices": [_without_nan(asdict(device)) for device in self.devices],
                   "effects": [], "provenance": self.provenance}
@@ -128,17 +165,18 @@ class Twin:
             record = json.loads(path.read_text(encoding="utf-8"))
             if record["schema"] != SCHEMA:
                 raise BadInput(f"{path}: schema is {record['schema']!r}, this version reads {SCHEMA!r}")
-            devices = [TwinDevice(**_with_nan(device)) for device in record["devices"]]
-            channel = load_channel(folder / record["channel"]["file"])
-            return cls(channel, devices, record["level"], record["limit_db"], record["provenance"])
+            content = _TwinFile.model_validate(record)
+            devices = [TwinDevice(**_with_nan(device.model_dump())) for device in content.devices]
+            channel = load_channel(folder / CHANNEL_FILE)
+            return cls(channel, devices, content.level, content.limit_db, content.provenance)
         except (FileNotFoundError, NotADirectoryError):
             raise BadInput(f"{folder} is not a twin's folder (no twin.json); `radiotwin fit` makes one") from None
-        except (KeyError, TypeError, ValueError) as error:
+        except (OSError, KeyError, TypeError, ValueError) as error:
             raise BadInput(f"{path} is damaged ({type(error).__name__}: {error}); run `radiotwin fit` again") from None
 
 
 def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmented_nn", seed: int,
-             start: "Twin | None" = None) -> Twin:
+             start: "Twin | None" = None, allow_indoor: bool = False) -> Twin:
     """Learn the channel from the anchors' links, then find the unknown devices with it.
 
     Args:
@@ -147,12 +185,14 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
         model: a key of `radiotwin.channel.MODELS`.
         seed: of the channel's and the search's random numbers.
         start: an earlier twin; the search also starts from its positions.
+        allow_indoor: whether unknown devices may be inside buildings.
 
     Raises:
         BadInput: no anchor, nothing detected, or links that no channel can be learned from.
     """
     if model not in MODELS:
         raise BadInput(f"channel model {model!r} is unknown; allowed are {', '.join(MODELS)}")
+    _check_positions(measurements, scene)
     level = measurements.level_column
     radio = scene.config.radio
     limit_db = scene.config.gain_limit_db if level == "gain_db" else radio.sensitivity_dbm
@@ -162,11 +202,13 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
     devices = [_anchor(row) if row.role == "anchor" else None for row in measurements.devices.itertuples()]
     unknown = np.flatnonzero(~measurements.is_anchor)
     if len(unknown):
-        for index, found in zip(unknown, _locate(measurements, scene, channel.trend, unknown, limit_db, seed, start)):
+        settings = LocalizeSettings(allow_indoor=allow_indoor)
+        located = _locate(measurements, scene, channel.trend, unknown, limit_db, seed, start, settings)
+        for index, found in zip(unknown, located):
             devices[index] = TwinDevice(measurements.devices["device"][index], found.x_m, found.y_m, found.z_m,
                                         "unknown", found.located, found.credible_radius_m, found.second_mode)
     if channel.trend is not channel:
-        device_m = np.array([(d.x_m, d.y_m, d.z_m) for d in devices])
+        device_m = np.array([(d.x_m, d.y_m, d.z_m) if d.located else (np.nan,) * 3 for d in devices])
         channel = _fit_channel(measurements, device_m, scene, MODELS[model](), limit_db, seed)
     provenance = {"scene": scene.config.name, "scene_hash": scene.content_hash(), "links": len(measurements.table),
                   "flights": measurements.flights, "seed": seed, "radiotwin_version": radiotwin.__version__}
@@ -182,25 +224,38 @@ def _fit_channel(measurements, device_m, scene, channel: ChannelModel, limit_db,
     if not known.any():
         raise BadInput("no link to an anchor: none of the devices with role anchor was measured; fly nearer to them")
     training = measurements.select(known)
-    _check_heights(training)
     links = make_links(device_m, training.receiver_m, training.device_index, scene.city)
     check_fit_data(links, training.level_db, needs_los=channel.uses_map)
     return channel.fit(links, training.level_db, limit_db, seed)
 
 
-def _check_heights(measurements: Measurements) -> None:
-    for table, column, what in ((measurements.table, "receiver_z_m", "receiver"),
-                                (measurements.devices, "z_m", "device")):
-        if table[column].isna().any():
-            row = int(np.flatnonzero(table[column].isna())[0])
-            raise BadInput(f"row {row + 2}, column {column}: the {what}'s height is empty; with a 3D map every "
-                           "position needs one")
+def _check_positions(measurements: Measurements, scene: Scene) -> None:
+    """Raise BadInput for what a 3D map cannot be used with, warn about what is odd."""
+    if measurements.table["receiver_z_m"].isna().any():
+        row = int(np.flatnonzero(measurements.table["receiver_z_m"].isna())[0])
+        raise BadInput(f"measurements, row {row + 2}, column receiver_z_m: the receiver's height is empty; with a 3D "
+                       "map every position needs one")
+    measured = np.unique(measurements.device_index)
+    for index in measured[np.isnan(measurements.device_m[measured, 2])]:
+        raise BadInput(f"devices, row {index + 2}, column z_m: the height of device "
+                       f"{measurements.devices['device'][index]!r} is empty; with a 3D map every position needs one")
+    anchors = np.flatnonzero(measurements.is_anchor & np.isfinite(measurements.device_m).all(axis=1))
+    for index in anchors[scene.city.inside(measurements.device_m[anchors])]:
+        x_m, y_m, z_m = measurements.device_m[index]
+        raise BadInput(f"devices, row {index + 2}: anchor {measurements.devices['device'][index]!r} at ({x_m:g}, {y_m:g}, "
+                       f"{z_m:g}) m is inside a building of the scene; correct its position, or the scene's frame")
+    receiver_m = measurements.receiver_m
+    low, high = scene.city.vertices.min(axis=0)[:2], scene.city.vertices.max(axis=0)[:2]
+    for odd, where in ((scene.city.inside(receiver_m), "inside buildings"),
+                       (((receiver_m[:, :2] < low) | (receiver_m[:, :2] > high)).any(axis=1), "outside the 3D map")):
+        if odd.any():
+            warnings.warn(f"{odd.sum()} of {len(odd)} receiver positions lie {where}: do measurements and scene share "
+                          "one frame and unit?", stacklevel=3)
 
 
-def _locate(measurements, scene, channel, unknown, limit_db, seed, start):
+def _locate(measurements, scene, channel, unknown, limit_db, seed, start, settings):
     measured = np.isin(measurements.device_index, unknown)
     links = measurements.select(measured)
-    _check_heights(links)
     start_m = None
     if start is not None:
         before = {device.device: (device.x_m, device.y_m) for device in start.devices}
@@ -208,7 +263,7 @@ def _locate(measurements, scene, channel, unknown, limit_db, seed, start):
     return localize(
         links.receiver_m, links.device_index, links.level_db, channel, devices=unknown,
         bounds=scene.config.extent.bounds, z_m=measurements.device_m[unknown, 2],
-        city=scene.city, limit_db=limit_db, seed=seed, start_m=start_m)
+        city=scene.city, limit_db=limit_db, seed=seed, start_m=start_m, settings=settings)
 
 
 def _anchor(row) -> TwinDevice:

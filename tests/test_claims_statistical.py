@@ -15,7 +15,6 @@ import pytest
 
 from radiotwin.channel import make_links
 from radiotwin.channel.likelihood import mean_if_detected
-from radiotwin.compare import true_positions
 from radiotwin.scene import Scene
 from radiotwin.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
@@ -27,7 +26,7 @@ FLIGHTS = 5
 
 @pytest.fixture(scope="module")
 def runs():
-    """(seed, twin, held-out measurements, true device positions) of every seed."""
+    """(seed, twin, held-out measurements) of every seed."""
     scene = Scene.load(RBM)
     truth = segmented_truth(scene)
     results = []
@@ -35,17 +34,17 @@ def runs():
         flown = fly_survey(scene, truth, flights=2 * FLIGHTS, pattern="random-waypoint", seed=seed, noise_db=0.0)
         early = flown.table["flight"].isin(flown.flights[:FLIGHTS]).to_numpy()
         twin = fit_twin(flown.select(early), scene, seed=seed)
-        results.append((seed, twin, flown.select(~early), true_positions(scene, flown)))
+        results.append((seed, twin, flown.select(~early)))
     return scene, results
 
 
 def test_channel_error_is_within_8_percent_of_the_noise(runs):
     scene, results = runs
-    for seed, twin, test, true_m in results:
-        links = make_links(true_m, test.receiver_m, test.device_index, scene.city)
+    for seed, twin, test in results:
+        links = make_links(scene.device_m, test.receiver_m, test.device_index, scene.city)
         predicted_db = mean_if_detected(*twin.channel.predict(links), scene.config.gain_limit_db)
         error_db = predicted_db - test.level_db
-        # Near the limit only the upper part of the noise is seen; there the floor is not σ but less.
+        # Within 8 dB of the limit only the upper part of the noise is seen: the floor is not σ there, but less.
         inside = np.isfinite(error_db) & (predicted_db > scene.config.gain_limit_db + 8)
         for los, floor_db in ((True, 2**0.5), (False, 5**0.5)):
             mask = inside & (links.los == los)
@@ -55,9 +54,9 @@ def test_channel_error_is_within_8_percent_of_the_noise(runs):
 
 
 def test_unknown_devices_are_found(runs):
-    _, results = runs
-    error_m = np.array([np.hypot(device.x_m - x_m, device.y_m - y_m) for _, twin, _, true_m in results
-                        for device, (x_m, y_m, _) in zip(twin.devices, true_m) if device.role == "unknown"])
+    scene, results = runs
+    error_m = np.array([np.hypot(device.x_m - x_m, device.y_m - y_m) for _, twin, _ in results
+                        for device, (x_m, y_m, _) in zip(twin.devices, scene.device_m) if device.role == "unknown"])
     assert len(error_m) == 7 * len(SEEDS)
     assert np.median(error_m) <= 3
     assert np.quantile(error_m, 0.9) <= 12
@@ -66,8 +65,8 @@ def test_unknown_devices_are_found(runs):
 
 def test_credible_radii_hold_what_they_say(runs):
     """90 % radii hold the truth in 81 % of these 70 cases (docs/results.md); below 70 % something has been broken."""
-    _, results = runs
+    scene, results = runs
     within = [np.hypot(device.x_m - x_m, device.y_m - y_m) <= device.credible_radius_m
-              for _, twin, _, true_m in results
-              for device, (x_m, y_m, _) in zip(twin.devices, true_m) if device.role == "unknown"]
+              for _, twin, _ in results
+              for device, (x_m, y_m, _) in zip(twin.devices, scene.device_m) if device.role == "unknown"]
     assert np.mean(within) >= 0.7

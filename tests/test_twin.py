@@ -7,6 +7,7 @@ import pytest
 
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
+from radiotwin.scene import Scene
 from radiotwin.survey import fly_survey, segmented_truth
 from radiotwin.twin import Twin, fit_twin
 
@@ -59,11 +60,13 @@ def test_a_device_never_measured_is_reported_not_guessed(small_scene, flown, tmp
 
 
 def test_a_level_in_dbm_is_turned_into_gain_by_the_transmit_power(small_scene, flown, twin):
-    """RSSI with 0 dBm transmitted has the numbers of the gain; the map must be the same."""
-    rssi = Measurements(flown.table.rename(columns={"gain_db": "rssi_dbm"}), flown.devices)
-    again = fit_twin(rssi, small_scene, model="segmented_log_distance", seed=0)
+    """RSSI with 20 dBm transmitted is 20 dB above the gain; the map must be the same."""
+    radio = small_scene.config.radio.model_copy(update={"tx_power_dbm": 20.0, "sensitivity_dbm": -100.0})
+    loud = Scene(small_scene.folder, small_scene.config.model_copy(update={"radio": radio}))
+    table = flown.table.assign(rssi_dbm=flown.table["gain_db"] + 20).drop(columns="gain_db")
+    again = fit_twin(Measurements(table, flown.devices), loud, model="segmented_log_distance", seed=0)
     assert again.level == "rssi_dbm"
-    np.testing.assert_array_equal(again.radio_map(small_scene).gain_db, twin.radio_map(small_scene).gain_db)
+    np.testing.assert_allclose(again.radio_map(loud).gain_db, twin.radio_map(small_scene).gain_db, atol=0.02)
 
 
 def test_a_damaged_twin_is_bad_input(twin, tmp_path):
@@ -72,7 +75,10 @@ def test_a_damaged_twin_is_bad_input(twin, tmp_path):
     twin.save(tmp_path / "twin")
     path = tmp_path / "twin" / "twin.json"
     text = path.read_text()
-    for broken in (text[:100], text.replace('"devices"', '"gadgets"')):
+    for broken in (text[:100], text.replace('"devices"', '"gadgets"'), text.replace('"x_m": 80.0', '"x_m": "far"'),
+                   text.replace('"gain_db"', '"loudness"'), text.replace('"d1"', '"d0"'),
+                   text.replace('"anchor"', '"boss"')):
+        assert broken != text
         path.write_text(broken)
         with pytest.raises(BadInput, match="damaged"):
             Twin.load(tmp_path / "twin")
@@ -84,5 +90,18 @@ def test_a_damaged_twin_is_bad_input(twin, tmp_path):
 def test_a_missing_height_is_bad_input(small_scene, flown):
     table = flown.table.copy()
     table.loc[4, "receiver_z_m"] = np.nan
-    with pytest.raises(BadInput, match="height is empty"):
+    with pytest.raises(BadInput, match="measurements, row 6, column receiver_z_m"):
         fit_twin(Measurements(table, flown.devices), small_scene, model="segmented_log_distance", seed=0)
+
+
+def test_an_anchor_inside_a_building_is_bad_input(small_scene, flown):
+    devices = flown.devices.copy()
+    devices.loc[0, ["x_m", "y_m"]] = 130.0, 170.0
+    with pytest.raises(BadInput, match="devices, row 2: anchor 'd0' .*inside a building"):
+        fit_twin(Measurements(flown.table, devices), small_scene, model="segmented_log_distance", seed=0)
+
+
+def test_receivers_off_the_map_are_mentioned(small_scene, flown):
+    table = flown.table.assign(receiver_x_m=flown.table["receiver_x_m"] + 5000)
+    with pytest.warns(UserWarning, match="outside the 3D map"):
+        fit_twin(Measurements(table, flown.devices), small_scene, model="log_distance", seed=0)

@@ -26,6 +26,8 @@ def fit(
         help="segmented_nn, segmented_log_distance, log_distance or regression_kriging.")] = "segmented_nn",
     devices: Annotated[Path | None, typer.Option(help="Table of devices [devices.csv beside the file].")] = None,
     start: Annotated[Path | None, typer.Option(help="An earlier twin, to start the search from.")] = None,
+    allow_indoor: Annotated[bool, typer.Option("--allow-indoor", help="Unknown devices may be inside buildings.")
+                            ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the fits and the search.")] = 0,
 ) -> None:
     """Learn the channel from the anchors, then find the unknown devices: the twin."""
@@ -36,7 +38,7 @@ def fit(
     show_warnings_plainly()
     data, world = read_measurements(measurements, devices), Scene.load(scene)
     earlier = Twin.load(start) if start else None
-    twin = fit_twin(data, world, model=model, seed=seed, start=earlier)
+    twin = fit_twin(data, world, model=model, seed=seed, start=earlier, allow_indoor=allow_indoor)
     twin.save(out)
     print_rows(f"Twin {out} ({model})",
                {"device": "left", "role": "left", "x [m]": "right", "y [m]": "right", "90 % radius [m]": "right",

@@ -1,5 +1,6 @@
 """Gains of links by the paths that Sionna RT finds."""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -87,8 +88,14 @@ class PathGains:
         real, imaginary = (np.array(part, dtype=float).reshape(self.settings.batch_receivers, -1) for part in paths.a)
         field = real + 1j * imaginary
         if self.settings.combining == "power":
-            return (np.abs(field) ** 2).sum(axis=1)
+            return _exact_sums(np.abs(field) ** 2)
         # Sionna's coefficients leave out the phase of the delay, which is -1 where there is no path.
         delay_s = np.array(paths.tau, dtype=float).reshape(field.shape)
         phase = -2 * np.pi * float(self._city.frequency[0]) * delay_s
-        return np.abs((field * np.exp(1j * phase)).sum(axis=1)) ** 2
+        field *= np.exp(1j * phase)
+        return _exact_sums(field.real) ** 2 + _exact_sums(field.imag) ** 2
+
+
+def _exact_sums(values: np.ndarray) -> np.ndarray:
+    """Sum of each row, rounded once: Sionna RT gives the same paths in an order that threads decide."""
+    return np.array([math.fsum(row[row != 0]) for row in values])

@@ -98,7 +98,7 @@ def test_a_negative_frequency(run, here):
 
 def test_a_device_inside_a_building(run, here):
     path = here / "scene" / "scene.toml"
-    path.write_text(path.read_text().replace("x_m = 160.0, y_m = 120.0", "x_m = 130.0, y_m = 170.0"))
+    path.write_text(path.read_text().replace("x_m = 160.0\ny_m = 120.0", "x_m = 130.0\ny_m = 170.0"))
     refuse(run, "survey scene --truth segmented -o s.csv", here, "scene.toml", "device 'd3'", "inside a building")
 
 

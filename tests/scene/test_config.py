@@ -75,7 +75,8 @@ def test_a_device_can_be_appended_by_hand(tmp_path, devices):
 
 
 def test_the_greatest_lattice_is_allowed(tmp_path):
-    text = GOOD.split("[[devices]]")[0].replace("x_max_m = 100", "x_max_m = 9999").replace("y_max_m = 60", "y_max_m = 999")
+    text = GOOD.split("[[devices]]")[0].replace("x_max_m = 100", "x_max_m = 9999")
+    text = text.replace("y_max_m = 60", "y_max_m = 999")
     assert read_config(write(tmp_path, text.replace("step_m = 20", "step_m = 1"))).lattice.step_m == 1
     with pytest.raises(BadInput, match="positions; allowed"):
         read_config(write(tmp_path, text.replace("step_m = 20", "step_m = 1").replace("999\n", "1000\n")))
@@ -85,7 +86,7 @@ def test_the_greatest_lattice_is_allowed(tmp_path):
     ("frequency_hz = 3.5e9", "frequency_hz = -1", r"radio\.frequency_hz = -1: allowed is 1e6 Hz to 450e9 Hz .*GHz"),
     ("frequency_hz = 3.5e9", "frequency_hz = 3.5e12", r"radio\.frequency_hz = 3500000000000.0: allowed is 1e6 Hz"),
     ("frequency_hz = 3.5e9", "frequency_hz = true", r"radio\.frequency_hz = True: .*valid number"),
-    ("frequency_hz = 3.5e9", "tx_power_dbm = -120", r"radio: sensitivity_dbm = -120 must lie below tx_power_dbm"),
+    ("frequency_hz = 3.5e9", "sensitivity_dbm = 5", r"radio: sensitivity_dbm = 5 must lie below tx_power_dbm"),
     ("altitudes_m = [50]", "altitudes_m = [50, true]", r"lattice\.altitudes_m\.1 = True: .*valid number"),
     ("altitudes_m = [50]", "altitudes_m = [50, 60, 50.0]", r"lattice\.altitudes_m.*50 stands there twice"),
     ("step_m = 20", "step_m = 0.01", r"lattice\.step_m = 0\.01 over an extent of 100 x 60 m .*10,000,000"),
