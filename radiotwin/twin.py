@@ -144,7 +144,7 @@ class Twin:
         folder = Path(folder)
         if folder.is_dir() and any(folder.iterdir()) and not (folder / "twin.json").is_file():
             raise BadInput(f"{folder} is not empty and not a twin's folder; choose another output folder")
-        record = {"schema": SCHEMA, "channel": {"model": self.channel.name, "file": CHANNEL_FILE},  # for people; the name is fixed
+        record = {"schema": SCHEMA, "channel": {"model": self.channel.name, "file": CHANNEL_FILE},
                   "level": self.level, "limit_db": self.limit_db,
                   "devices": [_without_nan(asdict(device)) for device in self.devices],
                   "effects": [], "provenance": self.provenance}
@@ -242,8 +242,8 @@ def _check_positions(measurements: Measurements, scene: Scene) -> None:
     anchors = np.flatnonzero(measurements.is_anchor & np.isfinite(measurements.device_m).all(axis=1))
     for index in anchors[scene.city.inside(measurements.device_m[anchors])]:
         x_m, y_m, z_m = measurements.device_m[index]
-        raise BadInput(f"devices, row {index + 2}: anchor {measurements.devices['device'][index]!r} at ({x_m:g}, {y_m:g}, "
-                       f"{z_m:g}) m is inside a building of the scene; correct its position, or the scene's frame")
+        raise BadInput(f"devices, row {index + 2}: anchor {measurements.devices['device'][index]!r} at ({x_m:g}, "
+                       f"{y_m:g}, {z_m:g}) m is inside a building of the scene; correct its position, or the scene's frame")
     receiver_m = measurements.receiver_m
     low, high = scene.city.vertices.min(axis=0)[:2], scene.city.vertices.max(axis=0)[:2]
     for odd, where in ((scene.city.inside(receiver_m), "inside buildings"),
