@@ -242,8 +242,9 @@ def _check_positions(measurements: Measurements, scene: Scene) -> None:
     anchors = np.flatnonzero(measurements.is_anchor & np.isfinite(measurements.device_m).all(axis=1))
     for index in anchors[scene.city.inside(measurements.device_m[anchors])]:
         x_m, y_m, z_m = measurements.device_m[index]
-        raise BadInput(f"devices, row {index + 2}: anchor {measurements.devices['device'][index]!r} at ({x_m:g}, "
-                       f"{y_m:g}, {z_m:g}) m is inside a building of the scene; correct its position, or the scene's frame")
+        name = measurements.devices["device"][index]
+        raise BadInput(f"devices, row {index + 2}: anchor {name!r} at ({x_m:g}, {y_m:g}, {z_m:g}) m is inside a "
+                       "building of the scene; correct its position, or the scene's frame")
     receiver_m = measurements.receiver_m
     low, high = scene.city.vertices.min(axis=0)[:2], scene.city.vertices.max(axis=0)[:2]
     for odd, where in ((scene.city.inside(receiver_m), "inside buildings"),

@@ -45,6 +45,9 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
     device_m = scene.device_m[index]
     key = _key(scene, settings)
     store = BatchStore(scene.folder / "cache", key)
+    finished = _finished(Path(out_path), store.hash, [scene.config.devices[i].device for i in index])
+    if finished is not None:
+        return finished
     raw_db = solve_lattice(scene, settings, store, index)
 
     los = np.stack([scene.city.line_of_sight(one_m[None], positions_m) for one_m in device_m])
@@ -67,6 +70,18 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
                     **library_versions(), "radiotwin_version": version("radiotwin")})
     radio_map.write(out_path)
     return radio_map
+
+
+def _finished(path: Path, trace_hash: str, devices: list[str]) -> RadioMap | None:
+    """The map that is at `path` already, where it is the one that was asked for."""
+    if not path.is_file():
+        return None
+    try:
+        radio_map = RadioMap.read(path)
+    except BadInput:  # something else, or damaged: to be replaced
+        return None
+    same = radio_map.dataset.attrs.get("trace_hash") == trace_hash and radio_map.devices == devices
+    return radio_map if same else None
 
 
 def device_indices(scene: Scene, devices: list[str] | None) -> list[int]:

@@ -1,5 +1,7 @@
 """The orchestration of a trace: cache, resumption, censoring, attributes. Gains come from a law here."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -68,7 +70,7 @@ def test_only_what_is_missing_or_damaged_is_solved_again(own_scene, law, tmp_pat
     files[8].write_bytes(files[8].read_bytes()[:100])
     np.save(files[11], np.zeros(3))
     law.calls = 0
-    again = trace_map(own_scene, SETTINGS, tmp_path / "truth.nc")
+    again = trace_map(own_scene, SETTINGS, tmp_path / "again.nc")
     assert law.calls == 3
     assert again.gain_db.tobytes() == first.gain_db.tobytes()
 
@@ -122,3 +124,14 @@ def test_positions_inside_buildings_have_no_gain(own_scene, law, tmp_path):
     radio_map = trace_map(scene, SETTINGS, tmp_path / "truth.nc")
     assert np.isnan(radio_map.gain_db.reshape(DEVICES, -1)[:, inside]).all()
     assert radio_map.dataset.attrs["links_inside_building"] == DEVICES * inside.sum()
+
+
+def test_a_finished_map_is_known_without_its_cache(own_scene, law, tmp_path):
+    """A map that ships, or was moved, is not traced again; other settings, devices or a damaged file are."""
+    first = trace_map(own_scene, SETTINGS, tmp_path / "map.nc")
+    shutil.rmtree(own_scene.folder / "cache")
+    calls = law.calls
+    again = trace_map(own_scene, SETTINGS, tmp_path / "map.nc")
+    assert law.calls == calls and again.gain_db.tobytes() == first.gain_db.tobytes()
+    trace_map(own_scene, SETTINGS, tmp_path / "map.nc", ["d1"])
+    assert law.calls > calls
