@@ -406,12 +406,3 @@ def test_sionna_rt_loads_what_is_built(town, tmp_path, frequency_hz):
         constants = [material.relative_permittivity[0] for material in scene.radio_materials.values()]
         assert len(constants) >= 7 and min(constants) >= 1.0
     assert len(scene.objects) == 18
-
-
-def test_a_source_inside_the_output_is_not_replaced(tmp_path):
-    """`build-scene D/city.xml -o D` would leave nothing of the user's own files."""
-    build_scene("sionna:simple_street_canyon", tmp_path / "scene")
-    before = (tmp_path / "scene" / "city.xml").read_bytes()
-    with pytest.raises(BadInput, match="choose another output"):
-        build_scene(tmp_path / "scene" / "city.xml", tmp_path / "scene")
-    assert (tmp_path / "scene" / "city.xml").read_bytes() == before
