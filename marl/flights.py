@@ -1,0 +1,111 @@
+"""Flying whole flights with a policy, and what is recorded of them."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from marl.environment import Environment, Frame, empty_frame
+from marl.features import observe
+from marl.heuristics import greedy_actions, random_actions
+from marl.mission import Mission
+from marl.networks import Agent
+
+
+@dataclass(frozen=True, eq=False)
+class Flights:
+    """A record of E flights, slot by slot.
+
+    Attributes:
+        frames: `Frame` of arrays (E, T, …): what there was before each action.
+        action: (E, T, U) int8.
+        collected: (E, T, U) float32 data units.
+        length: (E,) int32 slots until all batteries were empty; what lies behind is padding.
+    """
+
+    frames: Frame
+    action: np.ndarray
+    collected: np.ndarray
+    length: np.ndarray
+
+    def ratio(self, mission: Mission) -> np.ndarray:
+        """(E,) collected data of all the data that waited."""
+        return self.collected.sum(axis=(1, 2), dtype=float) / mission.data_units.sum()
+
+
+class Policy(Protocol):
+    """Decides the actions of E flights, slot by slot."""
+
+    def start(self, mission: Mission, flights: int) -> None:
+        """Forget the flights before."""
+
+    def act(self, frame: Frame) -> np.ndarray:
+        """(E, U) feasible actions."""
+
+
+class HeuristicPolicy:
+    """`random` or `greedy`."""
+
+    def __init__(self, name: str, rng: np.random.Generator):
+        self._decide = {"random": random_actions, "greedy": greedy_actions}[name]
+        self._rng = rng
+
+    def start(self, mission: Mission, flights: int) -> None:
+        self._mission = mission
+
+    def act(self, frame: Frame) -> np.ndarray:
+        return self._decide(self._mission, frame, self._rng)
+
+
+class AgentPolicy:
+    """The best action by the agents' values, and with the chance `epsilon` any feasible one.
+
+    Args:
+        agent: its weights are read at every slot.
+        epsilon: chance of a random action, for every UAV and slot.
+        rng: of exploration.
+        device: the torch device that the agent is on.
+    """
+
+    def __init__(self, agent: Agent, epsilon: float, rng: np.random.Generator, device: str = "cpu"):
+        self._agent, self._epsilon, self._rng, self._device = agent, epsilon, rng, device
+
+    def start(self, mission: Mission, flights: int) -> None:
+        self._mission = mission
+        self._memory = None
+        self._last = np.full((flights, mission.uavs), -1, dtype=np.int64)
+
+    @torch.inference_mode()
+    def act(self, frame: Frame) -> np.ndarray:
+        observation, mask = observe(self._mission, frame)
+        values, self._memory = self._agent(torch.from_numpy(observation).to(self._device)[None],
+                                           torch.from_numpy(self._last).to(self._device)[None], self._memory)
+        action = np.where(mask, values[0].cpu().numpy(), -np.inf).argmax(axis=-1)
+        if self._epsilon > 0:
+            explores = self._rng.random(action.shape) < self._epsilon
+            lots = np.where(mask, self._rng.random(mask.shape), -1.0).argmax(axis=-1)
+            action = np.where(explores, lots, action)
+        self._last = action
+        return action
+
+
+def fly(environment: Environment, policy: Policy) -> Flights:
+    """Fly from take-off until all batteries are empty, and record everything."""
+    mission, frame = environment.mission, environment.reset()
+    count = len(frame.battery)
+    policy.start(mission, count)
+    record = Flights(empty_frame((count, mission.longest), mission),
+                     np.zeros((count, mission.longest, mission.uavs), np.int8),
+                     np.zeros((count, mission.longest, mission.uavs), np.float32), np.zeros(count, np.int32))
+    slot, flying = 0, np.ones(count, dtype=bool)
+    while flying.any():
+        for kept, now in zip(record.frames, frame):
+            kept[:, slot] = now
+        action = policy.act(frame)
+        record.action[:, slot] = action
+        record.collected[:, slot] = environment.step(action)
+        record.length[flying] += 1
+        flying = ~environment.done
+        slot += 1
+    return record

@@ -1,0 +1,150 @@
+"""The mission as arrays: what the UAVs fly over, what they collect, and what they know."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from radiotwin.errors import BadInput
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.survey.grid import HOVER_COST, MOVE_COST, UNREACHABLE, FlightGrid
+from radiotwin.survey.statistical import LOS_LAW
+
+HOVER, NORTH, WEST, SOUTH, EAST, NO_OP = range(6)
+ACTIONS = ("hover", "north", "west", "south", "east", "no-op")
+MOVES = np.array([(0, 0), (1, 0), (0, -1), (-1, 0), (0, 1), (0, 0)], dtype=np.int64)  # (row, column) of each action
+# The battery is counted in whole hovers, so that it is exact.
+UNIT = HOVER_COST
+COSTS = np.array([1, *[round(MOVE_COST / UNIT)] * 4, 0], dtype=np.int64)
+
+
+class Mission(NamedTuple):
+    """All that a flight depends on; U UAVs, K devices, a lattice of ny x nx cells at each UAV's altitude.
+
+    A tuple of arrays, because compiled functions take it as it is.
+
+    Attributes:
+        snr_db: (U, K, ny, nx) float32 mean SNR [dB]; -inf where nothing is ever detected.
+        sigma_db: (U, K, ny, nx) float32 standard deviation of the shadowing, drawn anew in every slot [dB].
+        steps_home: (U, ny, nx) int64 moves to the UAV's terminal.
+        start: (U, 2) int64 cell (row, column) where each UAV starts.
+        battery: (U,) int64 at take-off, in hovers (half battery units).
+        altitude_m: (U,)
+        data_units: (K,) float64 waiting at each device.
+        known_m: (K, 2) float64 horizontal positions of the devices as the UAVs know them, relative to the lattice's
+            south-west corner; NaN where nobody knows. They decide what agents see, never what they receive.
+        step_m: lattice step.
+        rate_scale: data units per slot and bit/s/Hz.
+        threshold_db: SNR from which on a link works.
+        uav_link_db: (2,) SNR between two UAVs at 1 m [dB], and its slope per decade of distance (the LoS law).
+        max_rate: whether a UAV that loses its best device to another one idles (the paper's Eq. 8); otherwise the
+            strongest remaining pair is matched until none is left.
+    """
+
+    snr_db: np.ndarray
+    sigma_db: np.ndarray
+    steps_home: np.ndarray
+    start: np.ndarray
+    battery: np.ndarray
+    altitude_m: np.ndarray
+    data_units: np.ndarray
+    known_m: np.ndarray
+    step_m: float
+    rate_scale: float
+    threshold_db: float
+    uav_link_db: np.ndarray
+    max_rate: bool
+
+    @property
+    def uavs(self) -> int:
+        return len(self.start)
+
+    @property
+    def devices(self) -> int:
+        return len(self.data_units)
+
+    @property
+    def longest(self) -> int:
+        """Slots of the longest possible flight: one that hovers until the battery is empty."""
+        return int(self.battery.max())
+
+
+@dataclass(frozen=True)
+class Known:
+    """Where the UAVs believe the devices are: device -> (x, y) [m]; those that are missing nobody has located."""
+
+    position_m: dict[str, tuple[float, float]]
+
+    @classmethod
+    def truth(cls, scene: Scene) -> "Known":
+        """All true positions: more than a real UAV knows."""
+        return cls({d.device: (d.x_m, d.y_m) for d in scene.config.devices})
+
+    @classmethod
+    def anchors(cls, scene: Scene) -> "Known":
+        """What is known before the first flight."""
+        return cls({d.device: (d.x_m, d.y_m) for d in scene.config.devices if d.role == "anchor"})
+
+
+def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: str = "matching",
+                 shadowing: bool = True) -> Mission:
+    """The mission of a scene in a radio map: the truth's, or a twin's.
+
+    Args:
+        scene: its UAVs, radio, batteries and data; the buildings keep UAVs out.
+        radio_map: over the scene's lattice. A device that it lacks is never heard.
+        known: positions that the agents see.
+        assignment: `matching` or `max-rate`.
+        shadowing: whether the map's `sigma_db`, where it has one, is drawn in every slot.
+
+    Raises:
+        BadInput: no UAV, no device, a map of another lattice, or a battery that does not reach the terminal.
+    """
+    config, lattice = scene.config, scene.lattice
+    path = scene.folder / "scene.toml"
+    if assignment not in ("matching", "max-rate"):
+        raise BadInput(f"assignment {assignment!r} is unknown; allowed are matching, max-rate")
+    if not config.uavs or not config.devices:
+        raise BadInput(f"{path}: a mission needs at least one UAV and one device, here are {len(config.uavs)} and "
+                       f"{len(config.devices)}; add [[uavs]] or [[devices]] tables")
+    if radio_map.gain_db.shape[1:] != lattice.shape or \
+            not np.allclose(radio_map.lattice.positions_m, lattice.positions_m):
+        raise BadInput(f"the radio map's lattice {radio_map.gain_db.shape[1:]} (z, y, x) is not that of {path} "
+                       f"{lattice.shape}; make the map for this scene")
+    levels = [int(np.abs(lattice.z_m - uav.altitude_m).argmin()) for uav in config.uavs]
+    to_snr_db = config.radio.tx_power_dbm - config.radio.noise_dbm
+    shape = (len(config.uavs), len(config.devices), *lattice.shape[1:])
+    snr_db, sigma_db = np.full(shape, -np.inf, np.float32), np.zeros(shape, np.float32)
+    for k, device in enumerate(config.devices):
+        if device.device not in radio_map.devices:
+            continue
+        row = radio_map.devices.index(device.device)
+        gain_db = radio_map.gain_db[row, levels]
+        snr_db[:, k] = np.where(np.isnan(gain_db), -np.inf, gain_db + to_snr_db)
+        if shadowing and "sigma_db" in radio_map.dataset:
+            sigma_db[:, k] = np.nan_to_num(radio_map.dataset["sigma_db"].values[row, levels])
+    starts, homes = zip(*(_ends(scene, uav, level) for uav, level in zip(config.uavs, levels)))
+    origin_m = np.array([lattice.x_m[0], lattice.y_m[0]])
+    known_m = np.array([known.position_m.get(d.device, (np.nan, np.nan)) for d in config.devices]) - origin_m
+    return Mission(
+        snr_db, sigma_db, np.array(homes), np.array(starts),
+        np.array([int(uav.battery / UNIT + 1e-9) for uav in config.uavs]),
+        np.array([uav.altitude_m for uav in config.uavs], dtype=float),
+        np.full(len(config.devices), float(config.mission.data_units)), known_m, lattice.step_m,
+        float(config.mission.rate_scale), float(config.radio.snr_threshold_db),
+        np.array([to_snr_db + LOS_LAW.intercept_db, 10 * LOS_LAW.slope]), assignment == "max-rate")
+
+
+def _ends(scene: Scene, uav, level: int) -> tuple[np.ndarray, np.ndarray]:
+    """The start cell, and the (ny, nx) moves home."""
+    lattice = scene.lattice
+    start, terminal = ((round((y_m - lattice.y_m[0]) / lattice.step_m), round((x_m - lattice.x_m[0]) / lattice.step_m))
+                       for x_m, y_m in ((uav.start_x_m, uav.start_y_m), (uav.terminal_x_m, uav.terminal_y_m)))
+    home = FlightGrid(~scene.blocked[level], terminal).steps_to(terminal)
+    needed = home[start] * MOVE_COST
+    if needed > uav.battery:
+        moves = "there is no way" if home[start] == UNREACHABLE else f"{needed:g} are needed"
+        raise BadInput(f"uav {uav.uav!r}: battery = {uav.battery:g} does not reach from its start to its terminal "
+                       f"({moves}); raise it in {scene.folder / 'scene.toml'}")
+    return np.array(start), home
