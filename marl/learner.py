@@ -125,10 +125,11 @@ def _lambda_targets(reward: Tensor, best: Tensor, valid: Tensor, discount: float
     Returns:
         the shape of `best`
     """
-    target = torch.empty_like(best)
-    following = torch.zeros_like(best[0])
-    for slot in range(len(best) - 1, -1, -1):
-        target[slot] = following = reward[slot] + discount * following
-        # Behind the end of a flight nothing is worth anything.
-        following = ((1 - td_lambda) * best[slot] + td_lambda * following) * valid[slot]
+    # Behind the end of a flight nothing is worth anything.
+    ahead = torch.cat([valid[1:], torch.zeros_like(valid[:1])])
+    target = reward + discount * (1 - td_lambda) * ahead * torch.cat([best[1:], torch.zeros_like(best[:1])])
+    if td_lambda > 0:
+        decay = discount * td_lambda * ahead
+        for slot in range(len(best) - 2, -1, -1):
+            target[slot].addcmul_(decay[slot], target[slot + 1])
     return target

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from marl.environment import ACTION_COUNT
+from marl.gru import gru
 
 
 class Agent(nn.Module):
@@ -44,7 +45,7 @@ class Agent(nn.Module):
         encoded = nn.functional.linear(observation, weight[:, :size], self.encoder.bias)
         encoded = encoded + nn.functional.embedding(last_action % (ACTION_COUNT + 1), rows)
         encoded = torch.relu(encoded + weight[:, size + ACTION_COUNT:].t())
-        remembered, memory = self.memory(encoded.reshape(slots, flights * self.uavs, self.hidden), memory)
+        remembered, memory = gru(encoded.reshape(slots, flights * self.uavs, self.hidden), memory, self.memory)
         return self.head(remembered).reshape(slots, flights, self.uavs, ACTION_COUNT), memory
 
 
