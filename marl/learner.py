@@ -102,6 +102,31 @@ class Learner:
             reward, valid = reward.unsqueeze(-1), valid.unsqueeze(-1)
         return observation, mask, state, action, reward, valid
 
+    def weights(self) -> dict[str, np.ndarray]:
+        """Copies of the weights of agent and mixer; with `federate_all` of the target networks and of the optimiser's
+        moments, too."""
+        tensors = {name: parameter.detach() for name, parameter in self._federated()}
+        return {name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}
+
+    @torch.no_grad()
+    def set_weights(self, weights: dict[str, np.ndarray]) -> None:
+        """Copy averaged weights into the networks."""
+        for name, parameter in self._federated():
+            parameter.copy_(torch.from_numpy(weights[name]))
+
+    def _federated(self) -> list[tuple[str, Tensor]]:
+        modules = {"agent": self.agent, "mixer": self.mixer}
+        if self.settings.federate_all:
+            modules |= {"target_agent": self.target_agent, "target_mixer": self.target_mixer}
+        named = [(f"{module}.{name}", parameter) for module, network in modules.items() if network
+                 for name, parameter in network.named_parameters()]
+        if self.settings.federate_all:
+            # The moments exist after the first update, in all replicas alike.
+            named += [(f"{moment}.{number}", self.optimiser.state[parameter][moment])
+                      for number, parameter in enumerate(self.parameters()) if self.optimiser.state[parameter]
+                      for moment in ("exp_avg", "exp_avg_sq")]
+        return named
+
     def state(self) -> dict:
         """Everything that learning goes on from."""
         modules = {"agent": self.agent, "mixer": self.mixer, "target_agent": self.target_agent,

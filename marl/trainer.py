@@ -1,7 +1,6 @@
 """One replica: its environment, memory, learner and exploration."""
 
 import numpy as np
-import torch
 
 from marl.environment import Environment
 from marl.flights import AgentPolicy, Flights, fly
@@ -29,16 +28,12 @@ class Trainer:
         self.learner = Learner(settings, mission, seed, device)
         self.replay = Replay(settings.replay, mission)
         self.episodes, self.slots = 0, 0
+        self.mission = mission
         self._rng = np.random.default_rng([seed, stream])
-        self._environment = Environment(mission, settings.parallel, self._rng)
-
-    @property
-    def mission(self) -> Mission:
-        return self._environment.mission
 
     def enter(self, mission: Mission) -> None:
         """Go on in another map of the same mission."""
-        self._environment.mission = mission
+        self.mission = mission
 
     @property
     def epsilon(self) -> float:
@@ -53,34 +48,40 @@ class Trainer:
         done = min(self.episodes / self.horizon, 1.0)
         return settings.learning_rate + done * (settings.last_learning_rate - settings.learning_rate)
 
-    def train(self, episodes: int) -> list[dict[str, float]]:
-        """Fly `episodes` flights, a multiple of `parallel`, and learn from them.
+    def train(self, episodes: int) -> dict[str, float]:
+        """Fly some flights and learn from them.
 
         Returns:
-            a record for every batch of flights: `ratio`, `epsilon`, `learning_rate`, and the means of what
-            `Learner.update` returns
+            means over them: `train_ratio` of collected data, and what `Learner.update` returns; at their end: `epsilon`,
+            `learning_rate`
         """
-        settings, records = self.settings, []
-        for _ in range(episodes // settings.parallel):
-            flights = self._fly()
+        settings, ratios, losses = self.settings, [], []
+        for start in range(0, episodes, settings.parallel):
+            flights = self._fly(min(settings.parallel, episodes - start))
             self.replay.add(flights)
+            ratios.append(flights.ratio(self.mission))
             before = self.episodes // settings.episodes_per_update
-            self.episodes += settings.parallel
+            self.episodes += len(flights.length)
             self.slots += int(flights.length.sum())
-            updates = self.episodes // settings.episodes_per_update - before
-            losses = []
             if self.replay.size >= settings.batch:
-                losses = [self.learner.update(self.replay.sample(settings.batch, self._rng), self.mission,
-                                              self.learning_rate) for _ in range(updates)]
-            record = {"ratio": float(flights.ratio(self.mission).mean()), "epsilon": self.epsilon,
-                      "learning_rate": self.learning_rate}
-            records.append(record | {name: float(np.mean([loss[name] for loss in losses]))
-                                     for name in (losses[0] if losses else ())})
-        return records
+                losses += [self.learner.update(self.replay.sample(settings.batch, self._rng), self.mission,
+                                               self.learning_rate)
+                           for _ in range(self.episodes // settings.episodes_per_update - before)]
+        means = {name: float(np.mean([loss[name] for loss in losses])) for name in (losses[0] if losses else ())}
+        return {"train_ratio": float(np.concatenate(ratios).mean()), "epsilon": self.epsilon,
+                "learning_rate": self.learning_rate, **means}
 
-    def _fly(self) -> Flights:
-        policy = AgentPolicy(self.learner.agent, self.epsilon, self._rng, self.learner.device)
-        return fly(self._environment, policy)
+    def _fly(self, count: int) -> Flights:
+        environment = Environment(self.mission, count, self._rng)
+        return fly(environment, AgentPolicy(self.learner.agent, self.epsilon, self._rng, self.learner.device))
+
+    def weights(self) -> dict:
+        """What is averaged over replicas: see `Learner.weights`."""
+        return self.learner.weights()
+
+    def set_weights(self, weights: dict) -> None:
+        """Go on from averaged weights."""
+        self.learner.set_weights(weights)
 
     def state(self) -> dict:
         """Everything that training goes on from, for a checkpoint."""
@@ -92,11 +93,3 @@ class Trainer:
         self._rng.bit_generator.state = state["rng"]
         self.learner.load_state(state["learner"])
         self.replay.load_state(state["replay"])
-
-
-def evaluate(agent, mission: Mission, flights: int, seed: int, device: str = "cpu") -> np.ndarray:
-    """Fly without exploration: (flights,) collection ratios."""
-    rng = np.random.default_rng(seed)
-    with torch.inference_mode():
-        record = fly(Environment(mission, flights, rng), AgentPolicy(agent, 0.0, rng, device))
-    return record.ratio(mission)

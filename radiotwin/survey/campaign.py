@@ -50,7 +50,7 @@ def fly_survey(scene: Scene, truth: RadioMap, *, flights: int, pattern: str, see
                     level_db += rng.normal(0, 1, level_db.shape) * shadowing_db[:, index]
                 level_db[level_db < limit_db] = np.nan
                 time_s = start_s + slot_s * np.arange(len(index))
-                parts.append(_table(scene, f"f{flight}", uav.uav, index, level_db, time_s, _heading_deg(cells)))
+                parts.append(link_table(scene, f"f{flight}", uav.uav, index, level_db, time_s, heading_deg(cells)))
                 longest = max(longest, len(index))
             start_s += slot_s * longest
             advance(1)
@@ -87,8 +87,9 @@ def _lattice_index(scene: Scene, uav: UavConfig, cells: np.ndarray) -> np.ndarra
     return np.ravel_multi_index((np.full(len(cells), level), cells[:, 0], cells[:, 1]), scene.lattice.shape)
 
 
-def _heading_deg(cells: np.ndarray) -> np.ndarray:
-    """Clockwise from north, of the move that led here; a hover keeps it, the first slot has that of the next move."""
+def heading_deg(cells: np.ndarray) -> np.ndarray:
+    """Heading along (slots, 2) cells (row, column), clockwise from north: that of the move that led here; a hover keeps
+    it, the first slot has that of the next move."""
     moves = np.diff(cells, axis=0)
     heading = pd.Series(np.full(len(cells), np.nan))
     moved = np.flatnonzero(moves.any(axis=1))
@@ -96,7 +97,17 @@ def _heading_deg(cells: np.ndarray) -> np.ndarray:
     return heading.ffill().bfill().fillna(0.0).to_numpy()
 
 
-def _table(scene, flight, receiver, index, level_db, time_s, heading_deg) -> pd.DataFrame:
+def link_table(scene: Scene, flight: str, receiver: str, index: np.ndarray, level_db: np.ndarray, time_s: np.ndarray,
+               heading_deg: np.ndarray) -> pd.DataFrame:
+    """What one receiver measured on one flight, as rows of `Measurements.table`.
+
+    Args:
+        scene: names the devices.
+        flight, receiver: names.
+        index: (slots,) flat lattice index of the positions.
+        level_db: (devices, slots) gain, NaN where not detected [dB].
+        time_s, heading_deg: (slots,)
+    """
     devices, slots = len(level_db), len(index)
     position_m = scene.lattice.positions_m[index]
     return pd.DataFrame({

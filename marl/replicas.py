@@ -1,0 +1,111 @@
+"""Replicas that learn side by side: one in this process, several in a process each.
+
+Processes, because three of them use two cores a quarter better than three threads do (`benchmarks/marl.py`).
+"""
+
+import multiprocessing
+import traceback
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from marl.mission import Mission
+from marl.settings import LearnerSettings
+from marl.threads import limit_threads
+from marl.trainer import Trainer
+from radiotwin.errors import RunFailed
+
+Weights = dict[str, np.ndarray]
+
+
+class Replicas:
+    """Trainers with equal initial weights and random numbers of their own; a context manager that ends their processes.
+
+    Args:
+        count: of the replicas.
+        settings, mission, horizon, seed, device: of each `Trainer`.
+    """
+
+    def __init__(self, count: int, settings: LearnerSettings, mission: Mission, horizon: int, seed: int,
+                 device: str = "cpu"):
+        arguments = [(settings, mission, horizon, seed, stream, device) for stream in range(count)]
+        self._replicas = [_Remote(*each) for each in arguments] if count > 1 else [_Local(*arguments[0])]
+        self._pool = ThreadPoolExecutor(count)  # only waits for the processes
+
+    def __enter__(self) -> "Replicas":
+        return self
+
+    def __exit__(self, *_) -> None:
+        for replica in self._replicas:
+            replica.close()
+        self._pool.shutdown()
+
+    def call(self, method: str, *arguments, each: list | None = None) -> list:
+        """Call a method of all trainers at once.
+
+        Args:
+            method: name of a method of `Trainer`.
+            arguments: the same for all.
+            each: one more argument for every replica, after the others.
+
+        Returns:
+            the result of every replica
+        """
+        own = [()] * len(self._replicas) if each is None else [(one,) for one in each]
+        calls = [self._pool.submit(replica.call, method, *arguments, *mine)
+                 for replica, mine in zip(self._replicas, own)]
+        return [call.result() for call in calls]
+
+
+class _Local:
+    def __init__(self, *arguments):
+        self._trainer = Trainer(*arguments)
+
+    def call(self, method: str, *arguments):
+        return getattr(self._trainer, method)(*arguments)
+
+    def close(self) -> None:
+        pass
+
+
+class _Remote:
+    def __init__(self, *arguments):
+        # A forked process would inherit the locks of threads that it does not have.
+        context = multiprocessing.get_context("spawn")
+        self._pipe, other = context.Pipe()
+        self._process = context.Process(target=_serve, args=(other, arguments), daemon=True)
+        self._process.start()
+        other.close()
+
+    def call(self, method: str, *arguments):
+        try:
+            self._pipe.send((method, arguments))
+            done, result = self._pipe.recv()
+        except (EOFError, OSError):
+            raise RunFailed("a process that trains a replica has ended, perhaps for lack of memory; start the same "
+                            "command with --resume to go on from the last checkpoint") from None
+        if not done:
+            raise RuntimeError(f"in a replica's process:\n{result}")
+        return result
+
+    def close(self) -> None:
+        self._pipe.close()
+        self._process.join(timeout=10)
+        self._process.kill()
+
+
+def _serve(pipe, arguments) -> None:
+    """Answer calls until the other end of the pipe closes."""
+    limit_threads(1)
+    trainer = Trainer(*arguments)
+    while True:
+        try:
+            method, call = pipe.recv()
+        except (EOFError, KeyboardInterrupt):
+            return
+        try:
+            pipe.send((True, getattr(trainer, method)(*call)))
+        except KeyboardInterrupt:
+            return
+        except Exception:
+            pipe.send((False, traceback.format_exc()))
