@@ -66,15 +66,18 @@ class AgentPolicy:
         epsilon: chance of a random action, for every UAV and slot.
         rng: of exploration.
         device: the torch device that the agent is on.
+        guide: actions (T, U) of a plan, and (E,) slots that each flight follows it before the agents take over.
     """
 
-    def __init__(self, agent: Agent, epsilon: float, rng: np.random.Generator, device: str = "cpu"):
-        self._agent, self._epsilon, self._rng, self._device = agent, epsilon, rng, device
+    def __init__(self, agent: Agent, epsilon: float, rng: np.random.Generator, device: str = "cpu",
+                 guide: tuple[np.ndarray, np.ndarray] | None = None):
+        self._agent, self._epsilon, self._rng, self._device, self._guide = agent, epsilon, rng, device, guide
 
     def start(self, mission: Mission, flights: int) -> None:
         self._mission = mission
         self._memory = None
         self._last = np.full((flights, mission.uavs), -1, dtype=np.int64)
+        self._slot = 0
 
     @torch.inference_mode()
     def act(self, frame: Frame) -> np.ndarray:
@@ -86,7 +89,11 @@ class AgentPolicy:
             explores = self._rng.random(action.shape) < self._epsilon
             lots = np.where(mask, self._rng.random(mask.shape), -1.0).argmax(axis=-1)
             action = np.where(explores, lots, action)
-        self._last = action
+        if self._guide is not None:
+            plan, slots = self._guide
+            following = slots > self._slot
+            action[following] = plan[self._slot]
+        self._last, self._slot = action, self._slot + 1
         return action
 
 

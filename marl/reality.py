@@ -42,6 +42,10 @@ class Reality:
         """The mission in the truth, for UAVs that know these positions."""
         return make_mission(self.scene, self.truth, known, self.assignment)
 
+    def twin_mission(self, twin: Twin, known: Known) -> Mission:
+        """The mission in the twin."""
+        return make_mission(self.scene, twin.radio_map(self.scene), known, self.assignment)
+
     def fly(self, policy: Policy, known: Known) -> Flights:
         """Fly one real episode with all UAVs, measure every device in every slot, and keep the measurements."""
         mission = self.mission(known)

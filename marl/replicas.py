@@ -7,19 +7,15 @@ import multiprocessing
 import traceback
 from concurrent.futures import ThreadPoolExecutor
 
-import numpy as np
-
 from marl.mission import Mission
 from marl.settings import LearnerSettings
 from marl.threads import limit_threads
 from marl.trainer import Trainer
 from radiotwin.errors import RunFailed
 
-Weights = dict[str, np.ndarray]
-
 
 class Replicas:
-    """Trainers with equal initial weights and random numbers of their own; a context manager that ends their processes.
+    """Trainers with equal initial weights and random numbers of their own; to be closed.
 
     Args:
         count: of the replicas.
@@ -31,14 +27,6 @@ class Replicas:
         arguments = [(settings, mission, horizon, seed, stream, device) for stream in range(count)]
         self._replicas = [_Remote(*each) for each in arguments] if count > 1 else [_Local(*arguments[0])]
         self._pool = ThreadPoolExecutor(count)  # only waits for the processes
-
-    def __enter__(self) -> "Replicas":
-        return self
-
-    def __exit__(self, *_) -> None:
-        for replica in self._replicas:
-            replica.close()
-        self._pool.shutdown()
 
     def call(self, method: str, *arguments, each: list | None = None) -> list:
         """Call a method of all trainers at once.
@@ -55,6 +43,12 @@ class Replicas:
         calls = [self._pool.submit(replica.call, method, *arguments, *mine)
                  for replica, mine in zip(self._replicas, own)]
         return [call.result() for call in calls]
+
+    def close(self) -> None:
+        """End the processes."""
+        for replica in self._replicas:
+            replica.close()
+        self._pool.shutdown()
 
 
 class _Local:

@@ -1,4 +1,7 @@
-"""Settings of learning, with a line of help each, and the presets."""
+"""Settings of a run and of learning, with a line of help each, checked when they are given."""
+
+from pathlib import Path
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -8,7 +11,7 @@ class LearnerSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    mix: bool = Field(True, description="learn a joint value with the monotonic mixer (QMIX); false: independently (IQL)")
+    mix: bool = Field(True, description="learn a joint value with the monotonic mixer (QMIX), or each UAV alone (IQL)")
     hidden: int = Field(64, ge=1, le=4096, description="width of the agents' recurrent layer")
     mixing_width: int = Field(32, ge=1, le=4096, description="width of the mixing layer")
     learning_rate: float = Field(2e-3, gt=0, le=1, description="of Adam, at the start")
@@ -24,14 +27,45 @@ class LearnerSettings(BaseModel):
     first_epsilon: float = Field(1.0, ge=0, le=1, description="chance of a random action at the start")
     last_epsilon: float = Field(0.05, ge=0, le=1, description="chance of a random action at the end")
     epsilon_slots: int = Field(175_000, ge=0, description="slots over which it falls linearly")
-    federate_every: int = Field(100, ge=1, description="episodes of a replica between averages (FedQMIX)")
-    federate_all: bool = Field(True, description="average target networks and the optimiser's moments, too (FedQMIX)")
+    federate_every: int = Field(100, ge=1, description="episodes of a replica between averages (fedqmix)")
+    federate_all: bool = Field(True, description="average target networks and the optimiser's moments, too (fedqmix)")
     reward_scale: float = Field(1000.0, gt=0, description="data units that make a reward of 1")
 
 
 PRESETS = {
     "fast": LearnerSettings(),
-    # Chen et al. 2023 and the code published with it.
+    # Chen et al. 2023 and the code published with it; ten flights side by side are ours, and so is the reward's scale.
     "paper": LearnerSettings(learning_rate=5e-4, last_learning_rate=5e-4, td_lambda=0.0, double_q=False, replay=5000,
-                             target_every=200, episodes_per_update=1, parallel=10, epsilon_slots=50_000, federate_every=50, federate_all=False),
+                             target_every=200, episodes_per_update=1, parallel=10, epsilon_slots=50_000,
+                             federate_every=50, federate_all=False),
 }
+EPISODES = {"fast": (10, 800), "paper": (30, 1000)}
+"""Real episodes, and simulated episodes of each replica after each of them."""
+
+
+class RunSettings(BaseModel):
+    """What is run."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    scene: Path = Field(Path("scenes/rbm"), description="scene folder")
+    truth: Literal["traced", "segmented"] = Field(
+        "traced", description="what real flights meet: SCENE/truth.nc, or the statistical truth of the paper")
+    twin: Literal["nn", "log-distance", "kriging", "truth"] = Field(
+        "nn", description="channel model of the twin that is trained in; truth: a perfect twin, no flight is needed")
+    algorithm: Literal["fedqmix", "qmix", "iql", "greedy", "planner", "random"] = Field(
+        "fedqmix", description="what decides where the UAVs fly")
+    preset: Literal["fast", "paper"] = Field("fast", description="settings of learning")
+    real_episodes: int = Field(EPISODES["fast"][0], ge=1, le=10_000, description="real flights to learn the twin from")
+    episodes: int = Field(EPISODES["fast"][1], ge=1, le=10_000_000,
+                          description="simulated episodes of each replica after each real one")
+    help: Literal["none", "planner"] = Field(
+        "none", description="planner: some of the flights that are learned from follow the planner's plan")
+    assignment: Literal["matching", "max-rate"] = Field(
+        "matching", description="matching: strongest remaining pair first; max-rate: strictly each UAV's best device")
+    privileged: bool = Field(False, description="agents see the true positions of the unknown devices")
+    compare: bool = Field(True, description="afterwards train in the other twins and in the truth, too, for the table")
+    planner_iterations: int = Field(60_000, ge=1, le=10**9, description="plans that the planner tries")
+    noise_db: float = Field(1.0, ge=0, le=50, description="standard deviation of the receivers' measurement error")
+    flights: int = Field(64, ge=1, le=100_000, description="flights of an evaluation")
+    seed: int = Field(0, ge=0, le=2**31, description="of everything random")

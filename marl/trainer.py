@@ -9,6 +9,8 @@ from marl.mission import Mission
 from marl.replay import Replay
 from marl.settings import LearnerSettings
 
+GUIDED_SHARE = 0.25  # of the flights, with the planner's help
+
 
 class Trainer:
     """Learns a policy by flying in a mission.
@@ -28,12 +30,17 @@ class Trainer:
         self.learner = Learner(settings, mission, seed, device)
         self.replay = Replay(settings.replay, mission)
         self.episodes, self.slots = 0, 0
-        self.mission = mission
+        self.mission, self._plan = mission, None
         self._rng = np.random.default_rng([seed, stream])
 
-    def enter(self, mission: Mission) -> None:
-        """Go on in another map of the same mission."""
-        self.mission = mission
+    def enter(self, mission: Mission, plan: np.ndarray | None = None) -> None:
+        """Go on in another map of the same mission.
+
+        Args:
+            mission: its map.
+            plan: (T, U) actions of a good flight in it, to learn from; None: no help.
+        """
+        self.mission, self._plan = mission, plan
 
     @property
     def epsilon(self) -> float:
@@ -52,8 +59,8 @@ class Trainer:
         """Fly some flights and learn from them.
 
         Returns:
-            means over them: `train_ratio` of collected data, and what `Learner.update` returns; at their end: `epsilon`,
-            `learning_rate`
+            means over them: `train_ratio` of collected data, and what `Learner.update` returns; at their end:
+            `epsilon`, `learning_rate`
         """
         settings, ratios, losses = self.settings, [], []
         for start in range(0, episodes, settings.parallel):
@@ -72,8 +79,17 @@ class Trainer:
                 "learning_rate": self.learning_rate, **means}
 
     def _fly(self, count: int) -> Flights:
-        environment = Environment(self.mission, count, self._rng)
-        return fly(environment, AgentPolicy(self.learner.agent, self.epsilon, self._rng, self.learner.device))
+        guide = None if self._plan is None else (self._plan, self._follow(count))
+        policy = AgentPolicy(self.learner.agent, self.epsilon, self._rng, self.learner.device, guide)
+        return fly(Environment(self.mission, count, self._rng), policy)
+
+    def _follow(self, count: int) -> np.ndarray:
+        """Slots that each flight follows the plan: a quarter of the flights all the way, the others a random part,
+        which fades out as training goes on."""
+        longest = len(self._plan) * (1 - min(self.episodes / self.horizon, 1.0))
+        slots = self._rng.integers(0, int(longest) + 1, count)
+        slots[:round(GUIDED_SHARE * count)] = len(self._plan)
+        return slots
 
     def weights(self) -> dict:
         """What is averaged over replicas: see `Learner.weights`."""

@@ -1,0 +1,73 @@
+"""A run's state on disk: whole or not at all, and read without executing anything in it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+
+from radiotwin.errors import BadInput
+from radiotwin.files import atomic_folder, atomic_path
+
+
+def save_checkpoint(state: dict, path: Path) -> None:
+    """Write nested dicts and lists of numbers, texts, arrays, tensors and tables."""
+    with atomic_path(path) as temporary:
+        torch.save(_packed(state), temporary)
+
+
+def load_checkpoint(path: Path) -> dict:
+    """Read what `save_checkpoint` wrote.
+
+    Raises:
+        BadInput: there is none, or it is damaged.
+    """
+    if not path.is_file():
+        raise BadInput(f"{path} does not exist: there is nothing to resume; start the run without --resume")
+    try:
+        return _unpacked(torch.load(path, weights_only=True))
+    except Exception as error:  # zipfile, pickle and torch each have their own
+        raise BadInput(f"{path} is damaged ({type(error).__name__}); remove the run's folder and start again") from None
+
+
+def folder_content(folder: Path) -> dict[str, np.ndarray]:
+    """The files of a flat folder, for a checkpoint."""
+    return {path.name: np.frombuffer(path.read_bytes(), np.uint8) for path in sorted(folder.iterdir())}
+
+
+def restore_folder(content: dict[str, np.ndarray], folder: Path) -> None:
+    """Write the files of `folder_content` again."""
+    with atomic_folder(folder) as temporary:
+        for name, data in content.items():
+            (temporary / name).write_bytes(data.tobytes())
+
+
+def _packed(value):
+    if isinstance(value, pd.DataFrame):
+        return {"__table__": {name: list(column) if column.dtype.kind not in "fiub" else _packed(column.to_numpy())
+                              for name, column in value.items()}}
+    if isinstance(value, np.ndarray):
+        return {"__array__": torch.from_numpy(np.array(value))}
+    if isinstance(value, dict):
+        # The state of a random generator has integers of 128 bits, which only JSON keeps.
+        if "bit_generator" in value:
+            return {"__json__": json.dumps(value)}
+        return {name: _packed(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_packed(each) for each in value]
+    return value
+
+
+def _unpacked(value):
+    if isinstance(value, dict):
+        if "__table__" in value:
+            return pd.DataFrame(_unpacked(value["__table__"]))
+        if "__array__" in value:
+            return value["__array__"].numpy()
+        if "__json__" in value:
+            return json.loads(value["__json__"])
+        return {name: _unpacked(each) for name, each in value.items()}
+    if isinstance(value, list):
+        return [_unpacked(each) for each in value]
+    return value

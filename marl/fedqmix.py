@@ -1,0 +1,64 @@
+"""`python -m marl.fedqmix`: model-aided federated QMIX (Algorithm 1 of the paper), and what it is held against."""
+
+import argparse
+import signal
+import sys
+from pathlib import Path
+
+from marl.options import add_options, checked
+from marl.settings import EPISODES, PRESETS, LearnerSettings, RunSettings
+from radiotwin.cli.console import complain, say, show_warnings_plainly
+from radiotwin.errors import BadInput, RunFailed
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit status: 0 done, 1 failed while running, 2 bad input, 130 interrupted."""
+    parser = argparse.ArgumentParser(
+        prog="python -m marl.fedqmix", allow_abbrev=False,
+        description="Train UAVs to harvest data inside a twin that is learnt from few real flights, and judge them in "
+                    "the truth. With no option: scenes/rbm, within ten minutes on two cores.")
+    parser.add_argument("--out", type=Path, help="folder of the results [runs/SCENE-TRUTH-TWIN-ALGORITHM-SEED]")
+    parser.add_argument("--resume", action="store_true", help="go on with a run that was stopped; same options, same "
+                        "result")
+    add_options(parser, RunSettings, "run", without=set())
+    add_options(parser, LearnerSettings, "learning (defaults: those of the preset fast)", without={"mix"})
+    given = parser.parse_args(arguments)
+    try:
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+        show_warnings_plainly()
+        _run(given)
+        return 0
+    except BadInput as error:
+        complain(str(error))
+        return 2
+    except RunFailed as error:
+        complain(str(error))
+        return 1
+    except KeyboardInterrupt:
+        complain("interrupted; the finished rounds are kept: the same command with --resume goes on")
+        return 130
+
+
+def _settings(given: argparse.Namespace) -> tuple[RunSettings, LearnerSettings]:
+    preset = checked(given, RunSettings()).preset
+    real_episodes, episodes = EPISODES[preset]
+    run = checked(given, RunSettings(real_episodes=real_episodes, episodes=episodes))
+    learner = checked(given, PRESETS[preset].model_copy(update={"mix": run.algorithm != "iql"}))
+    if learner.batch > learner.replay or learner.parallel > learner.replay:
+        raise BadInput(f"--replay {learner.replay}: it must hold a batch ({learner.batch} flights) and what is flown "
+                       f"side by side ({learner.parallel}); raise it, or lower --batch or --parallel")
+    return run, learner
+
+
+def _run(given: argparse.Namespace) -> None:
+    run, learner = _settings(given)
+
+    from marl.session import Session  # torch and all: not for --help
+
+    out = given.out or Path("runs") / f"{run.scene.name}-{run.truth}-{run.twin}-{run.algorithm}-{run.seed}"
+    Session(run, learner, out, given.resume).execute()
+    say(f"wrote {out}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

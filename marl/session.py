@@ -1,0 +1,168 @@
+"""One run, from its settings to its folder: configuration, metrics, checkpoints, comparison, figures."""
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+
+from marl.algorithm import Outcome, run_algorithm
+from marl.figures import choose_flight, draw_curve, draw_trajectories
+from marl.mission import Known, Mission, make_mission
+from marl.settings import LearnerSettings, RunSettings
+from marl.strategies import evaluate, make_strategy
+from marl.threads import limit_threads
+from radiotwin.cli.console import print_rows
+from radiotwin.cli.world import read_truth
+from radiotwin.errors import BadInput
+from radiotwin.files import atomic_path
+from radiotwin.progress import progress
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+
+TRAINED_IN = {"nn": "NN twin", "log-distance": "log-distance twin", "kriging": "kriging twin", "truth": "the truth"}
+
+
+@dataclass(frozen=True)
+class Session:
+    """A run and its folder.
+
+    Args:
+        run, learner: settings.
+        out: folder of the results.
+        resume: go on with what is in it.
+    """
+
+    run: RunSettings
+    learner: LearnerSettings
+    out: Path
+    resume: bool
+
+    def execute(self) -> None:
+        """Run it all, write it all, and print the table at the end.
+
+        Raises:
+            BadInput: a scene or truth that cannot be used, a folder that is taken, or settings that are not those of
+                the run to be resumed.
+        """
+        limit_threads(1)
+        scene = Scene.load(self.run.scene)
+        truth = read_truth(scene, self.run.truth)
+        scene.check_map(truth)
+        make_mission(scene, truth, Known.truth(scene), self.run.assignment)  # complains before anything is written
+        self._claim_folder()
+        runs = {self.run.twin: self.run}
+        if self.run.compare and self.run.algorithm in ("fedqmix", "qmix", "iql"):
+            runs |= {twin: self.run.model_copy(update={"twin": twin})
+                     for twin in ("nn", "log-distance", "truth") if twin != self.run.twin}
+        outcomes = {}
+        with progress("starting", total=sum(run.real_episodes * run.episodes for run in runs.values())) as advance:
+            for twin, run in runs.items():
+                def named(count: int, text: str | None = None, twin: str = twin) -> None:
+                    advance(count, text and f"{TRAINED_IN[twin]}: {text}")
+                folder = self.out if run is self.run else self.out / "compare" / twin
+                outcomes[twin] = run_algorithm(run, self.learner, scene, truth, folder, self.resume,
+                                               _Log(folder), named, _torch_device())
+        self._write(scene, truth, outcomes)
+
+    def _claim_folder(self) -> None:
+        """Make the folder of a new run, or check that it holds the run that is to be resumed."""
+        path, config = self.out / "config.json", self._config()
+        if self.resume:
+            try:
+                before = json.loads(path.read_text(encoding="utf-8"))
+            except (OSError, ValueError):
+                raise BadInput(f"{path} is not there or damaged, so there is nothing to resume in {self.out}; start "
+                               "the run without --resume") from None
+            for group in config:
+                for name, value in config[group].items():
+                    if before.get(group, {}).get(name) != value:
+                        raise BadInput(f"--{name.replace('_', '-')} {value}: the run in {self.out} was started with "
+                                       f"{before.get(group, {}).get(name)}; resume it with the options that it was "
+                                       "started with, or give another --out")
+            return
+        if self.out.exists() and (not self.out.is_dir() or any(self.out.iterdir())):
+            raise BadInput(f"{self.out} exists and is not an empty folder; --resume goes on with the run in it, --out "
+                           "names another folder")
+        with atomic_path(path) as temporary:
+            temporary.write_text(json.dumps(config, indent=1), encoding="utf-8")
+
+    def _config(self) -> dict:
+        return {"run": self.run.model_dump(mode="json"), "learner": self.learner.model_dump(mode="json")}
+
+    def _write(self, scene: Scene, truth: RadioMap, outcomes: dict[str, Outcome]) -> None:
+        main = outcomes[self.run.twin]
+        real = make_mission(scene, truth, main.known, self.run.assignment)
+        entries = [_entry(self.run.algorithm, twin, outcome.rows[-1]) for twin, outcome in outcomes.items()]
+        trained_in = real
+        if main.twin is not None:
+            trained_in = make_mission(scene, main.twin.radio_map(scene), main.known, self.run.assignment)
+        for name in ("planner", "greedy", "random"):
+            if name != self.run.algorithm:
+                entries.append(self._without_learning(name, trained_in, real, main.rows[-1]["real_episodes"]))
+        table = pd.DataFrame(entries)
+        with atomic_path(self.out / "comparison.csv") as temporary:
+            table.to_csv(temporary, index=False)
+        levels = {entry["method"]: entry["truth_ratio"] for entry in entries
+                  if entry["method"] in ("planner", "greedy", "random") and entry["method"] != self.run.algorithm}
+        curves = {f"{self.run.algorithm} in {TRAINED_IN[twin]}": outcome.rows for twin, outcome in outcomes.items()}
+        draw_curve(curves, levels, self.out / "curve.png")
+        flights = main.flights
+        draw_trajectories(scene, real, flights, choose_flight(flights, real), main.known, self.out / "trajectories.png")
+        print_rows(f"Collected in the truth ({self.run.truth}), of all data; mean and standard deviation of "
+                   f"{self.run.flights} flights",
+                   {"method": "left", "trained in": "left", "real episodes": "right", "collected": "right",
+                    "±": "right"},
+                   [[row.method, row.trained_in, f"{row.real_episodes:,}", f"{row.truth_ratio:.3f}",
+                     f"{row.truth_ratio_std:.3f}"] for row in table.itertuples()])
+
+    def _without_learning(self, name: str, trained_in: Mission, real: Mission, real_episodes: int) -> dict:
+        strategy = make_strategy(self.run.model_copy(update={"algorithm": name}), self.learner, trained_in, 1, "cpu")
+        strategy.prepare(trained_in, lambda _: None)
+        policy = strategy.policy(np.random.default_rng(self.run.seed))
+        ratio = evaluate(real, policy, self.run.flights, self.run.seed + 2).ratio(real)
+        needs = {"planner": TRAINED_IN[self.run.twin], "greedy": "", "random": ""}[name]
+        # Random flights need nothing; greedy ones the positions, which the measured flights gave.
+        return {"method": name, "trained_in": needs, "real_episodes": 0 if name == "random" else real_episodes,
+                "truth_ratio": float(ratio.mean()), "truth_ratio_std": float(ratio.std())}
+
+
+def _entry(method: str, twin: str, row: dict) -> dict:
+    learned = method in ("fedqmix", "qmix", "iql", "planner")
+    return {"method": method, "trained_in": TRAINED_IN[twin] if learned else "",
+            **{name: row[name] for name in ("real_episodes", "truth_ratio", "truth_ratio_std")}}
+
+
+def _torch_device() -> str:
+    return "cuda" if torch.cuda.is_available() else "cpu"
+
+
+class _Log:
+    """Writes `metrics.csv` and TensorBoard events of one folder; called after every round with all rows so far."""
+
+    def __init__(self, folder: Path):
+        self._folder, self._writer, self._rows, self._blocks = folder, None, 0, 0
+
+    def __call__(self, rows: list[dict], blocks: list[dict]) -> None:
+        with atomic_path(self._folder / "metrics.csv") as temporary:
+            pd.DataFrame(rows).to_csv(temporary, index=False)
+        if self._writer is None:
+            from torch.utils.tensorboard import SummaryWriter
+
+            # A resumed run logs its first rounds again, so nothing is there twice.
+            shutil.rmtree(self._folder / "tensorboard", ignore_errors=True)
+            self._writer = SummaryWriter(self._folder / "tensorboard")
+        for row in rows[self._rows:]:
+            self._scalars("round", row, row["round"])
+        for block in blocks[self._blocks:]:
+            self._scalars("train", block, block["episodes"])
+        self._rows, self._blocks = len(rows), len(blocks)
+        self._writer.flush()
+
+    def _scalars(self, group: str, record: dict, step: int) -> None:
+        for name, value in record.items():
+            if name not in ("round", "episodes") and np.isfinite(value):
+                self._writer.add_scalar(f"{group}/{name}", value, step)

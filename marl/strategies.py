@@ -1,0 +1,168 @@
+"""What decides where UAVs fly, in one form: given a map, prepare; then fly."""
+
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from marl.environment import Environment
+from marl.federation import average
+from marl.flights import AgentPolicy, Flights, HeuristicPolicy, Policy, fly
+from marl.learner import Learner
+from marl.mission import Mission
+from marl.planner import PlanPolicy, plan
+from marl.replicas import Replicas
+from marl.settings import LearnerSettings, RunSettings
+
+
+class Strategy(Protocol):
+    """A way to decide."""
+
+    def prepare(self, mission: Mission, advance: Callable[[int], None]) -> list[dict[str, float]]:
+        """Learn, or plan, in the map of `mission`.
+
+        Args:
+            mission: the twin's, or the truth's.
+            advance: called with the number of episodes that were simulated.
+
+        Returns:
+            records to be logged, one for every block of episodes; `episodes` is how many there were before and in it
+        """
+
+    def policy(self, rng: np.random.Generator) -> Policy:
+        """What was learned or planned, without exploration."""
+
+    def state(self) -> dict:
+        """What `load_state` goes on from."""
+
+    def load_state(self, state: dict) -> None:
+        """Go on from a checkpoint."""
+
+    def close(self) -> None:
+        """Give back processes."""
+
+
+def make_strategy(run: RunSettings, learner: LearnerSettings, mission: Mission, rounds: int, device: str) -> Strategy:
+    """The strategy of `run.algorithm`; it will be prepared `rounds` times."""
+    if run.algorithm in ("random", "greedy"):
+        return Heuristic(run.algorithm)
+    if run.algorithm == "planner":
+        return Planned(run.planner_iterations, run.seed)
+    return Learned(run, learner, mission, rounds, device)
+
+
+def evaluate(mission: Mission, policy: Policy, flights: int, seed: int) -> Flights:
+    """Fly without learning from it."""
+    return fly(Environment(mission, flights, np.random.default_rng(seed)), policy)
+
+
+class Heuristic:
+    """`random` or `greedy`: nothing to prepare."""
+
+    def __init__(self, name: str):
+        self._name = name
+
+    def prepare(self, mission: Mission, advance) -> list[dict[str, float]]:
+        return []
+
+    def policy(self, rng: np.random.Generator) -> Policy:
+        return HeuristicPolicy(self._name, rng)
+
+    def state(self) -> dict:
+        return {}
+
+    def load_state(self, state: dict) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+class Planned:
+    """Search a plan in the map and fly it as it is."""
+
+    def __init__(self, iterations: int, seed: int):
+        self._iterations, self._seed, self._plan = iterations, seed, None
+
+    def prepare(self, mission: Mission, advance) -> list[dict[str, float]]:
+        self._plan = plan(mission, iterations=self._iterations, seed=self._seed)
+        return []
+
+    def policy(self, rng: np.random.Generator) -> Policy:
+        return PlanPolicy(self._plan)
+
+    def state(self) -> dict:
+        return {"actions": self._plan.actions}
+
+    def load_state(self, state: dict) -> None:
+        self._plan = state["actions"]
+
+    def close(self) -> None:
+        pass
+
+
+class Learned:
+    """QMIX, independent learners, or federated QMIX with one replica for each UAV.
+
+    After every block of `federate_every` episodes the present policy flies in the map that it is trained in; the one
+    that does best there, since the map is the present one, is the one that flies in reality.
+    """
+
+    def __init__(self, run: RunSettings, settings: LearnerSettings, mission: Mission, rounds: int, device: str):
+        self._run, self._settings = run, settings
+        count = mission.uavs if run.algorithm == "fedqmix" else 1
+        self._replicas = Replicas(count, settings, mission, rounds * run.episodes, run.seed, device)
+        self._best = Learner(settings, mission, run.seed, device).agent  # before any episode: the initial weights
+        self._present = Learner(settings, mission, run.seed, device).agent
+        self._device, self._federated, self._episodes = device, count > 1, 0
+
+    def prepare(self, mission: Mission, advance) -> list[dict[str, float]]:
+        plan_actions = None
+        if self._run.help == "planner":
+            plan_actions = plan(mission, iterations=self._run.planner_iterations, seed=self._run.seed).actions
+        self._replicas.call("enter", mission, plan_actions)
+        records, highest, left = [], -np.inf, self._run.episodes
+        while left:
+            block = min(left, self._settings.federate_every)
+            trained = self._replicas.call("train", block)
+            weights = self._replicas.call("weights")
+            mean = average(weights)
+            if self._federated:
+                self._replicas.call("set_weights", mean)
+            left, self._episodes = left - block, self._episodes + block
+            _load(self._present, mean)
+            rng = np.random.default_rng(self._run.seed)
+            policy = AgentPolicy(self._present, 0.0, rng, self._device)
+            ratio = float(evaluate(mission, policy, self._run.flights, self._run.seed).ratio(mission).mean())
+            if ratio > highest:
+                highest = ratio
+                _load(self._best, mean)
+            records.append({"episodes": self._episodes, "twin_ratio": ratio} | _means(trained))
+            advance(block)
+        return records
+
+    def policy(self, rng: np.random.Generator) -> Policy:
+        return AgentPolicy(self._best, 0.0, rng, self._device)
+
+    def state(self) -> dict:
+        return {"episodes": self._episodes, "best": self._best.state_dict(), "replicas": self._replicas.call("state")}
+
+    def load_state(self, state: dict) -> None:
+        self._episodes = state["episodes"]
+        self._best.load_state_dict(state["best"])
+        self._replicas.call("load_state", each=state["replicas"])
+
+    def close(self) -> None:
+        self._replicas.close()
+
+
+@torch.no_grad()
+def _load(agent: torch.nn.Module, weights: dict[str, np.ndarray]) -> None:
+    for name, parameter in agent.named_parameters():
+        parameter.copy_(torch.from_numpy(weights[f"agent.{name}"]))
+
+
+def _means(records: list[dict[str, float]]) -> dict[str, float]:
+    """Over the replicas."""
+    return {name: float(np.mean([record[name] for record in records])) for name in records[0]}
