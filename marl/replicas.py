@@ -1,6 +1,6 @@
 """Replicas that learn side by side: one in this process, several in a process each.
 
-Processes, because three of them use two cores a quarter better than three threads do (`benchmarks/marl.py`).
+Processes, because three of them use two cores a quarter better than three threads do (`benchmarks/marl_speed.py`).
 """
 
 import multiprocessing
@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from marl.mission import Mission
 from marl.settings import LearnerSettings
-from marl.threads import limit_threads
+from marl.threads import keep_memory, limit_threads
 from marl.trainer import Trainer
 from radiotwin.errors import RunFailed
 
@@ -91,6 +91,7 @@ class _Remote:
 def _serve(pipe, arguments) -> None:
     """Answer calls until the other end of the pipe closes."""
     limit_threads(1)
+    keep_memory()
     trainer = Trainer(*arguments)
     while True:
         try:

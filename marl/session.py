@@ -14,7 +14,7 @@ from marl.figures import choose_flight, draw_curve, draw_trajectories
 from marl.mission import Known, Mission, make_mission
 from marl.settings import LearnerSettings, RunSettings
 from marl.strategies import evaluate, make_strategy
-from marl.threads import limit_threads
+from marl.threads import keep_memory, limit_threads
 from radiotwin.cli.console import print_rows
 from radiotwin.cli.world import read_truth
 from radiotwin.errors import BadInput
@@ -49,6 +49,7 @@ class Session:
                 the run to be resumed.
         """
         limit_threads(1)
+        keep_memory()
         scene = Scene.load(self.run.scene)
         truth = read_truth(scene, self.run.truth)
         scene.check_map(truth)
