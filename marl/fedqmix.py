@@ -39,7 +39,12 @@ def main(arguments: list[str] | None = None) -> int:
         return 130
 
 
-def _settings(given: argparse.Namespace) -> tuple[RunSettings, LearnerSettings]:
+def settings_of(given: argparse.Namespace) -> tuple[RunSettings, LearnerSettings]:
+    """The settings that the command line names, on top of a preset's.
+
+    Raises:
+        BadInput: an impossible value.
+    """
     preset = checked(given, RunSettings()).preset
     real_episodes, episodes = EPISODES[preset]
     run = checked(given, RunSettings(real_episodes=real_episodes, episodes=episodes))
@@ -51,7 +56,7 @@ def _settings(given: argparse.Namespace) -> tuple[RunSettings, LearnerSettings]:
 
 
 def _run(given: argparse.Namespace) -> None:
-    run, learner = _settings(given)
+    run, learner = settings_of(given)
 
     from marl.session import Session  # torch and all: not for --help
 

@@ -59,7 +59,7 @@ class RunSettings(BaseModel):
     real_episodes: int = Field(EPISODES["fast"][0], ge=1, le=10_000, description="real flights to learn the twin from")
     episodes: int = Field(EPISODES["fast"][1], ge=1, le=10_000_000,
                           description="simulated episodes of each replica after each real one")
-    help: Literal["none", "planner"] = Field(
+    guide: Literal["none", "planner"] = Field(
         "none", description="planner: some of the flights that are learned from follow the planner's plan")
     assignment: Literal["matching", "max-rate"] = Field(
         "matching", description="matching: strongest remaining pair first; max-rate: strictly each UAV's best device")

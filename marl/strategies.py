@@ -15,6 +15,8 @@ from marl.planner import PlanPolicy, plan
 from marl.replicas import Replicas
 from marl.settings import LearnerSettings, RunSettings
 
+CLEARLY = 0.02  # more of the data, for a plan to be preferred to the one before
+
 
 class Strategy(Protocol):
     """A way to decide."""
@@ -83,20 +85,20 @@ class Planned:
     """Search a plan in the map and fly it as it is."""
 
     def __init__(self, iterations: int, seed: int):
-        self._iterations, self._seed, self._plan = iterations, seed, None
+        self._iterations, self._seed, self._actions = iterations, seed, None
 
     def prepare(self, mission: Mission, advance) -> list[dict[str, float]]:
-        self._plan = plan(mission, iterations=self._iterations, seed=self._seed)
+        self._actions = plan(mission, self._iterations, self._seed).actions
         return []
 
     def policy(self, rng: np.random.Generator) -> Policy:
-        return PlanPolicy(self._plan)
+        return PlanPolicy(self._actions)
 
     def state(self) -> dict:
-        return {"actions": self._plan.actions}
+        return {"actions": self._actions}
 
     def load_state(self, state: dict) -> None:
-        self._plan = state["actions"]
+        self._actions = state["actions"]
 
     def close(self) -> None:
         pass
@@ -115,13 +117,12 @@ class Learned:
         self._replicas = Replicas(count, settings, mission, rounds * run.episodes, run.seed, device)
         self._best = Learner(settings, mission, run.seed, device).agent  # before any episode: the initial weights
         self._present = Learner(settings, mission, run.seed, device).agent
-        self._device, self._federated, self._episodes = device, count > 1, 0
+        self._device, self._federated, self._episodes, self._actions = device, count > 1, 0, None
 
     def prepare(self, mission: Mission, advance) -> list[dict[str, float]]:
-        plan_actions = None
-        if self._run.help == "planner":
-            plan_actions = plan(mission, iterations=self._run.planner_iterations, seed=self._run.seed).actions
-        self._replicas.call("enter", mission, plan_actions)
+        if self._run.guide == "planner":
+            self._actions = self._better_plan(mission)
+        self._replicas.call("enter", mission, self._actions)
         records, highest, left = [], -np.inf, self._run.episodes
         while left:
             block = min(left, self._settings.federate_every)
@@ -142,14 +143,25 @@ class Learned:
             advance(block)
         return records
 
+    def _better_plan(self, mission: Mission) -> np.ndarray:
+        """Plan anew, but stay with the plan before unless the new one is clearly better: a teacher that changes its
+        mind every round teaches little."""
+        new = plan(mission, self._run.planner_iterations, self._run.seed).actions
+        if self._actions is None:
+            return new
+        before, after = (evaluate(mission, PlanPolicy(actions), self._run.flights, self._run.seed).ratio(mission).mean()
+                         for actions in (self._actions, new))
+        return new if after > before + CLEARLY else self._actions
+
     def policy(self, rng: np.random.Generator) -> Policy:
         return AgentPolicy(self._best, 0.0, rng, self._device)
 
     def state(self) -> dict:
-        return {"episodes": self._episodes, "best": self._best.state_dict(), "replicas": self._replicas.call("state")}
+        return {"episodes": self._episodes, "best": self._best.state_dict(), "actions": self._actions,
+                "replicas": self._replicas.call("state")}
 
     def load_state(self, state: dict) -> None:
-        self._episodes = state["episodes"]
+        self._episodes, self._actions = state["episodes"], state["actions"]
         self._best.load_state_dict(state["best"])
         self._replicas.call("load_state", each=state["replicas"])
 

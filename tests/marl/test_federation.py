@@ -1,0 +1,90 @@
+"""Averaging, and replicas that share no memory."""
+
+import numpy as np
+import pytest
+
+from marl.federation import average
+from marl.mission import Known, make_mission
+from marl.replicas import Replicas
+from marl.settings import PRESETS
+from marl.trainer import Trainer
+from radiotwin.errors import RunFailed
+from radiotwin.survey import segmented_truth
+
+SETTINGS = PRESETS["fast"].model_copy(update={"parallel": 4, "batch": 4, "replay": 8, "hidden": 8, "mixing_width": 4})
+
+
+@pytest.fixture(scope="module")
+def mission(small_scene):
+    return make_mission(small_scene, segmented_truth(small_scene), Known.truth(small_scene))
+
+
+def trainers(mission, settings=SETTINGS):
+    """Three replicas that have learned different things."""
+    made = [Trainer(settings, mission, 100, 0, stream) for stream in range(3)]
+    for trainer in made:
+        trainer.train(8)
+    return made
+
+
+def test_the_average_is_the_exact_mean():
+    rng = np.random.default_rng(0)
+    replicas = [{"a": rng.normal(size=(3, 2)).astype(np.float32), "b": np.float32(i) * np.ones(4, np.float32)}
+                for i in range(3)]
+    mean = average(replicas)
+    np.testing.assert_array_equal(mean["b"], np.ones(4))
+    exact = sum(each["a"].astype(np.longdouble) for each in replicas) / 3
+    np.testing.assert_array_equal(mean["a"], exact.astype(np.float32))
+    assert mean["a"].dtype == np.float32
+
+
+@pytest.mark.parametrize("federate_all", [False, True])
+def test_replicas_share_no_memory_after_averaging(mission, federate_all):
+    # The published code hands the same tensors to all: its replicas are one from the first averaging on.
+    replicas = trainers(mission, SETTINGS.model_copy(update={"federate_all": federate_all}))
+    assert any((a != b).any() for a, b in zip(replicas[0].weights().values(), replicas[1].weights().values()))
+    mean = average([replica.weights() for replica in replicas])
+    for replica in replicas:
+        replica.set_weights(mean)
+    for name, weights in replicas[0].weights().items():
+        np.testing.assert_array_equal(weights, mean[name])
+        np.testing.assert_array_equal(weights, replicas[2].weights()[name])
+    pointers = [{tensor.data_ptr() for tensor in replica.learner.parameters()} for replica in replicas]
+    assert not pointers[0] & pointers[1] and not pointers[1] & pointers[2]
+    others = [replica.weights() for replica in replicas[1:]]
+    replicas[0].train(4)
+    assert any((a != mean[name]).any() for name, a in replicas[0].weights().items())
+    for before, replica in zip(others, replicas[1:]):
+        for name, weights in replica.weights().items():
+            np.testing.assert_array_equal(weights, before[name])
+
+
+def test_federating_all_averages_moments_and_target_networks(mission):
+    weights = trainers(mission, SETTINGS.model_copy(update={"federate_all": True}))[0].weights()
+    assert {name.split(".")[0] for name in weights} == {"agent", "mixer", "target_agent", "target_mixer", "exp_avg",
+                                                        "exp_avg_sq"}
+    some = trainers(mission, SETTINGS.model_copy(update={"federate_all": False}))[0].weights()
+    assert {name.split(".")[0] for name in some} == {"agent", "mixer"}
+
+
+def test_processes_learn_the_same_as_this_one(mission):
+    here = [Trainer(SETTINGS, mission, 100, 0, stream) for stream in range(2)]
+    replicas = Replicas(2, SETTINGS, mission, 100, 0)
+    try:
+        records = replicas.call("train", 8)
+        assert records == [trainer.train(8) for trainer in here]
+        there = replicas.call("weights")
+        for trainer, weights in zip(here, there):
+            for name, expected in trainer.weights().items():
+                np.testing.assert_array_equal(weights[name], expected)
+        replicas.call("set_weights", each=[there[1], there[0]])
+        swapped = replicas.call("weights")
+        np.testing.assert_array_equal(swapped[0]["agent.head.bias"], there[1]["agent.head.bias"])
+        with pytest.raises(RuntimeError, match="AttributeError"):
+            replicas.call("no_such_method")
+        replicas._replicas[0]._process.kill()
+        replicas._replicas[0]._process.join()
+        with pytest.raises(RunFailed, match="--resume"):
+            replicas.call("train", 4)
+    finally:
+        replicas.close()
