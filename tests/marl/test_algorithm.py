@@ -1,0 +1,135 @@
+"""Algorithm 1 on the small scene: what it measures, what it knows, and that a stopped run ends as an unbroken one."""
+
+import numpy as np
+import pytest
+
+from marl.algorithm import run_algorithm
+from marl.flights import HeuristicPolicy
+from marl.mission import Known
+from marl.reality import Reality, known_by, learn_twin, location_errors_m
+from marl.settings import PRESETS, RunSettings
+from marl.trainer import Trainer
+from radiotwin.errors import BadInput
+from radiotwin.survey import segmented_truth
+
+LEARNER = PRESETS["fast"].model_copy(update={"parallel": 10, "batch": 8, "replay": 60, "federate_every": 20})
+
+
+def run_settings(**changes) -> RunSettings:
+    return RunSettings(truth="segmented", real_episodes=3, episodes=40, flights=8, planner_iterations=500, **changes)
+
+
+def execute(scene, run, folder=None, resume=False, on_round=lambda rows, blocks: None):
+    return run_algorithm(run, LEARNER, scene, segmented_truth(scene), folder, resume, on_round, lambda *_: None)
+
+
+def without_times(rows):
+    return [{name: value for name, value in row.items() if not name.endswith("_s")} for row in rows]
+
+
+@pytest.fixture(scope="module")
+def reality(small_scene):
+    """One random flight in the statistical truth, without noise of the receivers."""
+    world = Reality(small_scene, segmented_truth(small_scene), "matching", 0.0, 5)
+    world.fly(HeuristicPolicy("random", np.random.default_rng(0)), Known.anchors(small_scene))
+    return world
+
+
+def test_a_real_flight_measures_every_device_in_every_slot_until_it_lands(small_scene, reality):
+    measured = reality.measurements()
+    table = measured.table
+    for uav in small_scene.config.uavs:
+        own = table[table["receiver"] == uav.uav]
+        first = own.iloc[0]
+        assert (first["receiver_x_m"], first["receiver_y_m"], first["receiver_z_m"]) == (
+            uav.start_x_m, uav.start_y_m, uav.altitude_m)
+        slots = len(own) // len(small_scene.config.devices)
+        positions = own[["receiver_x_m", "receiver_y_m"]].to_numpy()[::len(small_scene.config.devices)]
+        moves = int((np.abs(np.diff(positions, axis=0)).sum(axis=1) > 0).sum())
+        # The last slot is flown, and what it leads to is no longer measured.
+        assert moves + 0.5 * (slots - 1 - moves) <= uav.battery
+        assert moves + 0.5 * (slots - moves) >= uav.battery - 1
+    assert measured.devices.loc[measured.devices["role"] == "unknown", ["x_m", "y_m"]].isna().all().all()
+
+
+def test_what_is_measured_is_what_the_mission_received(small_scene, reality):
+    table = reality.measurements().table
+    truth = segmented_truth(small_scene)
+    index = truth.lattice.index_of(table[["receiver_x_m", "receiver_y_m", "receiver_z_m"]].to_numpy())
+    rows = [truth.devices.index(name) for name in table["device"]]
+    flat = truth.gain_db.reshape(len(truth.devices), -1)
+    sigma_db = truth.dataset["sigma_db"].values.reshape(flat.shape)
+    deviation = (table["gain_db"] - flat[rows, index]) / sigma_db[rows, index]
+    assert len(table) > 500 and table["gain_db"].notna().all()
+    assert abs(deviation.mean()) < 0.15 and abs(deviation.std() - 1) < 0.1
+
+
+def test_below_sensitivity_is_blank(small_scene):
+    radio = small_scene.config.radio.model_copy(update={"sensitivity_dbm": -80.0})
+    deaf = type(small_scene)(small_scene.folder, small_scene.config.model_copy(update={"radio": radio}))
+    world = Reality(deaf, segmented_truth(deaf), "matching", 0.0, 5)
+    world.fly(HeuristicPolicy("random", np.random.default_rng(0)), Known.anchors(deaf))
+    level_db = world.measurements().level_db
+    assert np.isnan(level_db).any() and np.nanmin(level_db) >= -80.0
+
+
+def test_the_twin_tells_positions_of_unknown_devices_from_measurements_only(small_scene, reality):
+    known = known_by(learn_twin(reality, "nn", 0, None))
+    errors_m = location_errors_m(small_scene, known)
+    assert len(errors_m) == sum(d.role == "unknown" for d in small_scene.config.devices)
+    assert (errors_m > 0).all() and np.median(errors_m) < 25
+    assert np.isnan(location_errors_m(small_scene, Known.anchors(small_scene))).all()
+
+
+def test_an_unknown_kind_of_twin_is_refused(reality):
+    with pytest.raises(BadInput, match="allowed are nn, log-distance, kriging"):
+        learn_twin(reality, "oracle", 0, None)
+
+
+@pytest.mark.parametrize("algorithm, guide", [("qmix", "planner"), ("iql", "none"), ("planner", "none"),
+                                              ("greedy", "none")])
+def test_a_stopped_run_ends_as_an_unbroken_one(small_scene, tmp_path, algorithm, guide):
+    run = run_settings(algorithm=algorithm, guide=guide, seed=1)
+    unbroken = execute(small_scene, run)
+
+    class Killed(Exception):
+        pass
+
+    def kill_after_two(rows, blocks):
+        if len(rows) == 2:
+            raise Killed
+
+    with pytest.raises(Killed):
+        execute(small_scene, run, tmp_path, on_round=kill_after_two)
+    resumed = execute(small_scene, run, tmp_path, resume=True)
+    assert without_times(resumed.rows) == without_times(unbroken.rows)
+    assert resumed.blocks == unbroken.blocks
+    np.testing.assert_array_equal(resumed.flights.action, unbroken.flights.action)
+    assert resumed.known == unbroken.known
+
+
+def test_a_perfect_twin_counts_every_episode_as_real(small_scene):
+    rows = execute(small_scene, run_settings(algorithm="qmix", twin="truth")).rows
+    assert [row["real_episodes"] for row in rows] == [40, 80, 120]
+    assert [row["evaluation_flights"] for row in rows] == [8, 16, 24]
+
+
+def test_agents_see_estimates_in_the_twin_and_in_reality_alike(small_scene, monkeypatch):
+    seen = []
+    enter = Trainer.enter
+
+    def spy(self, mission, plan=None):
+        seen.append(mission.known_m.copy())
+        enter(self, mission, plan)
+
+    monkeypatch.setattr(Trainer, "enter", spy)
+    outcome = execute(small_scene, run_settings(algorithm="qmix"))
+    true_m = small_scene.device_m[:, :2]
+    unknown = [d.role == "unknown" for d in small_scene.config.devices]
+    assert (np.abs(seen[-1] - true_m)[unknown] > 1e-9).any(axis=1).all()
+    assert np.abs(seen[-1] - true_m)[~np.array(unknown)].max() == 0
+    final = np.array([outcome.known.position_m[d.device] for d in small_scene.config.devices])
+    np.testing.assert_allclose(final, seen[-1])
+    seen.clear()
+    execute(small_scene, run_settings(algorithm="qmix", privileged=True))
+    np.testing.assert_allclose(seen[-1], true_m)
