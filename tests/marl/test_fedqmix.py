@@ -1,0 +1,111 @@
+"""`python -m marl.fedqmix`, as a user runs it."""
+
+import csv
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from marl.checkpoint import load_checkpoint
+
+SMALL = ("--truth segmented --real-episodes 2 --episodes 40 --batch 8 --replay 40 --flights 8 "
+         "--planner-iterations 300 ")
+
+
+@pytest.fixture(scope="module")
+def scene_option(small_scene):
+    return f"--scene {shlex.quote(str(small_scene.folder))} "
+
+
+def start(words, cwd):
+    return subprocess.Popen([sys.executable, "-m", "marl.fedqmix", *shlex.split(words)], cwd=cwd,
+                            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+                            env=os.environ | {"COLUMNS": "120"})
+
+
+def run(words, cwd):
+    process = start(words, cwd)
+    out, err = process.communicate(timeout=300)
+    return process.returncode, out, err
+
+
+def metrics(path):
+    with path.open() as file:
+        return [{name: value for name, value in row.items() if not name.endswith("_s")} for row in csv.DictReader(file)]
+
+
+def test_a_whole_run_writes_everything_and_ends_in_the_table(scene_option, tmp_path):
+    status, out, err = run(scene_option + SMALL + "--out result", tmp_path)
+    assert status == 0, err
+    lines = [line for line in out.splitlines() if line.strip().startswith(("fedqmix", "planner", "greedy", "random"))]
+    assert [line.split()[:2] for line in lines] == [["fedqmix", "NN"], ["fedqmix", "log-distance"], ["fedqmix", "the"],
+                                                    ["planner", "NN"], ["greedy", "2"], ["random", "0"]]
+    # Trained in the truth, every episode of both replicas is a real one.
+    assert lines[2].split()[3] == "160"
+    folder = tmp_path / "result"
+    for name in ("config.json", "metrics.csv", "checkpoint.pt", "comparison.csv", "curve.png", "trajectories.png",
+                 "twin/twin.json", "compare/truth/metrics.csv"):
+        assert (folder / name).is_file(), name
+    assert list((folder / "tensorboard").iterdir())
+    config = json.loads((folder / "config.json").read_text())
+    assert config["run"]["real_episodes"] == 2 and config["learner"]["batch"] == 8
+    with (folder / "comparison.csv").open() as file:
+        ratios = {(row["method"], row["trained_in"]): float(row["truth_ratio"]) for row in csv.DictReader(file)}
+    assert all(0 < ratio <= 1 for ratio in ratios.values()) and ratios["planner", "NN twin"] > ratios["random", ""]
+
+
+def test_a_killed_run_resumes_to_the_same_result_bit_for_bit(scene_option, tmp_path):
+    words = scene_option + SMALL + "--real-episodes 3 --compare false "
+    status, _, err = run(words + "--out unbroken", tmp_path)
+    assert status == 0, err
+    process = start(words + "--out killed", tmp_path)
+    checkpoint = tmp_path / "killed" / "checkpoint.pt"
+    for _ in range(1200):
+        if checkpoint.exists() or process.poll() is not None:
+            break
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=60)
+    assert process.returncode == -signal.SIGKILL and len(load_checkpoint(checkpoint)["rows"]) < 3
+    status, _, err = run(words + "--out killed --resume", tmp_path)
+    assert status == 0, err
+    assert metrics(tmp_path / "killed" / "metrics.csv") == metrics(tmp_path / "unbroken" / "metrics.csv")
+    ends = [load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("killed", "unbroken")]
+    for one, other in zip(*(flat(end["strategy"]) for end in ends), strict=True):
+        assert one == other
+    for name in ("trajectories.png", "curve.png", "twin/twin.json"):
+        assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "unbroken" / name).read_bytes()
+    status, _, err = run(words + "--out killed --resume --learning-rate 0.1", tmp_path)
+    assert status == 2 and "--learning-rate 0.1" in err and "0.002" in err
+    status, _, err = run(words + "--out killed", tmp_path)
+    assert status == 2 and "--resume" in err
+
+
+def flat(value):
+    """All numbers of a nested state as texts of their bytes."""
+    if isinstance(value, dict):
+        return [item for name in value for item in (str(name), *flat(value[name]))]
+    if isinstance(value, list):
+        return [item for each in value for item in flat(each)]
+    return [value.tobytes() if hasattr(value, "tobytes") else value.numpy().tobytes() if hasattr(value, "numpy")
+            else repr(value)]
+
+
+@pytest.mark.parametrize("words, parts", [
+    ("--scene nowhere", ["nowhere", "radiotwin build-scene"]),
+    ("--episodes 0", ["--episodes 0", "≥ 1"]),
+    ("--compare perhaps", ["--compare perhaps", "true|false"]),
+    ("--twin magic", ["--twin magic", "nn|log-distance|kriging|truth"]),
+    ("--batch 64 --replay 32", ["--replay 32", "64"]),
+    ("--out result --resume", ["nothing to resume"])])
+def test_bad_input_is_one_message_and_leaves_nothing(words, parts, small_scene, tmp_path):
+    given = words if "--scene" in words else f"--scene {shlex.quote(str(small_scene.folder))} --truth segmented {words}"
+    status, out, err = run(given, tmp_path)
+    assert status == 2 and "Traceback" not in err and not out
+    assert all(part in err for part in parts), err
+    assert not list(tmp_path.iterdir())
