@@ -25,7 +25,7 @@ help:
 	@echo "make demo    set up, then the whole chain on a small city"
 	@echo "make test    set up, then every test"
 	@echo "make lint    ruff"
-	@echo "make bench   the benchmarks"
+	@echo "make bench   what takes how long (the studies of docs/results.md are started one by one)"
 	@echo "make llvm    set up only: the package and a libLLVM for tracing"
 	@echo "make clean   remove the environment and what the tools left"
 
@@ -41,7 +41,8 @@ lint: $(INSTALLED)
 	$(BIN)/ruff check
 
 bench: llvm
-	for benchmark in benchmarks/*.py; do $(BIN)/python $$benchmark || exit 1; done
+	for benchmark in line_of_sight channel_fit localize marl_speed trace; do \
+		$(BIN)/python benchmarks/$$benchmark.py || exit 1; done
 
 # The second run does nothing, until what is to be installed has changed.
 $(INSTALLED): pyproject.toml constraints.txt

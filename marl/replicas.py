@@ -4,6 +4,7 @@ Processes, because three of them use two cores a quarter better than three threa
 """
 
 import multiprocessing
+import pickle
 import traceback
 from concurrent.futures import ThreadPoolExecutor
 
@@ -73,8 +74,8 @@ class _Remote:
 
     def call(self, method: str, *arguments):
         try:
-            self._pipe.send((method, arguments))
-            done, result = self._pipe.recv()
+            _send(self._pipe, (method, arguments))
+            done, result = _receive(self._pipe)
         except (EOFError, OSError):
             raise RunFailed("a process that trains a replica has ended, perhaps for lack of memory; start the same "
                             "command with --resume to go on from the last checkpoint") from None
@@ -95,12 +96,21 @@ def _serve(pipe, arguments) -> None:
     trainer = Trainer(*arguments)
     while True:
         try:
-            method, call = pipe.recv()
+            method, call = _receive(pipe)
         except (EOFError, KeyboardInterrupt):
             return
         try:
-            pipe.send((True, getattr(trainer, method)(*call)))
+            _send(pipe, (True, getattr(trainer, method)(*call)))
         except KeyboardInterrupt:
             return
         except Exception:
-            pipe.send((False, traceback.format_exc()))
+            _send(pipe, (False, traceback.format_exc()))
+
+
+def _send(pipe, message) -> None:
+    """As plain bytes: `pipe.send` would hand over tensors as shared memory, one file each."""
+    pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
+
+
+def _receive(pipe):
+    return pickle.loads(pipe.recv_bytes())

@@ -60,7 +60,7 @@ class Session:
             runs |= {twin: self.run.model_copy(update={"twin": twin})
                      for twin in ("nn", "log-distance", "truth") if twin != self.run.twin}
         outcomes = {}
-        with progress("starting", total=sum(run.real_episodes * run.episodes for run in runs.values())) as advance:
+        with progress("first real episode", total=sum(run.real_episodes * run.episodes for run in runs.values())) as advance:
             for twin, run in runs.items():
                 def named(count: int, text: str | None = None, twin: str = twin) -> None:
                     advance(count, text and f"{TRAINED_IN[twin]}: {text}")
