@@ -1,0 +1,135 @@
+"""The mission's rules against the same rules written slowly, on random missions."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from marl.environment import ACTION_COUNT, Environment, assign, feasible, rate
+from marl.flights import HeuristicPolicy, fly
+
+FEW = settings(max_examples=40, deadline=None)
+
+
+@given(st.floats(-40, 80), st.floats(0.1, 1000))
+@FEW
+def test_the_rate_is_shannons(snr_db, scale):
+    assert rate(snr_db, scale) == pytest.approx(scale * math.log2(1 + 10 ** (snr_db / 10)), rel=1e-9, abs=1e-12)
+
+
+@given(st.data(), st.integers(0, 2**32 - 1))
+@FEW
+def test_safety_allows_exactly_what_leaves_a_way_home(missions, slow, data, seed):
+    mission, rng = data.draw(missions), np.random.default_rng(seed)
+    mask = np.empty(ACTION_COUNT, dtype=np.bool_)
+    for u in range(mission.uavs):
+        home = slow.ways_home(mission, u)
+        for battery, row, column in np.argwhere(home)[rng.permutation(home.sum())[:60]]:
+            if battery == 0 and mission.steps_home[u, row, column] > 0:
+                continue
+            feasible(mission, u, row, column, battery, mask)
+            assert mask.tolist() == slow.feasible(home, row, column, battery)
+            assert mask.any()
+
+
+@given(st.data(), st.integers(0, 2**32 - 1))
+@FEW
+def test_a_flight_follows_the_rules_slot_by_slot(missions, slow, data, seed):
+    mission, rng = data.draw(missions), np.random.default_rng(seed)
+    environment = Environment(mission, 2, np.random.default_rng(seed))
+    homes = [slow.ways_home(mission, u) for u in range(mission.uavs)]
+    frame = environment.reset()
+    assert (frame.cell == mission.start).all() and (frame.battery == mission.battery).all()
+    np.testing.assert_allclose(frame.data_units, np.tile(mission.data_units, (2, 1)), rtol=1e-6)
+    while not environment.done.all():
+        action = np.zeros((2, mission.uavs), dtype=int)
+        for e in range(2):
+            links = slow.usable(mission, frame, e)
+            served = slow.assign(links, mission.max_rate)
+            assert {u: int(k) for u, k in enumerate(frame.assigned[e]) if k >= 0} == served
+            for u in range(mission.uavs):
+                can = slow.feasible(homes[u], *frame.cell[e, u], int(frame.battery[e, u]))
+                action[e, u] = rng.choice(np.flatnonzero(can))
+        before = frame.copy()
+        collected = environment.step(action)
+        for e in range(2):
+            left = before.data_units[e].astype(float)
+            for u in range(mission.uavs):
+                k = before.assigned[e, u]
+                expected = 0.0
+                if k >= 0:
+                    expected = min(slow.rate(before.snr_db[e, u, k], mission.rate_scale), left[k])
+                    left[k] -= expected
+                assert collected[e, u] == pytest.approx(expected, rel=1e-5, abs=1e-3)
+                step = slow.steps[action[e, u]]
+                assert tuple(frame.cell[e, u]) == (before.cell[e, u, 0] + step[0], before.cell[e, u, 1] + step[1])
+                assert frame.battery[e, u] == before.battery[e, u] - slow.hovers[action[e, u]]
+            np.testing.assert_allclose(frame.data_units[e], left, rtol=1e-5, atol=1e-3)
+    assert (environment.step(action) == 0).all()  # whoever has landed collects no more
+
+
+@given(st.data(), st.sampled_from(["random", "greedy"]), st.integers(0, 2**32 - 1))
+@FEW
+def test_data_is_conserved_and_nobody_strands(missions, data, name, seed):
+    mission = data.draw(missions)
+    environment = Environment(mission, 4, np.random.default_rng(seed))
+    flights = fly(environment, HeuristicPolicy(name, np.random.default_rng(seed)))
+    left = environment.frame.data_units.sum(axis=1, dtype=float)
+    total = flights.collected.sum(axis=(1, 2), dtype=float) + left
+    np.testing.assert_allclose(total, mission.data_units.sum(), rtol=1e-5)
+    assert (left >= 0).all() and (flights.collected >= 0).all()
+    cell = environment.frame.cell
+    for u in range(mission.uavs):
+        # On the map at every slot, never inside a building, and home at the end.
+        flown = np.arange(flights.action.shape[1]) < flights.length[:, None]
+        rows, columns = flights.frames.cell[..., u, 0][flown], flights.frames.cell[..., u, 1][flown]
+        assert (mission.steps_home[u][rows, columns] < 2**50).all() and (rows >= 0).all() and (columns >= 0).all()
+        assert (mission.steps_home[u, cell[:, u, 0], cell[:, u, 1]] == 0).all()
+    assert (environment.frame.battery == 0).all()
+
+
+def test_the_first_position_counts_and_the_last_does_not(tiny):
+    # Only one cell is in range: the start of one mission, the terminal of the other.
+    for start, terminal, collects in (((2, 2), (2, 3), True), ((2, 3), (2, 2), False)):
+        snr_db = np.full((1, 1, 5, 5), -np.inf)
+        snr_db[0, 0, 2, 2] = 20.0
+        mission = tiny(0, uavs=1, devices=1, battery=(2,), start=[start], terminal=[terminal], snr_db=snr_db,
+                       data_units=[1000.0])
+        flights = fly(Environment(mission, 1, np.random.default_rng(0)),
+                      HeuristicPolicy("random", np.random.default_rng(0)))
+        assert flights.length[0] == 1
+        expected = 100 * math.log2(1 + 100) if collects else 0.0
+        assert flights.collected.sum() == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("max_rate, expected", [(False, [0, 1]), (True, [0, -1])])
+def test_who_loses_its_best_device_gets_another_or_idles(max_rate, expected):
+    strength, out = np.array([[30.0, 12.0], [25.0, 11.0]]), np.zeros(2, dtype=np.int16)
+    assign(strength, max_rate, out)
+    assert out.tolist() == expected
+
+
+def test_shadowing_is_normal_and_drawn_anew_in_every_slot(tiny):
+    mission = tiny(0, uavs=1, devices=2, snr_db=20.0, sigma_db=np.array([3.0, 0.0]).reshape(1, 2, 1, 1), battery=(8,),
+                   data_units=[1e9, 1e9])
+    flights = fly(Environment(mission, 4000, np.random.default_rng(0)),
+                  HeuristicPolicy("random", np.random.default_rng(0)))
+    flown = np.arange(flights.action.shape[1]) < flights.length[:, None]
+    drawn_db = flights.frames.snr_db[:, :, 0, 0][flown] - 20.0
+    n = len(drawn_db)
+    assert abs(drawn_db.mean()) < 4 * 3 / math.sqrt(n) and abs(drawn_db.std() - 3) < 4 * 3 / math.sqrt(2 * n)
+    # Shortest flights have four slots.
+    first, second = flights.frames.snr_db[:, 0, 0, 0], flights.frames.snr_db[:, 1, 0, 0]
+    assert abs(np.corrcoef(first, second)[0, 1]) < 0.07
+    assert (flights.frames.snr_db[:, :, 0, 1][flown] == 20).all()
+
+
+def test_the_same_seed_flies_the_same_flights(city_mission):
+    one, other, different = (
+        fly(Environment(city_mission, 3, np.random.default_rng(seed)),
+            HeuristicPolicy("random", np.random.default_rng(seed))) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.frames.snr_db, other.frames.snr_db)
+    np.testing.assert_array_equal(one.collected, other.collected)
+    assert not np.array_equal(one.action, different.action)

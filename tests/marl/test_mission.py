@@ -1,0 +1,87 @@
+"""A scene and a radio map become a mission."""
+
+import numpy as np
+import pytest
+
+from marl.mission import Known, make_mission
+from radiotwin.errors import BadInput
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.survey import segmented_truth
+
+
+def changed(scene, **parts):
+    return Scene(scene.folder, scene.config.model_copy(update=parts))
+
+
+def test_the_snr_is_power_plus_gain_minus_noise_at_the_uavs_altitude(small_scene, city_mission):
+    truth = segmented_truth(small_scene)
+    radio = small_scene.config.radio
+    for u, uav in enumerate(small_scene.config.uavs):
+        at_altitude = truth.dataset.sel(z=uav.altitude_m)
+        for k, device in enumerate(small_scene.config.devices):
+            expected = at_altitude["gain_db"].sel(device=device.device).values + radio.tx_power_dbm - radio.noise_dbm
+            np.testing.assert_allclose(city_mission.snr_db[u, k], expected, rtol=1e-5)
+            np.testing.assert_allclose(city_mission.sigma_db[u, k],
+                                       at_altitude["sigma_db"].sel(device=device.device).values)
+
+
+def test_what_is_not_detected_is_never_heard(small_scene):
+    truth = segmented_truth(small_scene)
+    dataset = truth.dataset.copy(deep=True)
+    dataset["gain_db"].values[2, :, 3, 4] = np.nan
+    mission = make_mission(small_scene, RadioMap(dataset), Known.truth(small_scene))
+    assert (mission.snr_db[:, 2, 3, 4] == -np.inf).all() and np.isfinite(mission.sigma_db).all()
+    lacking = RadioMap(dataset.drop_sel(device="d1"))
+    mission = make_mission(small_scene, lacking, Known.truth(small_scene))
+    assert (mission.snr_db[:, 1] == -np.inf).all()
+
+
+def test_the_way_home_goes_around_buildings(small_scene, slow):
+    # Two UAVs below the roofs.
+    lattice = small_scene.config.lattice.model_copy(update={"altitudes_m": [10.0]})
+    uavs = [uav.model_copy(update={"altitude_m": 10.0}) for uav in small_scene.config.uavs]
+    low = changed(small_scene, lattice=lattice, uavs=uavs)
+    mission = make_mission(low, segmented_truth(low), Known.truth(low))
+    assert low.blocked[0].any()
+    for u, uav in enumerate(uavs):
+        end = round(uav.terminal_y_m / 20), round(uav.terminal_x_m / 20)
+        expected = slow.moves_home(low.blocked[0], end)
+        reached = expected < slow.far
+        np.testing.assert_array_equal(mission.steps_home[u][reached], expected[reached])
+        assert (mission.steps_home[u][~reached] > 10**6).all()
+        assert (expected[reached] > 0).any()
+
+
+def test_batteries_are_counted_in_whole_hovers(small_scene):
+    uavs = [uav.model_copy(update={"battery": 40.7}) for uav in small_scene.config.uavs]
+    scene = changed(small_scene, uavs=uavs)
+    mission = make_mission(scene, segmented_truth(scene), Known.truth(scene))
+    assert mission.battery.tolist() == [81, 81] and mission.longest == 81
+
+
+def test_known_positions_are_relative_to_the_lattice_and_nan_where_nobody_knows(small_scene):
+    mission = make_mission(small_scene, segmented_truth(small_scene), Known.anchors(small_scene))
+    for device, known_m in zip(small_scene.config.devices, mission.known_m):
+        if device.role == "anchor":
+            np.testing.assert_allclose(known_m, (device.x_m, device.y_m))  # this lattice begins at the origin
+        else:
+            assert np.isnan(known_m).all()
+
+
+def test_shadowing_can_be_left_out(small_scene):
+    mission = make_mission(small_scene, segmented_truth(small_scene), Known.truth(small_scene), shadowing=False)
+    assert (mission.sigma_db == 0).all()
+
+
+def test_bad_input_is_refused(small_scene):
+    truth, known = segmented_truth(small_scene), Known.truth(small_scene)
+    with pytest.raises(BadInput, match="allowed are matching, max-rate"):
+        make_mission(small_scene, truth, known, "fair")
+    with pytest.raises(BadInput, match="at least one UAV and one device, here are 0 and 7"):
+        make_mission(changed(small_scene, uavs=[]), truth, known)
+    with pytest.raises(BadInput, match="lattice"):
+        make_mission(small_scene, RadioMap(truth.dataset.isel(x=slice(0, 5))), known)
+    far = [uav.model_copy(update={"terminal_x_m": 300.0, "battery": 3.0}) for uav in small_scene.config.uavs]
+    with pytest.raises(BadInput, match="battery = 3 does not reach"):
+        make_mission(changed(small_scene, uavs=far), truth, known)
