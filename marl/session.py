@@ -60,7 +60,8 @@ class Session:
             runs |= {twin: self.run.model_copy(update={"twin": twin})
                      for twin in ("nn", "log-distance", "truth") if twin != self.run.twin}
         outcomes = {}
-        with progress("first real episode", total=sum(run.real_episodes * run.episodes for run in runs.values())) as advance:
+        episodes = len(runs) * self.run.real_episodes * self.run.episodes
+        with progress("first real episode", total=episodes) as advance:
             for twin, run in runs.items():
                 def named(count: int, text: str | None = None, twin: str = twin) -> None:
                     advance(count, text and f"{TRAINED_IN[twin]}: {text}")

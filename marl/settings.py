@@ -56,9 +56,10 @@ class RunSettings(BaseModel):
     algorithm: Literal["fedqmix", "qmix", "iql", "greedy", "planner", "random"] = Field(
         "fedqmix", description="what decides where the UAVs fly")
     preset: Literal["fast", "paper"] = Field("fast", description="settings of learning")
-    real_episodes: int = Field(EPISODES["fast"][0], ge=1, le=10_000, description="real flights to learn the twin from")
+    real_episodes: int = Field(EPISODES["fast"][0], ge=1, le=10_000,
+                               description="real flights to learn the twin from; preset paper: 30")
     episodes: int = Field(EPISODES["fast"][1], ge=1, le=10_000_000,
-                          description="simulated episodes of each replica after each real one")
+                          description="simulated episodes of each replica after each real one; preset paper: 1000")
     guide: Literal["none", "planner"] = Field(
         "none", description="planner: some of the flights that are learned from follow the planner's plan")
     assignment: Literal["matching", "max-rate"] = Field(
@@ -66,6 +67,7 @@ class RunSettings(BaseModel):
     privileged: bool = Field(False, description="agents see the true positions of the unknown devices")
     compare: bool = Field(True, description="afterwards train in the other twins and in the truth, too, for the table")
     planner_iterations: int = Field(60_000, ge=1, le=10**9, description="plans that the planner tries")
-    noise_db: float = Field(1.0, ge=0, le=50, description="standard deviation of the receivers' measurement error")
+    noise_db: float = Field(1.0, ge=0, le=50, description="standard deviation of the receivers' measurement error; a "
+                            "truth with shadowing has no other")
     flights: int = Field(64, ge=1, le=100_000, description="flights of an evaluation")
     seed: int = Field(0, ge=0, le=2**31, description="of everything random")
