@@ -23,6 +23,7 @@ from radiotwin.scene.citymap import CityMap
 SCHEMA = "radiotwin.twin/1"
 CHANNEL_FILE = "channel.safetensors"
 MAP_CHUNK = 200_000  # links predicted at once
+FEW_BLANK, LIMIT_GAP_DB = 0.02, 10.0  # from which on blanks and the limit of detection are said not to fit together
 
 
 @dataclass(frozen=True)
@@ -114,6 +115,9 @@ class Twin:
 
         The mean is given below sensitivity, too; attribute `gain_limit_db` says where detection ends.
         """
+        if self.provenance.get("scene_hash", scene.content_hash()) != scene.content_hash():
+            warnings.warn(f"the twin was learnt in another scene ({self.provenance.get('scene')}) than {scene.folder}, "
+                          "or this one has changed since: geometry, radio or declared devices differ", stacklevel=2)
         known = np.flatnonzero(np.isfinite(self.device_m).all(axis=1))
         receiver_m = scene.lattice.positions_m
         shape = (len(known), len(receiver_m))
@@ -196,6 +200,7 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
     level = measurements.level_column
     radio = scene.config.radio
     limit_db = scene.config.gain_limit_db if level == "gain_db" else radio.sensitivity_dbm
+    _check_limit(measurements, limit_db)
     # Where a file gives x and y of an unknown device, too, they are not to be learned from.
     anchors_m = np.where(measurements.is_anchor[:, None], measurements.device_m, np.nan)
     channel = _fit_channel(measurements, anchors_m, scene, MODELS[model](), limit_db, seed)
@@ -252,6 +257,16 @@ def _check_positions(measurements: Measurements, scene: Scene) -> None:
         if odd.any():
             warnings.warn(f"{odd.sum()} of {len(odd)} receiver positions lie {where}: do measurements and scene share "
                           "one frame and unit?", stacklevel=3)
+
+
+def _check_limit(measurements: Measurements, limit_db: float) -> None:
+    """Warn where blank levels are said to lie below a limit that no measured level comes near."""
+    level_db = measurements.level_db
+    blank = np.isnan(level_db)
+    if blank.mean() > FEW_BLANK and not blank.all() and np.nanmin(level_db) > limit_db + LIMIT_GAP_DB:
+        warnings.warn(f"{blank.sum()} levels are blank and taken for levels below the scene's limit of detection, "
+                      f"{limit_db:.0f} dB, but the weakest measured one is {np.nanmin(level_db):.0f} dB: check "
+                      "sensitivity_dbm and tx_power_dbm in scene.toml", stacklevel=3)
 
 
 def _locate(measurements, scene, channel, unknown, limit_db, seed, start, settings):

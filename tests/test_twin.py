@@ -105,3 +105,19 @@ def test_receivers_off_the_map_are_mentioned(small_scene, flown):
     table = flown.table.assign(receiver_x_m=flown.table["receiver_x_m"] + 5000)
     with pytest.warns(UserWarning, match="outside the 3D map"):
         fit_twin(Measurements(table, flown.devices), small_scene, model="log_distance", seed=0)
+
+
+def test_a_map_of_another_scene_is_warned_of(small_scene, twin):
+    radio = small_scene.config.radio.model_copy(update={"frequency_hz": 3.5e9})
+    other = Scene(small_scene.folder, small_scene.config.model_copy(update={"radio": radio}))
+    with pytest.warns(UserWarning, match="another scene"):
+        twin.radio_map(other)
+
+
+def test_blanks_far_above_the_limit_of_detection_are_warned_of(small_scene, flown):
+    table = flown.table.copy()
+    table.loc[table["gain_db"] < np.nanquantile(table["gain_db"], 0.2), "gain_db"] = np.nan
+    radio = small_scene.config.radio.model_copy(update={"sensitivity_dbm": -150.0})
+    deaf = Scene(small_scene.folder, small_scene.config.model_copy(update={"radio": radio}))
+    with pytest.warns(UserWarning, match="check sensitivity_dbm"):
+        fit_twin(Measurements(table, flown.devices), deaf, model="segmented_log_distance", seed=0)
