@@ -97,7 +97,8 @@ def run_algorithm(run: RunSettings, learner: LearnerSettings, scene: Scene, trut
                            "round_s": time.perf_counter() - started})
             advance(0, _summary(rows[-1], run))
             if folder:
-                state = {"rows": rows, "blocks": blocks, "tables": reality.tables, "strategy": strategy.state()}
+                state = {"rows": rows, "blocks": blocks, "tables": reality.tables,
+                         "strategy": strategy.state(last=number + 1 == run.real_episodes)}
                 if twin is not None:
                     twin.save(folder / "twin")
                     state["twin"] = folder_content(folder / "twin")

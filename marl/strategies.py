@@ -35,8 +35,8 @@ class Strategy(Protocol):
     def policy(self, rng: np.random.Generator) -> Policy:
         """What was learned or planned, without exploration."""
 
-    def state(self) -> dict:
-        """What `load_state` goes on from."""
+    def state(self, last: bool) -> dict:
+        """What `load_state` goes on from; when nothing will be prepared any more (`last`), only what flies."""
 
     def load_state(self, state: dict) -> None:
         """Go on from a checkpoint."""
@@ -71,7 +71,7 @@ class Heuristic:
     def policy(self, rng: np.random.Generator) -> Policy:
         return HeuristicPolicy(self._name, rng)
 
-    def state(self) -> dict:
+    def state(self, last: bool) -> dict:
         return {}
 
     def load_state(self, state: dict) -> None:
@@ -94,7 +94,7 @@ class Planned:
     def policy(self, rng: np.random.Generator) -> Policy:
         return PlanPolicy(self._actions)
 
-    def state(self) -> dict:
+    def state(self, last: bool) -> dict:
         return {"actions": self._actions}
 
     def load_state(self, state: dict) -> None:
@@ -156,14 +156,16 @@ class Learned:
     def policy(self, rng: np.random.Generator) -> Policy:
         return AgentPolicy(self._best, 0.0, rng, self._device)
 
-    def state(self) -> dict:
+    def state(self, last: bool) -> dict:
+        # The replicas' memories are most of a checkpoint.
         return {"episodes": self._episodes, "best": self._best.state_dict(), "actions": self._actions,
-                "replicas": self._replicas.call("state")}
+                "replicas": None if last else self._replicas.call("state")}
 
     def load_state(self, state: dict) -> None:
         self._episodes, self._actions = state["episodes"], state["actions"]
         self._best.load_state_dict(state["best"])
-        self._replicas.call("load_state", each=state["replicas"])
+        if state["replicas"] is not None:
+            self._replicas.call("load_state", each=state["replicas"])
 
     def close(self) -> None:
         self._replicas.close()
