@@ -10,9 +10,10 @@ import numpy as np
 from marl.checkpoint import folder_content, load_checkpoint, restore_folder, save_checkpoint
 from marl.flights import Flights, HeuristicPolicy
 from marl.mission import Known
+from marl.randomness import stream
 from marl.reality import Reality, known_by, learn_twin, location_errors_m
 from marl.settings import LearnerSettings, RunSettings
-from marl.strategies import evaluate, make_strategy
+from marl.strategies import Strategy, evaluate, make_strategy
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin
@@ -58,7 +59,7 @@ def run_algorithm(run: RunSettings, learner: LearnerSettings, scene: Scene, trut
         the same to the bit, whether it was interrupted or not (on the CPU)
 
     Raises:
-        BadInput: no checkpoint to resume from, or what `fit_twin` and `make_mission` refuse.
+        BadInput: a damaged checkpoint, or what `fit_twin` and `make_mission` refuse.
     """
     noise_db = 0.0 if "sigma_db" in truth.dataset else run.noise_db  # shadowing already stands for it
     reality = Reality(scene, truth, run.assignment, noise_db, run.seed)
@@ -76,9 +77,10 @@ def run_algorithm(run: RunSettings, learner: LearnerSettings, scene: Scene, trut
                 twin = Twin.load(folder / "twin")
                 known = known if run.privileged else known_by(twin)
             advance(run.episodes * len(rows), _summary(rows[-1], run))
+            on_round(rows, blocks)  # the run may have been stopped between the checkpoint and the log
         for number in range(len(rows), run.real_episodes):
             started = time.perf_counter()
-            rng = np.random.default_rng([run.seed, number])
+            rng = stream(run.seed, "decisions", number)
             if run.twin == "truth":
                 mission = reality.mission(known)
             else:
@@ -89,10 +91,15 @@ def run_algorithm(run: RunSettings, learner: LearnerSettings, scene: Scene, trut
                 mission = reality.twin_mission(twin, known)
             learned_s = time.perf_counter() - started
             blocks += [{"round": number + 1} | block for block in strategy.prepare(mission, advance)]
-            in_twin = evaluate(mission, strategy.policy(rng), run.flights, run.seed + 1).ratio(mission)
+            in_twin = np.full(1, np.nan)
+            if twin is not None:
+                flights = evaluate(mission, strategy.policy(rng), run.flights, stream(run.seed, "twin evaluation"))
+                in_twin = flights.ratio(mission)
             real = reality.mission(known)
-            flights = evaluate(real, strategy.policy(rng), run.flights, run.seed + 2)
-            rows.append(_row(run, real.uavs, number + 1, in_twin, flights.ratio(real), location_errors_m(scene, known))
+            flights = evaluate(real, strategy.policy(rng), run.flights, stream(run.seed, "truth evaluation"))
+            found = known if twin is None else known_by(twin)
+            rows.append(_row(run, strategy, real.uavs, number + 1, in_twin, flights.ratio(real),
+                             location_errors_m(scene, found))
                         | {"evaluation_flights": (number + 1) * run.flights, "learn_twin_s": learned_s,
                            "round_s": time.perf_counter() - started})
             advance(0, _summary(rows[-1], run))
@@ -105,17 +112,21 @@ def run_algorithm(run: RunSettings, learner: LearnerSettings, scene: Scene, trut
                 save_checkpoint(state, checkpoint)
             on_round(rows, blocks)
         real = reality.mission(known)
-        flights = evaluate(real, strategy.policy(np.random.default_rng(run.seed)), run.flights, run.seed + 2)
+        policy = strategy.policy(stream(run.seed, "decisions", run.real_episodes - 1))
+        flights = evaluate(real, policy, run.flights, stream(run.seed, "truth evaluation"))
         return Outcome(rows, blocks, flights, known, twin)
     finally:
         strategy.close()
 
 
-def _row(run: RunSettings, uavs: int, number: int, in_twin: np.ndarray, real: np.ndarray, errors_m: np.ndarray) -> dict:
+def _row(run: RunSettings, strategy: Strategy, uavs: int, number: int, in_twin: np.ndarray, real: np.ndarray,
+         errors_m: np.ndarray) -> dict:
     simulated = number * run.episodes * {"fedqmix": uavs, "qmix": 1, "iql": 1}.get(run.algorithm, 0)
     located = errors_m[np.isfinite(errors_m)]
     return {
-        "round": number, "real_episodes": simulated if run.twin == "truth" else number,
+        "round": number,
+        # In the truth, what is flown to choose between policies is real, too.
+        "real_episodes": simulated + strategy.selection_flights if run.twin == "truth" else number,
         "simulated_episodes": simulated,
         "truth_ratio": float(real.mean()), "truth_ratio_std": float(real.std()), "twin_ratio": float(in_twin.mean()),
         "located": len(located),
@@ -127,4 +138,4 @@ def _row(run: RunSettings, uavs: int, number: int, in_twin: np.ndarray, real: np
 def _summary(row: dict, run: RunSettings) -> str:
     """A round in a few words, for the progress bar."""
     where = "" if run.twin == "truth" else f", devices found to {row['location_error_median_m']:.1f} m"
-    return f"real episode {row['round']}/{run.real_episodes}: {row['truth_ratio']:.3f} collected{where}"
+    return f"round {row['round']}/{run.real_episodes}: {row['truth_ratio']:.3f} collected{where}"

@@ -21,12 +21,12 @@ def load_checkpoint(path: Path) -> dict:
     """Read what `save_checkpoint` wrote.
 
     Raises:
-        BadInput: there is none, or it is damaged.
+        BadInput: it is damaged.
     """
-    if not path.is_file():
-        raise BadInput(f"{path} does not exist: there is nothing to resume; start the run without --resume")
     try:
         return _unpacked(torch.load(path, map_location="cpu", weights_only=True))
+    except (OSError, MemoryError):
+        raise
     except Exception as error:  # zipfile, pickle and torch each have their own
         raise BadInput(f"{path} is damaged ({type(error).__name__}); remove the run's folder and start again") from None
 

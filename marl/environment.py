@@ -47,7 +47,7 @@ class Environment:
     """E flights side by side; each ends when all its batteries are empty, and then stands still.
 
     Attributes:
-        mission: its rules; may be replaced between flights (another twin's map).
+        mission: its rules.
         frame: the present; `step` overwrites it.
     """
 
@@ -152,6 +152,8 @@ def _sense(mission, frame, flying, rng):
                 sigma_db = mission.sigma_db[u, k, row, column]
                 if sigma_db > 0:
                     snr_db += np.float32(sigma_db * rng.standard_normal())
+                if snr_db < mission.detection_db:
+                    snr_db = np.float32(-np.inf)
                 frame.snr_db[e, u, k] = snr_db
                 # A UAV with an empty battery has landed and collects no more.
                 usable = frame.battery[e, u] > 0 and frame.data_units[e, k] > 0 and snr_db >= mission.threshold_db

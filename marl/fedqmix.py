@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 from marl.options import add_options, checked
-from marl.settings import EPISODES, PRESETS, LearnerSettings, RunSettings
+from marl.settings import EPISODES, LEARNERS, PRESETS, LearnerSettings, RunSettings
 from radiotwin.cli.console import complain, say, show_warnings_plainly
 from radiotwin.errors import BadInput, RunFailed
 
@@ -52,6 +52,9 @@ def settings_of(given: argparse.Namespace) -> tuple[RunSettings, LearnerSettings
     if learner.batch > learner.replay or learner.parallel > learner.replay:
         raise BadInput(f"--replay {learner.replay}: it must hold a batch ({learner.batch} flights) and what is flown "
                        f"side by side ({learner.parallel}); raise it, or lower --batch or --parallel")
+    if run.guide != "none" and run.algorithm not in LEARNERS:
+        raise BadInput(f"--guide {run.guide}: {run.algorithm} does not learn, so nothing can be guided; give it with "
+                       f"--algorithm {', '.join(LEARNERS)} only")
     return run, learner
 
 

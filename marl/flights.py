@@ -115,4 +115,6 @@ def fly(environment: Environment, policy: Policy) -> Flights:
         record.length[flying] += 1
         flying = ~environment.done
         slot += 1
+    for kept, now in zip(record.frames, frame):
+        kept[:, slot:] = now[:, None]  # padding that is a place where a UAV can be
     return record

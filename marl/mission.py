@@ -12,10 +12,10 @@ from radiotwin.survey.grid import HOVER_COST, MOVE_COST, UNREACHABLE, FlightGrid
 from radiotwin.survey.statistical import LOS_LAW
 
 HOVER, NORTH, WEST, SOUTH, EAST, NO_OP = range(6)
-ACTIONS = ("hover", "north", "west", "south", "east", "no-op")
 MOVES = np.array([(0, 0), (1, 0), (0, -1), (-1, 0), (0, 1), (0, 0)], dtype=np.int64)  # (row, column) of each action
 # The battery is counted in whole hovers, so that it is exact.
 UNIT = HOVER_COST
+MOST_HOVERS = 20_000  # of a flight: batteries are counted in 16 bits
 COSTS = np.array([1, *[round(MOVE_COST / UNIT)] * 4, 0], dtype=np.int64)
 
 
@@ -25,7 +25,7 @@ class Mission(NamedTuple):
     A tuple of arrays, because compiled functions take it as it is.
 
     Attributes:
-        snr_db: (U, K, ny, nx) float32 mean SNR [dB]; -inf where nothing is ever detected.
+        snr_db: (U, K, ny, nx) float32 mean SNR [dB]; -inf where nothing is ever received.
         sigma_db: (U, K, ny, nx) float32 standard deviation of the shadowing, drawn anew in every slot [dB].
         steps_home: (U, ny, nx) int64 moves to the UAV's terminal.
         start: (U, 2) int64 cell (row, column) where each UAV starts.
@@ -37,6 +37,7 @@ class Mission(NamedTuple):
         step_m: lattice step.
         rate_scale: data units per slot and bit/s/Hz.
         threshold_db: SNR from which on a link works.
+        detection_db: SNR below which a receiver does not detect anything.
         uav_link_db: (2,) SNR between two UAVs at 1 m [dB], and its slope per decade of distance (the LoS law).
         max_rate: whether a UAV that loses its best device to another one idles (the paper's Eq. 8); otherwise the
             strongest remaining pair is matched until none is left.
@@ -53,6 +54,7 @@ class Mission(NamedTuple):
     step_m: float
     rate_scale: float
     threshold_db: float
+    detection_db: float
     uav_link_db: np.ndarray
     max_rate: bool
 
@@ -87,16 +89,15 @@ class Known:
         return cls({d.device: (d.x_m, d.y_m) for d in scene.config.devices if d.role == "anchor"})
 
 
-def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: str = "matching",
-                 shadowing: bool = True) -> Mission:
+def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: str = "matching") -> Mission:
     """The mission of a scene in a radio map: the truth's, or a twin's.
 
     Args:
         scene: its UAVs, radio, batteries and data; the buildings keep UAVs out.
-        radio_map: over the scene's lattice. A device that it lacks is never heard.
+        radio_map: over the scene's lattice; its `sigma_db`, where it has one, is drawn in every slot. A device that it
+            lacks is never heard, and nothing below the scene's sensitivity is.
         known: positions that the agents see.
         assignment: `matching` or `max-rate`.
-        shadowing: whether the map's `sigma_db`, where it has one, is drawn in every slot.
 
     Raises:
         BadInput: no UAV, no device, a map of another lattice, or a battery that does not reach the terminal.
@@ -112,6 +113,10 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: st
             not np.allclose(radio_map.lattice.positions_m, lattice.positions_m):
         raise BadInput(f"the radio map's lattice {radio_map.gain_db.shape[1:]} (z, y, x) is not that of {path} "
                        f"{lattice.shape}; make the map for this scene")
+    for uav in config.uavs:
+        if not 1 <= uav.battery / UNIT <= MOST_HOVERS:
+            raise BadInput(f"{path}: uav {uav.uav!r}: battery = {uav.battery:g}; a mission allows {UNIT:g} to "
+                           f"{MOST_HOVERS * UNIT:g}")
     levels = [int(np.abs(lattice.z_m - uav.altitude_m).argmin()) for uav in config.uavs]
     to_snr_db = config.radio.tx_power_dbm - config.radio.noise_dbm
     shape = (len(config.uavs), len(config.devices), *lattice.shape[1:])
@@ -122,7 +127,7 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: st
         row = radio_map.devices.index(device.device)
         gain_db = radio_map.gain_db[row, levels]
         snr_db[:, k] = np.where(np.isnan(gain_db), -np.inf, gain_db + to_snr_db)
-        if shadowing and "sigma_db" in radio_map.dataset:
+        if "sigma_db" in radio_map.dataset:
             sigma_db[:, k] = np.nan_to_num(radio_map.dataset["sigma_db"].values[row, levels])
     starts, homes = zip(*(_ends(scene, uav, level) for uav, level in zip(config.uavs, levels)))
     origin_m = np.array([lattice.x_m[0], lattice.y_m[0]])
@@ -133,6 +138,7 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: st
         np.array([uav.altitude_m for uav in config.uavs], dtype=float),
         np.full(len(config.devices), float(config.mission.data_units)), known_m, lattice.step_m,
         float(config.mission.rate_scale), float(config.radio.snr_threshold_db),
+        float(config.gain_limit_db + to_snr_db),
         np.array([to_snr_db + LOS_LAW.intercept_db, 10 * LOS_LAW.slope]), assignment == "max-rate")
 
 

@@ -1,7 +1,7 @@
 """The strong planner without learning: simulated annealing over waypoints, judged by the mission's own rules.
 
 It knows the radio map and nothing else: where a device is does not matter, only where it is heard. Shadowing enters by
-its expectation, so a plan is as good on average as it looks.
+its expectation: each slot counts with what it gives on average.
 """
 
 from typing import NamedTuple
@@ -12,6 +12,7 @@ from scipy.stats import norm
 
 from marl.environment import ACTION_COUNT, Frame, assign, feasible
 from marl.mission import COSTS, EAST, HOVER, MOVES, NO_OP, NORTH, SOUTH, WEST, Mission
+from marl.randomness import stream
 from radiotwin.progress import progress
 
 MOST_WAYPOINTS = 8  # of a UAV
@@ -54,7 +55,7 @@ def plan(mission: Mission, iterations: int, seed: int) -> Plan:
         iterations: plans that are tried; the annealing is spread over them.
         seed: of the search.
     """
-    rng = np.random.default_rng(seed)
+    rng = stream(seed, "planning")
     value = expected_data(mission)
     peaks = np.stack(np.unravel_index(value.reshape(*value.shape[:2], -1).argmax(axis=2), value.shape[2:]), axis=-1)
     tour = np.zeros((mission.uavs, MOST_WAYPOINTS, 3), dtype=np.int64)  # row, column, hovers
@@ -80,8 +81,9 @@ def expected_data(mission: Mission) -> np.ndarray:
         (U, K, ny, nx) float64
     """
     mean_db, sigma_db = mission.snr_db.astype(float), np.maximum(mission.sigma_db.astype(float), 1e-6)
-    short = np.clip((mission.threshold_db - mean_db) / sigma_db, -40.0, 40.0)
-    chance = norm.sf(short)
+    least_db = max(mission.threshold_db, mission.detection_db)
+    short = np.clip((least_db - mean_db) / sigma_db, -40.0, 40.0)
+    chance = np.where(mission.sigma_db > 0, norm.sf(short), mean_db >= least_db)
     # Mean of a normal distribution above a threshold; the ratio of density and tail in logarithms, both may vanish.
     usable_db = np.where(np.isfinite(mean_db), mean_db, 0) + sigma_db * np.exp(norm.logpdf(short) - norm.logsf(short))
     data = mission.rate_scale * np.log2(1 + 10 ** (np.minimum(usable_db, 300.0) / 10))

@@ -8,6 +8,7 @@ import pandas as pd
 from marl.environment import Environment
 from marl.flights import Flights, Policy, fly
 from marl.mission import Known, Mission, make_mission
+from marl.randomness import stream
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.radiomap import RadioMap
@@ -50,7 +51,7 @@ class Reality:
         """Fly one real episode with all UAVs, measure every device in every slot, and keep the measurements."""
         mission = self.mission(known)
         number = len(self.tables)
-        rng = np.random.default_rng([self.seed, number])
+        rng = stream(self.seed, "real flight", number)
         flights = fly(Environment(mission, 1, rng), policy)
         self.tables.append(self._measured(flights, f"f{number}", rng))
         return flights

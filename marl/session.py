@@ -1,5 +1,6 @@
 """One run, from its settings to its folder: configuration, metrics, checkpoints, comparison, figures."""
 
+import hashlib
 import json
 import shutil
 from dataclasses import dataclass
@@ -12,7 +13,8 @@ import torch
 from marl.algorithm import Outcome, run_algorithm
 from marl.figures import choose_flight, draw_curve, draw_trajectories
 from marl.mission import Known, Mission, make_mission
-from marl.settings import LearnerSettings, RunSettings
+from marl.randomness import stream
+from marl.settings import LEARNERS, LearnerSettings, RunSettings
 from marl.strategies import evaluate, make_strategy
 from marl.threads import keep_memory, limit_threads
 from radiotwin.cli.console import print_rows
@@ -54,9 +56,10 @@ class Session:
         truth = read_truth(scene, self.run.truth)
         scene.check_map(truth)
         make_mission(scene, truth, Known.truth(scene), self.run.assignment)  # complains before anything is written
-        self._claim_folder()
+        _torch_device(self.run.device)
+        self._claim_folder(_world(scene, truth))
         runs = {self.run.twin: self.run}
-        if self.run.compare and self.run.algorithm in ("fedqmix", "qmix", "iql"):
+        if self.run.compare and self.run.algorithm in LEARNERS:
             runs |= {twin: self.run.model_copy(update={"twin": twin})
                      for twin in ("nn", "log-distance", "truth") if twin != self.run.twin}
         outcomes = {}
@@ -67,12 +70,12 @@ class Session:
                     advance(count, text and f"{TRAINED_IN[twin]}: {text}")
                 folder = self.out if run is self.run else self.out / "compare" / twin
                 outcomes[twin] = run_algorithm(run, self.learner, scene, truth, folder, self.resume,
-                                               _Log(folder), named, _torch_device())
+                                               _Log(folder), named, _torch_device(self.run.device))
         self._write(scene, truth, outcomes)
 
-    def _claim_folder(self) -> None:
+    def _claim_folder(self, world: dict[str, str]) -> None:
         """Make the folder of a new run, or check that it holds the run that is to be resumed."""
-        path, config = self.out / "config.json", self._config()
+        path, config = self.out / "config.json", self._config() | {"world": world}
         if self.resume:
             try:
                 before = json.loads(path.read_text(encoding="utf-8"))
@@ -82,6 +85,9 @@ class Session:
             for group in config:
                 for name, value in config[group].items():
                     if before.get(group, {}).get(name) != value:
+                        if group == "world":
+                            raise BadInput(f"the {name} is not what it was when the run in {self.out} was started; put "
+                                           "it back, or give another --out")
                         raise BadInput(f"--{name.replace('_', '-')} {value}: the run in {self.out} was started with "
                                        f"{before.get(group, {}).get(name)}; resume it with the options that it was "
                                        "started with, or give another --out")
@@ -124,22 +130,34 @@ class Session:
     def _without_learning(self, name: str, trained_in: Mission, real: Mission, real_episodes: int) -> dict:
         strategy = make_strategy(self.run.model_copy(update={"algorithm": name}), self.learner, trained_in, 1, "cpu")
         strategy.prepare(trained_in, lambda _: None)
-        policy = strategy.policy(np.random.default_rng(self.run.seed))
-        ratio = evaluate(real, policy, self.run.flights, self.run.seed + 2).ratio(real)
+        policy = strategy.policy(stream(self.run.seed, "decisions"))
+        ratio = evaluate(real, policy, self.run.flights, stream(self.run.seed, "truth evaluation")).ratio(real)
         needs = {"planner": TRAINED_IN[self.run.twin], "greedy": "", "random": ""}[name]
-        # Random flights need nothing; greedy ones the positions, which the measured flights gave.
-        return {"method": name, "trained_in": needs, "real_episodes": 0 if name == "random" else real_episodes,
+        # Random flights need nothing; greedy ones the positions, and a plan the map, which the measured flights gave
+        # unless they were told.
+        told = name == "random" or self.run.twin == "truth" or (name == "greedy" and self.run.privileged)
+        return {"method": name, "trained_in": needs, "real_episodes": 0 if told else real_episodes,
                 "truth_ratio": float(ratio.mean()), "truth_ratio_std": float(ratio.std())}
 
 
 def _entry(method: str, twin: str, row: dict) -> dict:
-    learned = method in ("fedqmix", "qmix", "iql", "planner")
+    learned = method in (*LEARNERS, "planner")
     return {"method": method, "trained_in": TRAINED_IN[twin] if learned else "",
             **{name: row[name] for name in ("real_episodes", "truth_ratio", "truth_ratio_std")}}
 
 
-def _torch_device() -> str:
-    return "cuda" if torch.cuda.is_available() else "cpu"
+def _torch_device(wanted: str) -> str:
+    if wanted == "cuda" and not torch.cuda.is_available():
+        raise BadInput("--device cuda: torch finds no usable GPU here; leave the option out, or install a CUDA "
+                       "build of torch")
+    return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted
+
+
+def _world(scene: Scene, truth: RadioMap) -> dict[str, str]:
+    """What a resumed run must find as it was."""
+    declared = hashlib.sha256((scene.folder / "scene.toml").read_bytes()).hexdigest()
+    measured = hashlib.sha256(np.ascontiguousarray(truth.gain_db).tobytes()).hexdigest()
+    return {"city": scene.content_hash(), "scene.toml": declared, "truth": measured}
 
 
 class _Log:

@@ -27,7 +27,10 @@ class LearnerSettings(BaseModel):
     first_epsilon: float = Field(1.0, ge=0, le=1, description="chance of a random action at the start")
     last_epsilon: float = Field(0.05, ge=0, le=1, description="chance of a random action at the end")
     epsilon_slots: int = Field(175_000, ge=0, description="slots over which it falls linearly")
-    federate_every: int = Field(100, ge=1, description="episodes of a replica between averages (fedqmix)")
+    federate_every: int = Field(100, ge=1, description="episodes of a replica between averages (fedqmix), and between "
+                                "looks at the policy")
+    selection_flights: int = Field(64, ge=0, le=100_000, description="flights of a look at the policy, in the map that "
+                                   "it is trained in; the best of a round flies. 0: the last one flies")
     federate_all: bool = Field(True, description="average target networks and the optimiser's moments, too (fedqmix)")
     reward_scale: float = Field(1000.0, gt=0, description="data units that make a reward of 1")
 
@@ -37,10 +40,11 @@ PRESETS = {
     # Chen et al. 2023 and the code published with it; ten flights side by side are ours, and so is the reward's scale.
     "paper": LearnerSettings(learning_rate=5e-4, last_learning_rate=5e-4, td_lambda=0.0, double_q=False, replay=5000,
                              target_every=200, episodes_per_update=1, parallel=10, epsilon_slots=50_000,
-                             federate_every=50, federate_all=False),
+                             federate_every=50, selection_flights=0, federate_all=False),
 }
 EPISODES = {"fast": (10, 800), "paper": (30, 1000)}
-"""Real episodes, and simulated episodes of each replica after each of them."""
+"""Rounds, and episodes of each replica in each of them."""
+LEARNERS = ("fedqmix", "qmix", "iql")
 
 
 class RunSettings(BaseModel):
@@ -57,11 +61,11 @@ class RunSettings(BaseModel):
         "fedqmix", description="what decides where the UAVs fly")
     preset: Literal["fast", "paper"] = Field("fast", description="settings of learning")
     real_episodes: int = Field(EPISODES["fast"][0], ge=1, le=10_000,
-                               description="real flights to learn the twin from; preset paper: 30")
+                               description="rounds, of one real flight each to learn the twin from; preset paper: 30")
     episodes: int = Field(EPISODES["fast"][1], ge=1, le=10_000_000,
-                          description="simulated episodes of each replica after each real one; preset paper: 1000")
+                          description="episodes of training of each replica in a round; preset paper: 1000")
     guide: Literal["none", "planner"] = Field(
-        "none", description="planner: some of the flights that are learned from follow the planner's plan")
+        "none", description="planner: some of the flights that a learner learns from follow a plan")
     assignment: Literal["matching", "max-rate"] = Field(
         "matching", description="matching: strongest remaining pair first; max-rate: strictly each UAV's best device")
     privileged: bool = Field(False, description="agents see the true positions of the unknown devices")
@@ -70,4 +74,6 @@ class RunSettings(BaseModel):
     noise_db: float = Field(1.0, ge=0, le=50, description="standard deviation of the receivers' measurement error; a "
                             "truth with shadowing has no other")
     flights: int = Field(64, ge=1, le=100_000, description="flights of an evaluation")
+    device: Literal["auto", "cpu", "cuda"] = Field(
+        "auto", description="where networks are trained; auto: on a GPU if there is one. Only cpu repeats to the bit")
     seed: int = Field(0, ge=0, le=2**31, description="of everything random")

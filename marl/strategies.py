@@ -12,6 +12,7 @@ from marl.flights import AgentPolicy, Flights, HeuristicPolicy, Policy, fly
 from marl.learner import Learner
 from marl.mission import Mission
 from marl.planner import PlanPolicy, plan
+from marl.randomness import stream
 from marl.replicas import Replicas
 from marl.settings import LearnerSettings, RunSettings
 
@@ -19,7 +20,13 @@ CLEARLY = 0.02  # more of the data, for a plan to be preferred to the one before
 
 
 class Strategy(Protocol):
-    """A way to decide."""
+    """A way to decide.
+
+    Attributes:
+        selection_flights: flown in `prepare` so far to choose between policies.
+    """
+
+    selection_flights: int
 
     def prepare(self, mission: Mission, advance: Callable[[int], None]) -> list[dict[str, float]]:
         """Learn, or plan, in the map of `mission`.
@@ -54,13 +61,15 @@ def make_strategy(run: RunSettings, learner: LearnerSettings, mission: Mission, 
     return Learned(run, learner, mission, rounds, device)
 
 
-def evaluate(mission: Mission, policy: Policy, flights: int, seed: int) -> Flights:
-    """Fly without learning from it."""
-    return fly(Environment(mission, flights, np.random.default_rng(seed)), policy)
+def evaluate(mission: Mission, policy: Policy, flights: int, rng: np.random.Generator) -> Flights:
+    """Fly without learning from it; `rng` draws the shadowing."""
+    return fly(Environment(mission, flights, rng), policy)
 
 
 class Heuristic:
     """`random` or `greedy`: nothing to prepare."""
+
+    selection_flights = 0
 
     def __init__(self, name: str):
         self._name = name
@@ -83,6 +92,8 @@ class Heuristic:
 
 class Planned:
     """Search a plan in the map and fly it as it is."""
+
+    selection_flights = 0
 
     def __init__(self, iterations: int, seed: int):
         self._iterations, self._seed, self._actions = iterations, seed, None
@@ -108,12 +119,17 @@ class Learned:
     """QMIX, independent learners, or federated QMIX with one replica for each UAV.
 
     After every block of `federate_every` episodes the present policy flies in the map that it is trained in; the one
-    that does best there, since the map is the present one, is the one that flies in reality.
+    that does best there, those of earlier rounds included, is the one that flies in reality.
+
+    Attributes:
+        selection_flights: flown so far to choose the policy, none of them learned from.
     """
 
     def __init__(self, run: RunSettings, settings: LearnerSettings, mission: Mission, rounds: int, device: str):
-        self._run, self._settings = run, settings
+        self._run, self._settings, self.selection_flights = run, settings, 0
         count = mission.uavs if run.algorithm == "fedqmix" else 1
+        # Only its sizes are needed here, and what the replicas do not have they cannot learn from.
+        mission = mission._replace(snr_db=np.full_like(mission.snr_db, -np.inf))
         self._replicas = Replicas(count, settings, mission, rounds * run.episodes, run.seed, device)
         self._best = Learner(settings, mission, run.seed, device).agent  # before any episode: the initial weights
         self._present = Learner(settings, mission, run.seed, device).agent
@@ -123,7 +139,8 @@ class Learned:
         if self._run.guide == "planner":
             self._actions = self._better_plan(mission)
         self._replicas.call("enter", mission, self._actions)
-        records, highest, left = [], -np.inf, self._run.episodes
+        records, left = [], self._run.episodes
+        highest = self._look(mission, self._best) if self._episodes else -np.inf
         while left:
             block = min(left, self._settings.federate_every)
             trained = self._replicas.call("train", block)
@@ -133,15 +150,22 @@ class Learned:
                 self._replicas.call("set_weights", mean)
             left, self._episodes = left - block, self._episodes + block
             _load(self._present, mean)
-            rng = np.random.default_rng(self._run.seed)
-            policy = AgentPolicy(self._present, 0.0, rng, self._device)
-            ratio = float(evaluate(mission, policy, self._run.flights, self._run.seed).ratio(mission).mean())
-            if ratio > highest:
+            ratio = self._look(mission, self._present)
+            if not ratio <= highest:  # NaN: nobody looks, and the last one flies
                 highest = ratio
                 _load(self._best, mean)
             records.append({"episodes": self._episodes, "twin_ratio": ratio} | _means(trained))
             advance(block)
         return records
+
+    def _look(self, mission: Mission, agent: torch.nn.Module) -> float:
+        """Share of the data that a policy collects; always in the same shadowing. NaN where nobody looks."""
+        flights, seed = self._settings.selection_flights, self._run.seed
+        if not flights:
+            return np.nan
+        self.selection_flights += flights
+        policy = AgentPolicy(agent, 0.0, stream(seed, "decisions"), self._device)
+        return float(evaluate(mission, policy, flights, stream(seed, "choice")).ratio(mission).mean())
 
     def _better_plan(self, mission: Mission) -> np.ndarray:
         """Plan anew, but stay with the plan before unless the new one is clearly better: a teacher that changes its
@@ -149,8 +173,8 @@ class Learned:
         new = plan(mission, self._run.planner_iterations, self._run.seed).actions
         if self._actions is None:
             return new
-        before, after = (evaluate(mission, PlanPolicy(actions), self._run.flights, self._run.seed).ratio(mission).mean()
-                         for actions in (self._actions, new))
+        before, after = (evaluate(mission, PlanPolicy(actions), self._run.flights, stream(self._run.seed, "choice"))
+                         .ratio(mission).mean() for actions in (self._actions, new))
         return new if after > before + CLEARLY else self._actions
 
     def policy(self, rng: np.random.Generator) -> Policy:
@@ -159,10 +183,12 @@ class Learned:
     def state(self, last: bool) -> dict:
         # The replicas' memories are most of a checkpoint.
         return {"episodes": self._episodes, "best": self._best.state_dict(), "actions": self._actions,
+                "selection_flights": self.selection_flights,
                 "replicas": None if last else self._replicas.call("state")}
 
     def load_state(self, state: dict) -> None:
         self._episodes, self._actions = state["episodes"], state["actions"]
+        self.selection_flights = state["selection_flights"]
         self._best.load_state_dict(state["best"])
         if state["replicas"] is not None:
             self._replicas.call("load_state", each=state["replicas"])

@@ -6,6 +6,7 @@ from marl.environment import Environment
 from marl.flights import AgentPolicy, Flights, fly
 from marl.learner import Learner
 from marl.mission import Mission
+from marl.randomness import stream
 from marl.replay import Replay
 from marl.settings import LearnerSettings
 
@@ -20,18 +21,18 @@ class Trainer:
         mission: what is flown.
         horizon: episodes over which the learning rate falls.
         seed: of the initial weights. Replicas that are to be averaged share it.
-        stream: number of the replica; tells its random numbers from those of the others.
+        number: of the replica; tells its random numbers from those of the others.
         device: torch device.
     """
 
-    def __init__(self, settings: LearnerSettings, mission: Mission, horizon: int, seed: int, stream: int = 0,
+    def __init__(self, settings: LearnerSettings, mission: Mission, horizon: int, seed: int, number: int = 0,
                  device: str = "cpu"):
         self.settings, self.horizon = settings, horizon
         self.learner = Learner(settings, mission, seed, device)
         self.replay = Replay(settings.replay, mission)
         self.episodes, self.slots = 0, 0
         self.mission, self._plan = mission, None
-        self._rng = np.random.default_rng([seed, stream])
+        self._rng = stream(seed, "learning", number)
 
     def enter(self, mission: Mission, plan: np.ndarray | None = None) -> None:
         """Go on in another map of the same mission.
@@ -88,7 +89,7 @@ class Trainer:
         which fades out as training goes on."""
         longest = len(self._plan) * (1 - min(self.episodes / self.horizon, 1.0))
         slots = self._rng.integers(0, int(longest) + 1, count)
-        slots[:round(GUIDED_SHARE * count)] = len(self._plan)
+        slots[:int(np.ceil(GUIDED_SHARE * count))] = len(self._plan)
         return slots
 
     def weights(self) -> dict:

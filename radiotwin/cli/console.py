@@ -9,6 +9,7 @@ from rich.table import Table
 
 console = Console(highlight=False)
 error_console = Console(stderr=True, highlight=False)
+OURS = ("radiotwin", "marl")
 
 
 def complain(message: str) -> None:
@@ -25,7 +26,7 @@ def say(message: str) -> None:
 def show_warnings_plainly() -> None:
     """Warnings of the library as one line each, without a source line."""
     def show(message, category, filename, lineno, file=None, line=None):
-        if issubclass(category, UserWarning) and "radiotwin" in filename:
+        if issubclass(category, UserWarning) and any(f"/{package}/" in filename.replace("\\", "/") for package in OURS):
             error_console.print("[yellow]warning:[/] ", end="")
             error_console.print(str(message), markup=False, soft_wrap=True)
     warnings.showwarning = show

@@ -45,7 +45,7 @@ def moves_home(blocked, terminal):
 
 def build(rng, rows=5, columns=5, uavs=2, devices=3, battery=(12, 15, 9), start=None, terminal=None, blocked=None,
           snr_db=None, sigma_db=0.0, data_units=None, known_m=None, step_m=20.0, rate_scale=100.0, threshold_db=10.0,
-          max_rate=False):
+          detection_db=-np.inf, max_rate=False):
     """A mission from arrays; what is not given is drawn."""
     blocked = np.zeros((rows, columns), dtype=bool) if blocked is None else blocked
     centre = [(rows // 2, columns // 2)] * uavs
@@ -60,7 +60,7 @@ def build(rng, rows=5, columns=5, uavs=2, devices=3, battery=(12, 15, 9), start=
         np.array([moves_home(blocked, end) for end in terminal]), np.array(start, dtype=np.int64),
         np.array(battery[:uavs], dtype=np.int64), 50.0 + 5.0 * np.arange(uavs), np.array(data_units, dtype=float),
         np.array(known_m, dtype=float), float(step_m), float(rate_scale), float(threshold_db),
-        np.array([72.0, -25.0]), bool(max_rate))
+        float(detection_db), np.array([72.0, -25.0]), bool(max_rate))
 
 
 @st.composite

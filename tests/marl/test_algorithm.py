@@ -3,16 +3,20 @@
 import numpy as np
 import pytest
 
+import marl.algorithm
+import marl.strategies
 from marl.algorithm import run_algorithm
 from marl.flights import HeuristicPolicy
-from marl.mission import Known
+from marl.mission import Known, make_mission
 from marl.reality import Reality, known_by, learn_twin, location_errors_m
 from marl.settings import PRESETS, RunSettings
+from marl.strategies import evaluate
 from marl.trainer import Trainer
 from radiotwin.errors import BadInput
 from radiotwin.survey import segmented_truth
 
-LEARNER = PRESETS["fast"].model_copy(update={"parallel": 10, "batch": 8, "replay": 60, "federate_every": 20})
+LEARNER = PRESETS["fast"].model_copy(update={"parallel": 10, "batch": 8, "replay": 60, "federate_every": 20,
+                                             "selection_flights": 8})
 
 
 def run_settings(**changes) -> RunSettings:
@@ -24,7 +28,7 @@ def execute(scene, run, folder=None, resume=False, on_round=lambda rows, blocks:
 
 
 def without_times(rows):
-    return [{name: value for name, value in row.items() if not name.endswith("_s")} for row in rows]
+    return [{name: repr(value) for name, value in row.items() if not name.endswith("_s")} for row in rows]
 
 
 @pytest.fixture(scope="module")
@@ -108,10 +112,45 @@ def test_a_stopped_run_ends_as_an_unbroken_one(small_scene, tmp_path, algorithm,
     assert resumed.known == unbroken.known
 
 
-def test_a_perfect_twin_counts_every_episode_as_real(small_scene):
+def test_a_perfect_twin_counts_every_episode_as_real_and_every_flight_that_chooses_the_policy(small_scene):
     rows = execute(small_scene, run_settings(algorithm="qmix", twin="truth")).rows
-    assert [row["real_episodes"] for row in rows] == [40, 80, 120]
+    # 40 of training a round and 8 after each 20 of them; from the second round on the best so far flies once more.
+    assert [row["real_episodes"] for row in rows] == [40 + 16, 80 + 40, 120 + 64]
     assert [row["evaluation_flights"] for row in rows] == [8, 16, 24]
+    assert all(np.isnan(row["twin_ratio"]) for row in rows)
+
+
+def test_training_happens_in_the_twins_map_and_judging_in_the_truths(small_scene, monkeypatch):
+    trained, chosen, judged = [], [], []
+    enter = Trainer.enter
+
+    def spy_enter(self, mission, plan=None):
+        trained.append(mission)
+        enter(self, mission, plan)
+
+    def spy_on(log):
+        def spy(mission, policy, flights, rng):
+            log.append(mission)
+            return evaluate(mission, policy, flights, rng)
+        return spy
+
+    monkeypatch.setattr(Trainer, "enter", spy_enter)
+    monkeypatch.setattr(marl.strategies, "evaluate", spy_on(chosen))
+    monkeypatch.setattr(marl.algorithm, "evaluate", spy_on(judged))
+    outcome = execute(small_scene, run_settings(algorithm="qmix", twin="log-distance"))
+    expected = make_mission(small_scene, outcome.twin.radio_map(small_scene), outcome.known)
+    real = make_mission(small_scene, segmented_truth(small_scene), outcome.known)
+    assert np.abs(expected.snr_db - real.snr_db).max() > 1
+    for mission in (trained[-1], chosen[-1]):
+        np.testing.assert_array_equal(mission.snr_db, expected.snr_db)
+    for mission in trained + chosen:
+        assert not np.array_equal(mission.snr_db, real.snr_db)
+    np.testing.assert_array_equal(judged[-1].snr_db, real.snr_db)
+
+
+def test_errors_of_positions_are_the_twins_also_where_agents_know_better(small_scene):
+    rows = execute(small_scene, run_settings(algorithm="greedy", privileged=True)).rows
+    assert rows[-1]["location_error_median_m"] > 0
 
 
 def test_agents_see_estimates_in_the_twin_and_in_reality_alike(small_scene, monkeypatch):

@@ -28,10 +28,8 @@ def test_everything_comes_back(tmp_path):
     pd.testing.assert_frame_equal(back["tables"][0], state["tables"][0], check_dtype=False)
 
 
-def test_a_damaged_or_missing_one_is_bad_input(tmp_path):
+def test_a_damaged_one_is_bad_input(tmp_path):
     path = tmp_path / "state.pt"
-    with pytest.raises(BadInput, match="nothing to resume"):
-        load_checkpoint(path)
     save_checkpoint({"a": np.zeros(1000)}, path)
     path.write_bytes(path.read_bytes()[:500])
     with pytest.raises(BadInput, match="damaged"):

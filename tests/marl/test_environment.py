@@ -133,3 +133,15 @@ def test_the_same_seed_flies_the_same_flights(city_mission):
     np.testing.assert_array_equal(one.frames.snr_db, other.frames.snr_db)
     np.testing.assert_array_equal(one.collected, other.collected)
     assert not np.array_equal(one.action, different.action)
+
+
+@given(st.data(), st.integers(0, 2**32 - 1))
+@FEW
+def test_below_the_limit_of_detection_nothing_is_seen_and_nothing_collected(missions, data, seed):
+    mission = data.draw(missions)._replace(detection_db=15.0)  # above the threshold
+    flights = fly(Environment(mission, 2, np.random.default_rng(seed)),
+                  HeuristicPolicy("random", np.random.default_rng(seed)))
+    snr_db = flights.frames.snr_db
+    assert ((snr_db >= 15) | np.isneginf(snr_db)).all()
+    for e, t, u in np.argwhere(flights.collected > 0):
+        assert snr_db[e, t, u, flights.frames.assigned[e, t, u]] >= 15

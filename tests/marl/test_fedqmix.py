@@ -45,8 +45,8 @@ def test_a_whole_run_writes_everything_and_ends_in_the_table(scene_option, tmp_p
     lines = [line for line in out.splitlines() if line.strip().startswith(("fedqmix", "planner", "greedy", "random"))]
     assert [line.split()[:2] for line in lines] == [["fedqmix", "NN"], ["fedqmix", "log-distance"], ["fedqmix", "the"],
                                                     ["planner", "NN"], ["greedy", "2"], ["random", "0"]]
-    # Trained in the truth, every episode of both replicas is a real one.
-    assert lines[2].split()[3] == "160"
+    # Trained in the truth, every episode of both replicas is a real one, and so are three looks at the policy.
+    assert lines[2].split()[3] == str(160 + 3 * 64)
     folder = tmp_path / "result"
     for name in ("config.json", "metrics.csv", "checkpoint.pt", "comparison.csv", "curve.png", "trajectories.png",
                  "twin/twin.json", "compare/truth/metrics.csv"):
@@ -102,6 +102,8 @@ def flat(value):
     ("--compare perhaps", ["--compare perhaps", "true|false"]),
     ("--twin magic", ["--twin magic", "nn|log-distance|kriging|truth"]),
     ("--batch 64 --replay 32", ["--replay 32", "64"]),
+    ("--guide planner --algorithm greedy", ["--guide planner", "greedy does not learn"]),
+    ("--device tpu", ["--device tpu", "auto|cpu|cuda"]),
     ("--out result --resume", ["nothing to resume"])])
 def test_bad_input_is_one_message_and_leaves_nothing(words, parts, small_scene, tmp_path):
     given = words if "--scene" in words else f"--scene {shlex.quote(str(small_scene.folder))} --truth segmented {words}"

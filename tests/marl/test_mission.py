@@ -69,9 +69,18 @@ def test_known_positions_are_relative_to_the_lattice_and_nan_where_nobody_knows(
             assert np.isnan(known_m).all()
 
 
-def test_shadowing_can_be_left_out(small_scene):
-    mission = make_mission(small_scene, segmented_truth(small_scene), Known.truth(small_scene), shadowing=False)
-    assert (mission.sigma_db == 0).all()
+def test_the_limit_of_detection_is_the_receivers_sensitivity_as_snr(small_scene):
+    mission = make_mission(small_scene, segmented_truth(small_scene), Known.truth(small_scene))
+    radio = small_scene.config.radio
+    assert mission.detection_db == pytest.approx(radio.sensitivity_dbm - radio.noise_dbm)
+
+
+@pytest.mark.parametrize("battery", [0.4, 50_000.0])
+def test_a_battery_that_cannot_be_counted_is_refused(small_scene, battery):
+    uavs = [uav.model_copy(update={"battery": battery}) for uav in small_scene.config.uavs]
+    scene = Scene(small_scene.folder, small_scene.config.model_copy(update={"uavs": uavs}))
+    with pytest.raises(BadInput, match="allows 0.5 to 10000"):
+        make_mission(scene, segmented_truth(scene), Known.truth(scene))
 
 
 def test_bad_input_is_refused(small_scene):

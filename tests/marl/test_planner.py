@@ -55,6 +55,13 @@ def test_a_link_that_is_never_detected_is_worth_nothing(tiny):
     mission = tiny(0, snr_db=-np.inf, sigma_db=3.0)
     assert (expected_data(mission) == 0).all()
     assert plan(mission, 50, 0).ratio == 0
+    mission = tiny(0, snr_db=20.0, sigma_db=1.0, detection_db=30.0)
+    assert (expected_data(mission) == 0).all()
+
+
+def test_without_shadowing_a_link_at_the_threshold_works(tiny):
+    mission = tiny(0, snr_db=10.0)
+    np.testing.assert_allclose(expected_data(mission), 100 * np.log2(11))
 
 
 def test_with_shadowing_a_plan_collects_on_average_what_it_promises(tiny):

@@ -8,6 +8,7 @@ import torch
 
 from marl.environment import Environment
 from marl.flights import AgentPolicy, fly
+from marl.mission import HOVER
 from marl.settings import LearnerSettings
 from marl.trainer import Trainer
 
@@ -34,9 +35,9 @@ def test_there_is_an_update_for_every_so_many_episodes_once_a_batch_is_there(tin
 
 
 @pytest.mark.parametrize("mix", [True, False])
-def test_the_same_seed_learns_the_same_weights_and_another_stream_others(tiny, mix):
+def test_the_same_seed_learns_the_same_weights_and_another_replica_others(tiny, mix):
     settings, mission = SETTINGS.model_copy(update={"mix": mix}), tiny(0, sigma_db=1.0)
-    trainers = [Trainer(settings, mission, 40, 0, stream) for stream in (0, 0, 1)]
+    trainers = [Trainer(settings, mission, 40, 0, number) for number in (0, 0, 1)]
     start = [parameter.detach().clone() for parameter in trainers[2].learner.parameters()]
     assert all(torch.equal(a, b) for a, b in zip(start, trainers[0].learner.parameters()))
     records = [trainer.train(12) for trainer in trainers]
@@ -44,6 +45,19 @@ def test_the_same_seed_learns_the_same_weights_and_another_stream_others(tiny, m
     one, same, other = (list(trainer.learner.parameters()) for trainer in trainers)
     assert all(torch.equal(a, b) for a, b in zip(one, same))
     assert any(not torch.equal(a, b) for a, b in zip(one, other))
+
+
+def test_a_quarter_of_the_flights_follow_a_plan_and_the_help_for_the_others_fades(tiny):
+    mission, plan = tiny(0), np.full((20, 2), HOVER)
+    trainer = Trainer(SETTINGS, mission, 40, 0)
+    trainer.enter(mission, plan)
+    slots = np.array([trainer._follow(10) for _ in range(200)])
+    assert (slots[:, :3] == 20).all()
+    assert slots[:, 3:].min() == 0 and slots[:, 3:].max() == 20 and abs(slots[:, 3:].mean() - 10) < 1
+    trainer.episodes = 30
+    assert np.array([trainer._follow(10)[3:] for _ in range(200)]).max() == 5
+    trainer.episodes = 40
+    assert trainer._follow(1).tolist() == [20] and trainer._follow(10)[3:].max() == 0
 
 
 def test_a_trainer_goes_on_from_its_state_to_the_bit(tiny):
