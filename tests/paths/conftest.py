@@ -1,0 +1,47 @@
+"""Cities of boxes, turned as one likes."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from radiotwin.scene.citymap import CityMap
+
+
+def _turn(points_m, angle_rad):
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    return np.asarray(points_m, dtype=float) @ np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])
+
+
+@pytest.fixture(scope="session")
+def turn():
+    """Rotates (n, 3) points about the vertical by an angle [rad]."""
+    return _turn
+
+
+@pytest.fixture(scope="session")
+def box_mesh():
+    """A closed box x_min, y_min, x_max, y_max, height on the ground."""
+    def build(x_min, y_min, x_max, y_max, height):
+        mesh = trimesh.creation.box(extents=[x_max - x_min, y_max - y_min, height])
+        mesh.apply_translation([(x_min + x_max) / 2, (y_min + y_max) / 2, height / 2])
+        return mesh
+    return build
+
+
+@pytest.fixture(scope="session")
+def city_of(box_mesh):
+    """A map of boxes or meshes, turned by an angle [rad]."""
+    def build(*parts, angle_rad=0.0):
+        meshes = [part if isinstance(part, trimesh.Trimesh) else box_mesh(*part) for part in parts]
+        mesh = trimesh.util.concatenate(meshes)
+        return CityMap(_turn(mesh.vertices, angle_rad), mesh.faces)
+    return build
+
+
+@pytest.fixture(scope="session")
+def town(city_of):
+    """A few buildings around a street, by the angle [rad] they are turned by; two of them touch."""
+    def build(angle_rad=0.0):
+        return city_of((20, 5, 60, 30, 25), (60, 5, 80, 30, 18), (15, -40, 55, -12, 30), (62, -45, 90, -12, 22),
+                       (-45, -20, -15, 25, 20), angle_rad=angle_rad)
+    return build
