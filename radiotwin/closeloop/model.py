@@ -1,0 +1,198 @@
+"""The base and the effects that were found so far, as one regression on one set of training links."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.optimize import minimize
+
+from radiotwin.closeloop.bases import FittedBase
+from radiotwin.closeloop.records import Records
+from radiotwin.closeloop.regression import Problem, Solution, covariance, mean_db, nll, residual_db, solve
+from radiotwin.effects.base import Effect, Found, Setting, Term, View
+
+MOST_TRIALS = 60  # of settings while one is refined
+REFINED_ON = 8000  # links at most
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """An effect with its setting, and what it adds to all links of a side."""
+
+    effect: Effect
+    setting: Setting
+    term: Term
+
+
+@dataclass(frozen=True, eq=False)
+class Side:
+    """All links, of which some are learned from: one fold, or the whole.
+
+    Attributes:
+        records: n links, with the devices where the base has them.
+        train: (n,) bool, links that are learned from.
+        usable: (n,) bool, links to devices that the base has a position for.
+        base: fitted to the training links.
+        base_db: (n,) its expected level.
+        base_columns, base_spread: see `FittedBase.columns`.
+        group: (n,) index of the error scale.
+        dof: degrees of freedom of the errors.
+        parts: effects so far.
+    """
+
+    records: Records
+    train: np.ndarray
+    usable: np.ndarray
+    base: FittedBase
+    base_db: np.ndarray
+    base_columns: np.ndarray
+    base_spread: np.ndarray
+    group: np.ndarray
+    dof: float
+    parts: list[Part] = field(default_factory=list)
+
+    @classmethod
+    def make(cls, records: Records, train: np.ndarray, base: FittedBase, dof: float) -> "Side":
+        """Without effects."""
+        located = np.isfinite(base.device_m).all(axis=1)
+        usable = located[records.device]
+        # A stand-in for devices that are nowhere, whose links are not looked at.
+        placed = records.with_devices(np.where(np.isfinite(base.device_m), base.device_m, 0.0))
+        columns, spread = base.columns(placed)
+        return cls(placed, train & usable, usable, base, base.mean_db(placed), columns, spread, base.group(placed), dof)
+
+    def part(self, effect: Effect, setting: Setting) -> Part:
+        """An effect for these links."""
+        return Part(effect, setting, effect.term(self.records, setting, self.base.shifted_db))
+
+    def with_parts(self, parts: list[Part]) -> "Side":
+        """The same with other effects."""
+        return replace(self, parts=parts)
+
+    def problem(self, rows: np.ndarray) -> Problem:
+        """The regression on links of a mask or index."""
+        records, parts = self.records, self.parts
+        terms = [part.term for part in parts]
+        mine = records.select(rows) if any(part.effect.stage != "gain" for part in parts) else None
+        limit_db = -np.inf if records.limit_db is None else records.limit_db
+        return Problem(
+            records.level_db[rows], np.full(len(records), limit_db)[rows],
+            self.base_db[rows], self.base_columns[rows], _bend(parts, "paths", mine, rows),
+            sum((term.offset_db[rows] for term in terms), np.zeros(len(self.base_db[rows]))),
+            np.hstack([np.zeros((len(self.base_db[rows]), 0)), *(term.columns[rows] for term in terms)]),
+            np.concatenate([self.base_spread, *(term.spread_db for term in terms)]), self.group[rows],
+            _bend(parts, "receiver", mine, rows), self.dof)
+
+    def fit(self, start: Solution | None = None) -> Solution:
+        """Fit to the training links."""
+        return solve(self.problem(self.train), start)
+
+    def nll(self, solution: Solution) -> np.ndarray:
+        """(n,) negative log-likelihood of all links [nats]; NaN where the base has no position."""
+        return np.where(self.usable, nll(self.problem(slice(None)), solution), np.nan)
+
+    def mean_db(self, solution: Solution) -> np.ndarray:
+        """(n,) expected level of all links [dB]."""
+        return mean_db(self.problem(slice(None)), solution)
+
+    def view(self, solution: Solution) -> View:
+        """The training links as an effect sees them."""
+        problem = self.problem(self.train)
+        return View(self.records.select(self.train), residual_db(problem, solution), solution.scale_db[problem.group],
+                    mean_db(problem, solution), self.base.shifted_db)
+
+    def found(self, solution: Solution) -> list[Found]:
+        """Of each part: what was fitted, and how surely."""
+        spread = covariance(self.problem(self.train), solution)
+        at, result = self.base_columns.shape[1], []
+        for number, part in enumerate(self.parts):
+            place = slice(at, at + part.term.columns.shape[1])
+            result.append(Found(solution.coefficients[place], spread[place, place],
+                                self._setting_deviations(number, solution)))
+            at = place.stop
+        return result
+
+    def _setting_deviations(self, number: int, solution: Solution) -> np.ndarray:
+        """Standard deviation of each number of a setting: where the likelihood, all coefficients fitted again, has
+        fallen by half a nat if it falls as a parabola."""
+        part = self.parts[number]
+        variation = part.effect.vary(part.setting)
+        if variation is None:
+            return np.zeros(0)
+        deviations = np.empty(len(variation.values))
+        for i, step in enumerate(variation.steps):
+            rises = []
+            for sign in (-1.0, 1.0):
+                numbers = variation.values.copy()
+                numbers[i] = np.clip(numbers[i] + sign * step, variation.low[i], variation.high[i])
+                parts = list(self.parts)
+                parts[number] = self.part(part.effect, variation.setting(numbers))
+                rises.append(self.with_parts(parts).fit(solution).objective - solution.objective)
+            deviations[i] = step / np.sqrt(2 * max(float(np.mean(rises)), 1e-3))
+        return deviations
+
+
+def _bend(parts: list[Part], stage: str, records: Records | None, rows: np.ndarray) -> Callable | None:
+    """What all parts of a stage do to the level, one after the other; None where there is none."""
+    parts = [part for part in parts if part.effect.stage == stage]
+    if not parts:
+        return None
+    extras = [None if part.term.extra is None else part.term.extra[rows] for part in parts]
+
+    def bend(level_db: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        slope = np.ones_like(level_db)
+        for part, extra in zip(parts, extras):
+            level_db, own = part.effect.bend(level_db, records, part.setting, extra)
+            slope = slope * own
+        return level_db, slope
+    return bend
+
+
+def add(side: Side, effect: Effect, solution: Solution) -> tuple[Side, Solution] | None:
+    """Find the best setting of an effect on the training links of a side, beside the effects that it has.
+
+    Returns:
+        the side with the effect, and its fit; None where nothing in the residual looks like the effect
+    """
+    best = None
+    for setting in effect.propose(side.view(solution)):
+        tried = side.with_parts([*side.parts, side.part(effect, setting)])
+        fitted = tried.fit()
+        if best is None or fitted.objective < best[1].objective:
+            best = tried, fitted
+    if best is None:
+        return None
+    refined = _refine(*best)
+    return refined
+
+
+def _refine(side: Side, fitted: Solution) -> tuple[Side, Solution]:
+    """Vary the last effect's setting (Nelder and Mead 1965) for a better fit to the training links."""
+    part = side.parts[-1]
+    variation = part.effect.vary(part.setting)
+    if variation is None or not len(variation.values):
+        return side, fitted
+    rows = np.flatnonzero(side.train)
+    rows = rows[:: max(len(rows) // REFINED_ON, 1)]
+    part_records = side.records.select(rows)
+    terms = [p.term for p in side.parts[:-1]]
+    small = replace(
+        side, records=part_records, train=np.ones(len(rows), bool), usable=np.ones(len(rows), bool),
+        base_db=side.base_db[rows], base_columns=side.base_columns[rows], group=side.group[rows],
+        parts=[replace(p, term=Term(t.offset_db[rows], t.columns[rows], t.spread_db, t.names,
+                                      None if t.extra is None else t.extra[rows]))
+               for p, t in zip(side.parts[:-1], terms)])
+
+    def objective(numbers: np.ndarray) -> float:
+        inside = np.clip(numbers, variation.low, variation.high)
+        tried = small.with_parts([*small.parts, small.part(part.effect, variation.setting(inside))])
+        outside = np.abs((numbers - inside) / variation.steps).sum()
+        return tried.fit(fitted).objective + 10.0 * outside
+
+    simplex = np.vstack([variation.values, variation.values + np.diag(variation.steps)])
+    found = minimize(objective, variation.values, method="Nelder-Mead",
+                     options={"initial_simplex": simplex, "maxfev": MOST_TRIALS, "xatol": 1e-2, "fatol": 0.1})
+    setting = variation.setting(np.clip(found.x, variation.low, variation.high))
+    better = side.with_parts([*side.parts[:-1], side.part(part.effect, setting)])
+    solution = better.fit(fitted)
+    return (better, solution) if solution.objective < fitted.objective else (side, fitted)

@@ -1,0 +1,231 @@
+"""Measured links as the loop sees them: numbers only, checked, with everything that a residual may depend on."""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+
+from radiotwin.errors import BadInput
+from radiotwin.measurements import Measurements
+from radiotwin.scene import Scene
+from radiotwin.scene.citymap import CityMap
+
+LEAST_ROWS = 60
+FEW_ROWS = 5
+FAR_M = 100_000.0
+MISSING_HEIGHT_M = 1.5
+
+
+@dataclass(frozen=True, eq=False)
+class Records:
+    """n links.
+
+    Attributes:
+        level_db: (n,) measured gain [dB] or power [dBm]; NaN = not detected.
+        limit_db: the level below which receivers do not detect; None where it is not known.
+        receiver_m: (n, 3) positions [m].
+        device_m: (k, 3) positions of the devices as far as known [m]; NaN where unknown.
+        device, receiver, flight: (n,) index into the names.
+        time_s: (n,) NaN where unknown.
+        heading_deg: (n,) clockwise from north; NaN where unknown.
+        device_names, receiver_names, flight_names: names.
+        frequency_hz: of the radio; NaN where unknown.
+        city: 3D map; None without a scene.
+        is_gain: whether the level is a gain rather than a power.
+        anchors: indices of the devices whose positions are declared.
+        remarks: what was found odd in the file and what was done about it, a sentence each.
+    """
+
+    level_db: np.ndarray
+    limit_db: float | None
+    receiver_m: np.ndarray
+    device_m: np.ndarray
+    device: np.ndarray
+    receiver: np.ndarray
+    flight: np.ndarray
+    time_s: np.ndarray
+    heading_deg: np.ndarray
+    device_names: list[str]
+    receiver_names: list[str]
+    flight_names: list[str]
+    frequency_hz: float
+    city: CityMap | None
+    is_gain: bool
+    anchors: frozenset[int]
+    remarks: list[str] = field(default_factory=list)
+
+    def __len__(self) -> int:
+        return len(self.level_db)
+
+    @cached_property
+    def track(self) -> np.ndarray:
+        """(n,) index of the flight of a receiver that a link was measured on."""
+        return np.unique(self.flight * (self.receiver.max() + 1) + self.receiver, return_inverse=True)[1]
+
+    @cached_property
+    def offset_m(self) -> np.ndarray:
+        """(n, 3) from the device to the receiver [m]"""
+        return self.receiver_m - self.device_m[self.device]
+
+    @cached_property
+    def distance_m(self) -> np.ndarray:
+        """(n,) at least 1 m [m]"""
+        return np.maximum(np.linalg.norm(self.offset_m, axis=1), 1.0)
+
+    @cached_property
+    def azimuth_deg(self) -> np.ndarray:
+        """(n,) direction from the device to the receiver, clockwise from north [deg]"""
+        return np.degrees(np.arctan2(self.offset_m[:, 0], self.offset_m[:, 1])) % 360
+
+    @cached_property
+    def elevation_deg(self) -> np.ndarray:
+        """(n,) angle at the device up to the receiver [deg]"""
+        return np.degrees(np.arcsin(np.clip(self.offset_m[:, 2] / self.distance_m, -1, 1)))
+
+    @cached_property
+    def body_azimuth_deg(self) -> np.ndarray:
+        """(n,) direction from the receiver to the device, clockwise from its heading [deg]; NaN without one"""
+        return (self.azimuth_deg + 180 - self.heading_deg) % 360
+
+    @cached_property
+    def time_in_flight_s(self) -> np.ndarray:
+        """(n,) since the first measurement of the track [s]"""
+        first = np.full(self.track.max() + 1, np.inf)
+        np.minimum.at(first, self.track, np.where(np.isnan(self.time_s), np.inf, self.time_s))
+        return self.time_s - first[self.track]
+
+    @cached_property
+    def first_s(self) -> float:
+        """Time of the first measurement [s]; NaN without times"""
+        return float(np.nanmin(self.time_s)) if np.isfinite(self.time_s).any() else np.nan
+
+    @cached_property
+    def los(self) -> np.ndarray:
+        """(n,) bool; every link has line of sight where there is no map"""
+        if self.city is None:
+            return np.ones(len(self), dtype=bool)
+        return self.city.line_of_sight(self.device_m[self.device], self.receiver_m)
+
+    def select(self, rows: np.ndarray) -> "Records":
+        """The links of a mask or index array."""
+        names = ("level_db", "receiver_m", "device", "receiver", "flight", "time_s", "heading_deg")
+        part = replace(self, **{name: getattr(self, name)[rows] for name in names})
+        for name in ("los", "time_in_flight_s"):  # costly, or not to be had from a part
+            part.__dict__[name] = getattr(self, name)[rows]
+        part.__dict__["first_s"] = self.first_s
+        return part
+
+    def with_devices(self, device_m: np.ndarray) -> "Records":
+        """The same links, devices elsewhere."""
+        return replace(self, device_m=device_m)
+
+    def with_receivers(self, receiver_m: np.ndarray) -> "Records":
+        """The same links, receivers elsewhere."""
+        return replace(self, receiver_m=receiver_m)
+
+    def with_los(self, los: np.ndarray) -> "Records":
+        """The same links, with other lines of sight than the map tells."""
+        other = replace(self)
+        other.__dict__["los"] = los
+        return other
+
+
+def make_records(measurements: Measurements, scene: Scene | None) -> Records:
+    """Prepare measurements: what cannot be used is left out and told.
+
+    Raises:
+        BadInput: nothing that can be used is left.
+    """
+    table = measurements.table.reset_index(drop=True)
+    level_db = measurements.level_db
+    remarks: list[str] = []
+    keep = np.ones(len(table), dtype=bool)
+
+    def leave_out(bad: np.ndarray, why: str) -> None:
+        bad = np.asarray(bad) & keep
+        if bad.any():
+            remarks.append(f"{bad.sum():,} of {len(table):,} links left out: {why}")
+            keep[bad] = False
+
+    receiver_m = measurements.receiver_m
+    leave_out(np.abs(receiver_m[:, :2] - np.median(receiver_m[:, :2], axis=0)).max(axis=1) > FAR_M,
+              f"their receiver is more than {FAR_M / 1000:.0f} km from the others")
+    leave_out(table.duplicated().to_numpy(), "they stand there twice")
+    low_z = np.isnan(receiver_m[:, 2])
+    if low_z.any() and scene is not None:
+        leave_out(low_z, "their receiver's height is empty, and the 3D map needs it")
+    elif low_z.any():
+        remarks.append(f"{low_z.sum():,} receiver heights are empty and taken for {MISSING_HEIGHT_M} m")
+        receiver_m = np.where(np.isnan(receiver_m), MISSING_HEIGHT_M, receiver_m)
+    device_m = np.where(measurements.is_anchor[:, None], measurements.device_m, np.nan)
+    device_m[:, 2] = np.where(np.isnan(measurements.device_m[:, 2]), MISSING_HEIGHT_M, measurements.device_m[:, 2])
+    if scene is None:
+        unknown = np.isnan(device_m).any(axis=1)[measurements.device_index]
+        leave_out(unknown, "without a scene, devices of unknown position cannot be located")
+    for name in sorted(set(table["receiver"])):
+        mine = (table["receiver"] == name).to_numpy()
+        seen = level_db[mine & keep]
+        if (mine & keep).any() and np.isnan(seen).all():
+            leave_out(mine, f"receiver {name} never detected anything")
+        elif len(seen) > FEW_ROWS and np.nanstd(seen) == 0:
+            leave_out(mine, f"receiver {name} always reads {np.nanmin(seen):g}")
+        elif 0 < len(seen) < FEW_ROWS:
+            leave_out(mine, f"receiver {name} has {len(seen)} only")
+    fill_db, share = _fill_value(level_db[keep])
+    if fill_db is not None:
+        at_fill = (level_db == fill_db) & keep
+        level_db = np.where(at_fill, np.nan, level_db)
+        remarks.append(f"{at_fill.sum():,} links read exactly {fill_db:g}, the lowest value, {share:.0%} of all: taken "
+                       "for not detected")
+    if keep.sum() < LEAST_ROWS or np.isfinite(level_db[keep]).sum() < LEAST_ROWS // 2:
+        raise BadInput(f"{int(keep.sum())} links can be used, {int(np.isfinite(level_db[keep]).sum())} of them "
+                       f"detected; at least {LEAST_ROWS} are needed, {LEAST_ROWS // 2} of them detected. "
+                       + "; ".join(remarks))
+    if np.nanstd(level_db[keep]) == 0:
+        raise BadInput(f"all levels are {np.nanmin(level_db[keep]):g}: there is nothing to explain; check the column "
+                       f"{measurements.level_column}")
+    table = table[keep]
+    receiver, receiver_names = pd.factorize(table["receiver"], sort=True)
+    flight, flight_names = pd.factorize(table["flight"])
+    is_gain = measurements.level_column == "gain_db"
+    limit_db = _limit(level_db[keep], scene, is_gain)
+    return Records(
+        level_db[keep], limit_db, receiver_m[keep], device_m, measurements.device_index[keep], receiver, flight,
+        _column(table, "time_s"), _column(table, "heading_deg"), list(measurements.devices["device"]),
+        list(receiver_names), list(flight_names), _frequency(measurements, scene),
+        scene.city if scene else None, is_gain, frozenset(np.flatnonzero(measurements.is_anchor).tolist()), remarks)
+
+
+def _limit(level_db: np.ndarray, scene: Scene | None, is_gain: bool) -> float | None:
+    if scene is not None:
+        return scene.config.gain_limit_db if is_gain else scene.config.radio.sensitivity_dbm
+    # Without a scene nobody declares it; nothing detected lies below the lowest that was.
+    return float(np.nanmin(level_db)) if np.isnan(level_db).any() else None
+
+
+def _frequency(measurements: Measurements, scene: Scene | None) -> float:
+    if scene is not None:
+        return scene.config.radio.frequency_hz
+    if "frequency_hz" in measurements.devices:
+        return float(measurements.devices["frequency_hz"].median())
+    return float("nan")
+
+
+def _column(table: pd.DataFrame, name: str) -> np.ndarray:
+    return table[name].to_numpy(dtype=float) if name in table else np.full(len(table), np.nan)
+
+
+def _fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
+    """The lowest value and its share, where it stands for "not detected": far more often there than a tail would be,
+    and with a gap, or a heap, that no tail has."""
+    seen = level_db[np.isfinite(level_db)]
+    if len(seen) < LEAST_ROWS:
+        return None, 0.0
+    values, counts = np.unique(seen, return_counts=True)
+    if len(values) < 3:
+        return None, 0.0
+    steps = np.diff(values)
+    heap = counts[0] >= 10 and counts[0] > 5 * counts[1:6].max()
+    gap = counts[0] >= 3 and steps[0] > 10 * np.median(steps[:20]) and steps[0] > 3.0
+    return (float(values[0]), counts[0] / len(seen)) if heap or gap else (None, 0.0)

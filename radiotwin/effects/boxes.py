@@ -1,0 +1,121 @@
+"""Boxes that stand in the way of links, and where in a city they would explain what is missing."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+SAMPLES_M = 5.0  # along a link
+CELL_M = 12.5
+HEIGHTS_M = (6.0, 9.0, 12.0, 16.0, 22.0, 30.0, 40.0, 52.0, 66.0, 85.0, 110.0)
+CHUNK = 2000  # links a time: bounds memory
+
+
+class Box(NamedTuple):
+    """An upright box on the ground: centre, sides [m], height [m], and by how much it is turned [deg]."""
+
+    x_m: float
+    y_m: float
+    length_m: float
+    width_m: float
+    height_m: float
+    turn_deg: float
+
+
+class Crossing(NamedTuple):
+    """How n links cross a box; NaN where a link's ground track does not.
+
+    Attributes:
+        inside_m: length of the link within the box; 0 where it passes above.
+        over_m: height of the roof above the link in the middle of the crossing; negative where the link passes above.
+        left_m, right_m: how far the box reaches across the link's track to each side.
+        first_m, second_m: distance along the ground from each end to the middle of the crossing.
+    """
+
+    inside_m: np.ndarray
+    over_m: np.ndarray
+    left_m: np.ndarray
+    right_m: np.ndarray
+    first_m: np.ndarray
+    second_m: np.ndarray
+
+
+def cross(box: Box, a_m: np.ndarray, b_m: np.ndarray) -> Crossing:
+    """How links cross a box.
+
+    Args:
+        a_m, b_m: (n, 3) ends [m].
+    """
+    turn = np.radians(box.turn_deg)
+    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    half = 0.5 * np.array([box.length_m, box.width_m])
+    start, end = ((point[:, :2] - (box.x_m, box.y_m)) @ axes.T for point in (a_m, b_m))
+    step = end - start
+    with np.errstate(divide="ignore", invalid="ignore"):
+        sides = np.stack([(-half - start) / step, (half - start) / step])
+    # A track along an axis: within the box all the way, or never.
+    parallel = np.abs(step) < 1e-9
+    within = np.abs(start) <= half
+    low = np.where(parallel, np.where(within, -np.inf, np.inf), np.nanmin(np.where(parallel, np.inf, sides), axis=0))
+    high = np.where(parallel, np.where(within, np.inf, -np.inf), np.nanmax(np.where(parallel, -np.inf, sides), axis=0))
+    enter, leave = np.clip(low.max(axis=1), 0, 1), np.clip(high.min(axis=1), 0, 1)
+    crosses = (leave > enter) & (low.max(axis=1) < 1) & (high.min(axis=1) > 0)
+    length = np.linalg.norm(b_m - a_m, axis=1)
+    rise = b_m[:, 2] - a_m[:, 2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        under = np.where(np.abs(rise) < 1e-9, np.where(a_m[:, 2] < box.height_m, np.inf, -np.inf),
+                         (box.height_m - a_m[:, 2]) / rise)
+    below = (np.where(rise > 0, np.minimum(leave, under), leave)
+             - np.where(rise < 0, np.maximum(enter, under), enter))
+    below = np.where((np.abs(rise) < 1e-9) & (a_m[:, 2] >= box.height_m), 0.0, below)
+    middle = 0.5 * (enter + leave)
+    track = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
+    unit = step / track[:, None]
+    corners = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * half
+    across = unit[:, 0, None] * (corners[None, :, 1] - start[:, 1, None]) \
+        - unit[:, 1, None] * (corners[None, :, 0] - start[:, 0, None])
+    values = (np.maximum(below, 0) * length, box.height_m - (a_m[:, 2] + middle * rise), across.max(axis=1),
+              -across.min(axis=1), middle * track, (1 - middle) * track)
+    return Crossing(np.where(crosses, values[0], 0.0), *(np.where(crosses, value, np.nan) for value in values[1:]))
+
+
+def back_project(a_m: np.ndarray, b_m: np.ndarray, gain: np.ndarray, ground_m: float = 0.0):
+    """Where a box would cover the links that want one and leave out those that do not.
+
+    Args:
+        a_m, b_m: (n, 3) ends [m].
+        gain: (n,) what is won if the link is crossed [nats]; negative where a box there would be wrong.
+
+    Returns:
+        (m, 2) centres of the cells [m], and (m, heights) the sum over links that pass each cell below each of
+        `HEIGHTS_M`
+    """
+    low = np.floor(np.minimum(a_m, b_m)[:, :2].min(axis=0) / CELL_M).astype(int)
+    shape = np.ceil(np.maximum(a_m, b_m)[:, :2].max(axis=0) / CELL_M).astype(int) - low + 1
+    total = np.zeros((len(HEIGHTS_M), shape[0] * shape[1]))
+    for first in range(0, len(a_m), CHUNK):
+        part = slice(first, first + CHUNK)
+        longest = np.linalg.norm((b_m - a_m)[part, :2], axis=1).max(initial=1.0)
+        share = np.linspace(0, 1, max(int(longest / SAMPLES_M), 2))
+        points = a_m[part, None] + share[:, None] * (b_m - a_m)[part, None]
+        cell = np.floor(points[..., :2] / CELL_M).astype(int) - low
+        flat = cell[..., 0] * shape[1] + cell[..., 1]
+        link = np.broadcast_to(np.arange(len(points))[:, None], flat.shape)
+        # Of each link and cell the lowest point.
+        key = (link * total.shape[1] + flat).ravel()
+        order = np.lexsort((points[..., 2].ravel(), key))
+        lowest = order[np.r_[True, np.diff(key[order]) > 0]]
+        height, cells = points[..., 2].ravel()[lowest] - ground_m, flat.ravel()[lowest]
+        value = gain[part][link.ravel()[lowest]]
+        for row, top in enumerate(HEIGHTS_M):
+            under = height < top
+            total[row] += np.bincount(cells[under], weights=value[under], minlength=total.shape[1])
+    centres = (np.stack(np.unravel_index(np.arange(total.shape[1]), shape), axis=1) + low + 0.5) * CELL_M
+    return centres, total.T
+
+
+def knife_edge_db(height_m: np.ndarray, first_m: np.ndarray, second_m: np.ndarray, wavelength_m: float) -> np.ndarray:
+    """Loss over an edge that reaches `height_m` above the straight line (ITU-R P.526-15, Eq. 26 and 31) [dB]."""
+    near, far = np.maximum(first_m, 1.0), np.maximum(second_m, 1.0)
+    nu = height_m * np.sqrt(2 * (near + far) / (wavelength_m * near * far))
+    shifted = np.maximum(nu, -0.78) - 0.1
+    return np.where(nu > -0.78, 6.9 + 20 * np.log10(np.sqrt(shifted**2 + 1) + shifted), 0.0)

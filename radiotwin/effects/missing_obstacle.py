@@ -1,0 +1,79 @@
+"""A building that no map shows.
+
+Found by back-projecting the loss along the links' rays; then a box is fitted. Loss behind it: what comes over the roof
+and round both sides (knife edges of ITU-R P.526), and what reaches any shadow by reflections (the base's own level
+without line of sight), added as powers.
+"""
+
+import numpy as np
+
+from radiotwin.effects.base import Effect, Parameter, Term, Variation, View
+from radiotwin.effects.boxes import CELL_M, HEIGHTS_M, Box, back_project, cross, knife_edge_db
+
+LIGHT_M_S = 299_792_458.0
+LEAST_NATS = 6.0
+TYPICAL_LOSS_DB = 15.0
+STARTS = 3
+NAMES = ("x_m", "y_m", "length_m", "width_m", "height_m", "turn_deg")
+MOST_BLANK_DB = 25.0
+
+
+class MissingObstacle(Effect):
+    """A box; one step finds one."""
+
+    name = "missing_obstacle"
+    repeatable = True
+    confused_with = ("foliage", "antenna_pattern", "device_position_error")
+
+    def lacks(self, records) -> str | None:
+        if not np.isfinite(records.frequency_hz):
+            return "the frequency is not known; give frequency_hz in devices.csv"
+        return None
+
+    def propose(self, view: View) -> list[dict]:
+        records = view.records
+        rows = np.flatnonzero(records.los)
+        residual_db, weight = view.residual_db[rows], view.weight[rows]
+        # How much better a link is explained by a typical loss; by more where it lacks more.
+        loss_db = np.clip(-residual_db, TYPICAL_LOSS_DB, 2 * TYPICAL_LOSS_DB)
+        gain = 0.5 * weight * (residual_db**2 - (residual_db + loss_db) ** 2)
+        centres, total = back_project(records.device_m[records.device[rows]], records.receiver_m[rows], gain)
+        found = []
+        for place in np.argsort(-total.max(axis=1))[:STARTS]:
+            best = int(total[place].argmax())
+            if total[place, best] > LEAST_NATS:
+                found.append({"box": [*map(float, centres[place]), 1.5 * CELL_M, 1.5 * CELL_M, HEIGHTS_M[best], 0.0]})
+        return found
+
+    def term(self, records, setting, at) -> Term:
+        box = Box(*setting["box"])
+        offset_db = np.zeros(len(records))
+        rows = np.flatnonzero(records.los)
+        crossing = cross(box, records.device_m[records.device[rows]], records.receiver_m[rows])
+        hit = np.isfinite(crossing.over_m)
+        if not hit.any():
+            return Term.of_offset(offset_db)
+        rows = rows[hit]
+        over_m, left_m, right_m, first_m, second_m = (value[hit] for value in crossing[1:])
+        wavelength_m = LIGHT_M_S / records.frequency_hz
+        mine = records.select(rows)
+        scattered_db = at(mine.with_los(np.zeros(len(rows), bool))) - at(mine)
+        power = 10 ** (np.minimum(scattered_db, 0) / 10) if records.city is not None else 0.0
+        over_db = knife_edge_db(over_m, first_m, second_m, wavelength_m)
+        for side_m in (left_m, right_m):
+            power = power + 10 ** (-knife_edge_db(side_m, first_m, second_m, wavelength_m) / 10)
+        # A link that passes above the roof has its own strength, and what comes round the sides does not add to it.
+        power = np.where(over_m > 0, power, 0.0) + 10 ** (-over_db / 10)
+        offset_db[rows] = np.maximum(10 * np.log10(np.minimum(power, 1.0)), -2 * MOST_BLANK_DB)
+        return Term.of_offset(offset_db)
+
+    def vary(self, setting) -> Variation:
+        x_m, y_m = setting["box"][:2]
+        return Variation(np.array(setting["box"]), np.array([6.0, 6.0, 8.0, 8.0, 8.0, 20.0]),
+                         np.array([x_m - 60, y_m - 60, 4.0, 4.0, 3.0, -90.0]),
+                         np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0]),
+                         lambda numbers: {"box": [float(v) for v in numbers]})
+
+    def parameters(self, records, setting, found) -> dict[str, Parameter]:
+        return {name: Parameter.normal(value, spread, "deg" if name == "turn_deg" else "m")
+                for name, value, spread in zip(NAMES, setting["box"], found.setting_deviations)}

@@ -1,0 +1,65 @@
+"""Readings that hold the receiver's own noise, too: near the floor they stop falling with distance.
+
+Powers of signal and noise add: reading = 10 log10(10^(signal / 10) + 10^(floor / 10)). Readings such as RSSI hold both;
+those of a known reference signal do not (ITU-R SM.1753, 'Methods for measurements of radio noise').
+"""
+
+import numpy as np
+
+from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured
+
+LEAST_LINKS = 40
+QUANTILES = (0.01, 0.05, 0.1, 0.2, 0.35, 0.5)
+
+
+class NoiseFloor(Effect):
+    """A floor for each receiver."""
+
+    name = "noise_floor_censoring"
+    stage = "receiver"
+    confused_with = ("interference", "excess_attenuation")
+
+    def propose(self, view: View) -> list[dict]:
+        records, found = view.records, {}
+        seen = np.isfinite(records.level_db)
+        for receiver in measured(records.receiver[seen], LEAST_LINKS):
+            rows = seen & (records.receiver == receiver)
+            mean, residual, weight = view.mean_db[rows], view.residual_db[rows], view.weight[rows]
+            found[str(receiver)] = max(
+                (-float(weight @ (residual + mean - _floored(mean, floor)[0]) ** 2), float(floor))
+                for floor in np.quantile(records.level_db[rows], QUANTILES))[1]
+        return [{"receivers": found}] if found else []
+
+    def term(self, records, setting, at) -> Term:
+        return Term.of_offset(np.zeros(len(records)))
+
+    def bend(self, level_db, records, setting, extra):
+        floor = np.full(len(records.receiver_names), -np.inf)
+        for receiver, floor_db in setting["receivers"].items():
+            floor[int(receiver)] = floor_db
+        return _floored(level_db, floor[records.receiver])
+
+    def vary(self, setting) -> Variation | None:
+        if len(setting["receivers"]) > 8:
+            return None
+        receivers = list(setting["receivers"])
+
+        def again(numbers: np.ndarray) -> dict:
+            return {"receivers": dict(zip(receivers, map(float, numbers)))}
+        times = len(receivers)
+        return Variation(np.array(list(setting["receivers"].values())), np.full(times, 2.0), np.full(times, -250.0),
+                         np.full(times, 50.0), again)
+
+    def parameters(self, records, setting, found) -> dict[str, Parameter]:
+        spreads = found.setting_deviations
+        if not len(spreads):  # too many to be varied
+            spreads = np.full(len(setting["receivers"]), np.nan)
+        return {f"floor[{records.receiver_names[int(receiver)]}]": Parameter.normal(floor, spread,
+                                                                                    "dB" if records.is_gain else "dBm")
+                for (receiver, floor), spread in zip(setting["receivers"].items(), spreads)}
+
+
+def _floored(level_db, floor_db):
+    """What is read, and the slope of it."""
+    read = np.logaddexp(level_db * np.log(10) / 10, floor_db * np.log(10) / 10) * 10 / np.log(10)
+    return read, 10 ** ((level_db - read) / 10)

@@ -1,0 +1,126 @@
+"""Ends of links that are not where they are declared to be: an anchor, or a receiver.
+
+No law of its own: the base model is asked again with the end elsewhere, lines of sight included.
+"""
+
+import numpy as np
+
+from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured
+
+LEAST_LINKS = 60
+LEAST_NATS = 6.0
+RADII_M = (8.0, 15.0, 25.0, 40.0, 60.0, 85.0)
+DIRECTIONS = 12
+FARTHEST_M = 120.0
+MOST_DEVICES = 60
+RECEIVER_OFFSETS_M = (5.0, 10.0, 20.0)
+ENOUGH_LINKS = 600  # of a device, for a first look
+
+
+class DevicePositionError(Effect):
+    """An anchor stands elsewhere; one step finds one anchor, the worst."""
+
+    name = "device_position_error"
+    repeatable = True
+    confused_with = ("removed_obstacle", "missing_obstacle", "antenna_pattern", "device_gain_offset")
+
+    def lacks(self, records) -> str | None:
+        devices = _anchors(records)
+        if not devices:
+            return f"no anchor has {LEAST_LINKS} links"
+        if len(devices) > MOST_DEVICES:
+            return f"{len(devices)} devices are too many to move each about; at most {MOST_DEVICES}"
+        return None
+
+    def propose(self, view: View) -> list[dict]:
+        records, best = view.records, (LEAST_NATS, None)
+        moves = [(radius * np.sin(angle), radius * np.cos(angle)) for radius in RADII_M
+                 for angle in np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS]
+        for device in _anchors(records):
+            rows = np.flatnonzero(records.device == device)
+            rows = rows[:: max(len(rows) // ENOUGH_LINKS, 1)]
+            mine, share = records.select(rows), (records.device == device).sum() / len(rows)
+            before_db = view.at(mine)
+            squares = view.weight[rows] @ view.residual_db[rows] ** 2
+            for east, north in moves:
+                moved_db = view.at(_with_moved(mine, device, (east, north))) - before_db
+                nats = 0.5 * share * (squares - view.weight[rows] @ (view.residual_db[rows] - moved_db) ** 2)
+                if nats > best[0]:
+                    best = nats, {"device": device, "move_m": [float(east), float(north)]}
+        return [best[1]] if best[1] else []
+
+    def term(self, records, setting, at) -> Term:
+        offset_db = np.zeros(len(records))
+        rows = np.flatnonzero(records.device == setting["device"])
+        mine = records.select(rows)
+        offset_db[rows] = at(_with_moved(mine, setting["device"], setting["move_m"])) - at(mine)
+        return Term.of_offset(offset_db)
+
+    def vary(self, setting) -> Variation:
+        return Variation(np.array(setting["move_m"]), np.full(2, 6.0), np.full(2, -FARTHEST_M), np.full(2, FARTHEST_M),
+                         lambda numbers: setting | {"move_m": [float(v) for v in numbers]})
+
+    def parameters(self, records, setting, found) -> dict[str, Parameter]:
+        name = records.device_names[setting["device"]]
+        declared_m = records.device_m[setting["device"], :2]
+        return {f"{axis}_m[{name}]": Parameter.normal(declared + move, spread, "m") for axis, declared, move, spread in
+                zip("xy", declared_m, setting["move_m"], found.setting_deviations)}
+
+
+class ReceiverPositionError(Effect):
+    """All positions of a receiver are off by a constant; one step finds one receiver, the worst."""
+
+    name = "receiver_position_error"
+    repeatable = True
+    confused_with = ("receiver_gain_offset",)
+
+    def lacks(self, records) -> str | None:
+        receivers = measured(records.receiver, LEAST_LINKS)
+        if len(receivers) > MOST_DEVICES:
+            return f"{len(receivers)} receivers are too many to move each about; at most {MOST_DEVICES}"
+        return None if receivers else f"no receiver has {LEAST_LINKS} links"
+
+    def propose(self, view: View) -> list[dict]:
+        records, best = view.records, (LEAST_NATS, None)
+        axes = [(1, 0, 0), (0, 1, 0), (0.7, 0.7, 0), (0.7, -0.7, 0), (0, 0, 1)]
+        moves = [sign * size * np.array(axis) for axis in axes for size in RECEIVER_OFFSETS_M for sign in (-1, 1)]
+        for receiver in measured(records.receiver, LEAST_LINKS):
+            rows = np.flatnonzero(records.receiver == receiver)
+            rows = rows[:: max(len(rows) // ENOUGH_LINKS, 1)]
+            mine, share = records.select(rows), (records.receiver == receiver).sum() / len(rows)
+            before_db = view.at(mine)
+            weight, residual_db = view.weight[rows], view.residual_db[rows]
+            squares = weight @ residual_db**2
+            for move in moves:
+                moved_db = view.at(mine.with_receivers(mine.receiver_m + move)) - before_db
+                nats = 0.5 * share * (squares - weight @ (residual_db - moved_db) ** 2)
+                if nats > best[0]:
+                    best = nats, {"receiver": receiver, "move_m": [float(v) for v in move]}
+        return [best[1]] if best[1] else []
+
+    def term(self, records, setting, at) -> Term:
+        offset_db = np.zeros(len(records))
+        rows = np.flatnonzero(records.receiver == setting["receiver"])
+        mine = records.select(rows)
+        offset_db[rows] = at(mine.with_receivers(mine.receiver_m + np.array(setting["move_m"]))) - at(mine)
+        return Term.of_offset(offset_db)
+
+    def vary(self, setting) -> Variation:
+        return Variation(np.array(setting["move_m"]), np.full(3, 3.0), np.full(3, -60.0), np.full(3, 60.0),
+                         lambda numbers: setting | {"move_m": [float(v) for v in numbers]})
+
+    def parameters(self, records, setting, found) -> dict[str, Parameter]:
+        name = records.receiver_names[setting["receiver"]]
+        return {f"true_minus_given_{axis}_m[{name}]": Parameter.normal(move, spread, "m")
+                for axis, move, spread in zip("xyz", setting["move_m"], found.setting_deviations)}
+
+
+def _anchors(records) -> list[int]:
+    """Devices with enough links; those that were located from these very measurements stand where they fit best."""
+    return [device for device in measured(records.device, LEAST_LINKS) if device in records.anchors]
+
+
+def _with_moved(records, device: int, move_m):
+    device_m = records.device_m.copy()
+    device_m[device, :2] += move_m
+    return records.with_devices(device_m)

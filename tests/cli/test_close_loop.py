@@ -1,0 +1,55 @@
+"""`radiotwin close-loop` as a user runs it, on a file and nothing else."""
+
+import json
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+
+
+def write(folder, offset_db=0.0, seed=0):
+    """A survey over open ground of which one receiver reads `offset_db` too much."""
+    rng = np.random.default_rng(seed)
+    device_m = rng.uniform(0, 400, (4, 2))
+    rows = []
+    for flight in range(4):
+        for receiver in range(2):
+            place_m = np.cumsum(rng.normal(0, 12, (40, 2)), axis=0) + 200
+            for slot, (x, y) in enumerate(place_m):
+                for device, (east, north) in enumerate(device_m):
+                    distance_m = np.sqrt((x - east) ** 2 + (y - north) ** 2 + 50**2)
+                    gain_db = -38 - 22 * np.log10(distance_m) + rng.normal(0, 2) + offset_db * receiver
+                    rows.append((flight * 100 + slot, f"f{flight}", f"r{receiver}", x, y, 51.5, f"d{device}", gain_db))
+    names = ["time_s", "flight", "receiver", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device", "gain_db"]
+    pd.DataFrame(rows, columns=names).to_csv(folder / "measurements.csv", index=False)
+    pd.DataFrame({"device": [f"d{i}" for i in range(4)], "x_m": device_m[:, 0], "y_m": device_m[:, 1], "z_m": 1.5,
+                  "role": "anchor"}).to_csv(folder / "devices.csv", index=False)
+
+
+def test_a_file_and_a_table_of_devices_are_enough(run, tmp_path):
+    write(tmp_path, offset_db=6.0)
+    done = run("close-loop measurements.csv --out result", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "receiver_gain_offset" in done.stdout and "closeloop.html" in done.stdout
+    report = json.loads((tmp_path / "result" / "closeloop.json").read_text())
+    assert report["schema"] == "radiotwin.closeloop/1" and report["verdict"] == "effect"
+    assert report["effects"][0]["name"] == "receiver_gain_offset"
+    assert report["error"]["after"]["rmse_db"] < 0.8 * report["error"]["before"]["rmse_db"]
+    reasons = {candidate["name"]: candidate["reason"] for candidate in report["candidates"]}
+    assert "heading" in reasons["body_shadowing"] and "frequency" in reasons["missing_obstacle"]
+    page = (tmp_path / "result" / "closeloop.html").read_text()
+    assert page.count("data:image/png;base64,") == 3 and "receiver_gain_offset" in page
+    assert not re.search(r'(?:src|href)="(?!data:)', page)  # nothing from a network
+
+
+@pytest.mark.parametrize("words, parts", [
+    ("--base oracle", ["oracle", "twin, raytrace, log-distance"]),
+    ("--base raytrace", ["raytrace", "--scene"]),
+    ("--scene nowhere", ["nowhere"])])
+def test_bad_input_is_one_message(run, tmp_path, words, parts):
+    write(tmp_path)
+    done = run(f"close-loop measurements.csv --out result {words}", tmp_path)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert all(part in done.stderr for part in parts), done.stderr
+    assert not (tmp_path / "result").exists()

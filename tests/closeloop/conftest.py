@@ -1,0 +1,58 @@
+"""Measurements without a scene, made by plain formulas of these tests' own."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.measurements import Measurements
+
+FLIGHTS, SLOTS, RECEIVERS, DEVICES = 6, 60, 2, 5
+
+
+def fly(seed, noise_db=2.0, limit_db=-110.0):
+    """A table of links over open ground, gain = -35 - 26 log10(d) + noise, and arrays to change it with."""
+    rng = np.random.default_rng(seed)
+    device_m = np.column_stack([rng.uniform(0, 500, (DEVICES, 2)), np.full(DEVICES, 1.5)])
+    rows = []
+    for flight in range(FLIGHTS):
+        for receiver in range(RECEIVERS):
+            place_m, heading = rng.uniform(100, 400, 2), rng.uniform(0, 2 * np.pi)
+            for slot in range(SLOTS):
+                heading += rng.normal(0, 0.25)
+                if np.abs(place_m - 250).max() > 240:
+                    heading = np.arctan2(*(250 - place_m))
+                place_m = place_m + 10 * np.array([np.sin(heading), np.cos(heading)])
+                rows += [(flight, receiver, device, 200.0 * flight + slot, slot, *place_m, 50.0 + 10 * receiver,
+                          np.degrees(heading) % 360) for device in range(DEVICES)]
+    flight, receiver, device, time_s, slot, x, y, z, heading_deg = np.array(rows).T
+    flight, receiver, device = (value.astype(int) for value in (flight, receiver, device))
+    receiver_m = np.column_stack([x, y, z])
+    offset_m = receiver_m - device_m[device]
+    distance_m = np.linalg.norm(offset_m, axis=1)
+    gain_db = -35 - 26 * np.log10(distance_m) + rng.normal(0, noise_db, len(rows))
+    return SimpleNamespace(
+        flight=flight, receiver=receiver, device=device, time_s=time_s, slot=slot, receiver_m=receiver_m,
+        device_m=device_m, heading_deg=heading_deg, offset_m=offset_m, distance_m=distance_m, gain_db=gain_db,
+        limit_db=limit_db)
+
+
+def measured(world, **columns):
+    """What a user would have of it."""
+    gain_db = np.where(world.gain_db < world.limit_db, np.nan, world.gain_db)
+    table = pd.DataFrame({
+        "time_s": world.time_s, "flight": [f"f{i}" for i in world.flight],
+        "receiver": [f"r{i}" for i in world.receiver],
+        **{f"receiver_{axis}_m": world.receiver_m[:, i] for i, axis in enumerate("xyz")},
+        "device": [f"d{i}" for i in world.device], "gain_db": gain_db, "heading_deg": world.heading_deg} | columns)
+    devices = pd.DataFrame({"device": [f"d{i}" for i in range(DEVICES)], "x_m": world.device_m[:, 0],
+                            "y_m": world.device_m[:, 1], "z_m": world.device_m[:, 2], "role": "anchor",
+                            "frequency_hz": 2.4e9})
+    return Measurements(table, devices)
+
+
+@pytest.fixture
+def open_ground():
+    """The generator, and what makes measurements of what it made."""
+    return SimpleNamespace(fly=fly, measured=measured)

@@ -1,0 +1,81 @@
+"""What is left out of a file, and that it is told."""
+
+import numpy as np
+import pytest
+
+from radiotwin.closeloop.folds import evidence_blocks, make_folds
+from radiotwin.closeloop.records import make_records
+from radiotwin.errors import BadInput
+
+
+def test_what_cannot_be_used_is_left_out_and_told(open_ground):
+    measurements = open_ground.measured(open_ground.fly(0, limit_db=-500.0))
+    table = measurements.table
+    n = len(table)
+    table.loc[0, "receiver_x_m"] = 5.9e6
+    table.loc[1] = table.loc[2]
+    table.loc[3:5, "receiver"] = "broken"
+    table.loc[6:40, "receiver"] = "dead"
+    table.loc[6:40, "gain_db"] = np.nan
+    table.loc[41:60, "receiver"] = "stuck"
+    table.loc[41:60, "gain_db"] = -77.0
+    records = make_records(measurements, None)
+    assert len(records) == n - 1 - 1 - 3 - 35 - 20 and records.receiver_names == ["r0", "r1"]
+    told = " ".join(records.remarks)
+    for part in ("more than 100 km", "twice", "broken has 3 only", "dead never detected", "stuck always reads -77"):
+        assert part in told, part
+
+
+def test_a_value_that_stands_for_not_detected_becomes_blank(open_ground):
+    world = open_ground.fly(1)
+    measurements = open_ground.measured(world)
+    blank = measurements.table["gain_db"].isna()
+    lowest = measurements.table["gain_db"].nsmallest(300).index
+    measurements.table.loc[blank, "gain_db"] = -140.0
+    measurements.table.loc[lowest, "gain_db"] = -140.0
+    records = make_records(measurements, None)
+    assert np.isnan(records.level_db).sum() == blank.sum() + 300 and "-140" in " ".join(records.remarks)
+    assert make_records(open_ground.measured(world), None).remarks == []  # an ordinary tail stays
+
+
+def test_directions_are_compass_bearings(open_ground):
+    world = open_ground.fly(2)
+    records = make_records(open_ground.measured(world), None)
+    east, north = records.offset_m[:, 0], records.offset_m[:, 1]
+    rows = (np.abs(east) < 30) & (north > 100)
+    assert rows.any() and (np.abs((records.azimuth_deg[rows] + 180) % 360 - 180) < 20).all()
+    # A receiver that flies straight away from the device has it behind itself.
+    away = np.abs((records.heading_deg - records.azimuth_deg + 180) % 360 - 180) < 5
+    assert away.any() and (np.abs(records.body_azimuth_deg[away] - 180) < 5.01).all()
+
+
+def test_flights_are_held_out_where_they_are_alike_and_places_where_not(open_ground):
+    world = open_ground.fly(3)
+    records = make_records(open_ground.measured(world), None)
+    folds = make_folds(records, 0)
+    assert folds.by == "flight"
+    for flight in range(6):
+        assert len(np.unique(folds.index[records.flight == flight])) == 1
+    walks = [f"{device}-{receiver}" for device, receiver in zip(world.device, world.receiver)]
+    one = make_records(open_ground.measured(world, flight=walks), None)
+    folds = make_folds(one, 0)
+    assert folds.by == "block" and folds.count == 6
+    cell = np.floor(one.receiver_m[:, :2] / 60).astype(int)
+    for place in np.unique(cell, axis=0)[:40]:
+        assert len(np.unique(folds.index[(cell == place).all(axis=1)])) == 1
+    sizes = np.bincount(folds.index)
+    assert sizes.max() < 1.3 * sizes.min()
+
+
+def test_a_piece_of_evidence_is_of_one_device_receiver_and_flight(open_ground):
+    records = make_records(open_ground.measured(open_ground.fly(4)), None)
+    block = evidence_blocks(records)
+    for index in (records.device, records.receiver, records.flight):
+        pairs = np.unique(np.column_stack([block, index]), axis=0)
+        assert len(pairs) == block.max() + 1
+
+
+def test_too_little_is_refused(open_ground):
+    measurements = open_ground.measured(open_ground.fly(5))
+    with pytest.raises(BadInput, match="at least 60 are needed"):
+        make_records(measurements.select(np.arange(len(measurements.table)) < 40), None)

@@ -1,0 +1,111 @@
+"""The regression against data drawn from its own assumptions, and against closed forms."""
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.stats import norm
+from scipy.stats import t as student
+
+from radiotwin.closeloop.regression import Problem, covariance, mean_db, nll, residual_db, solve
+
+
+def problem(level_db, columns, limit_db=-np.inf, dof=5.0, split=1, paths=None, receiver=None, spread=np.inf):
+    n, p = columns.shape
+    return Problem(level_db, np.full(n, limit_db), np.zeros(n), columns[:, :split], paths, np.zeros(n),
+                   columns[:, split:], np.full(p, spread), np.zeros(n, int), receiver, dof)
+
+
+def draw(seed, dof=5.0, n=4000, scale=3.0):
+    rng = np.random.default_rng(seed)
+    columns = np.column_stack([np.ones(n), rng.normal(size=(n, 2))])
+    truth = np.array([-80.0, 5.0, -4.0])
+    return columns, truth, columns @ truth + scale * rng.standard_t(dof, n)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("blank_share", [0.0, 0.2, 0.5])
+def test_coefficients_and_scale_are_found_also_where_many_levels_are_blank(seed, blank_share):
+    columns, truth, level_db = draw(seed)
+    limit_db = np.quantile(level_db, blank_share) if blank_share else -np.inf
+    given = problem(np.where(level_db < limit_db, np.nan, level_db), columns, limit_db)
+    found = solve(given)
+    deviation = np.sqrt(np.diag(covariance(given, found)))
+    assert (np.abs(found.coefficients - truth) < 4.5 * deviation).all() and deviation.max() < 0.2
+    assert found.scale_db[0] == pytest.approx(3.0, rel=0.08)
+
+
+def test_the_solution_is_the_maximum_of_the_likelihood_written_with_scipy():
+    columns, _, level_db = draw(0, n=400)
+    limit_db = np.quantile(level_db, 0.3)
+    blank = level_db < limit_db
+    given = problem(np.where(blank, np.nan, level_db), columns, limit_db)
+    found = solve(given)
+
+    def objective(theta):
+        mean, scale = columns @ theta[:3], np.exp(theta[3])
+        return -(student.logpdf((level_db - mean) / scale, 5)[~blank] - np.log(scale)).sum() \
+            - student.logcdf((limit_db - mean) / scale, 5)[blank].sum()
+
+    best = minimize(objective, np.r_[found.coefficients, np.log(found.scale_db)], method="BFGS")
+    assert objective(np.r_[found.coefficients, np.log(found.scale_db)]) == pytest.approx(best.fun, abs=0.05)
+    assert nll(given, found).sum() == pytest.approx(best.fun, abs=0.05)
+
+
+def test_outliers_do_not_bend_it():
+    columns, truth, level_db = draw(1, dof=50.0)
+    level_db[:200] += 60
+    found = solve(problem(level_db, columns, dof=3.0))
+    assert np.abs(found.coefficients - truth).max() < 0.4
+    plain = np.linalg.lstsq(columns, level_db, rcond=None)[0]
+    assert abs(plain[0] - truth[0]) > 2
+
+
+def test_a_narrow_prior_holds_a_coefficient_back():
+    columns, _, level_db = draw(2, n=50)
+    free, held = solve(problem(level_db, columns)), solve(problem(level_db, columns, spread=0.01))
+    assert np.abs(held.coefficients).max() < 0.1 < np.abs(free.coefficients).max()
+
+
+def test_a_blank_without_a_limit_tells_nothing():
+    columns, _, level_db = draw(3)
+    blank = np.arange(len(level_db)) % 3 == 0
+    with_blanks = solve(problem(np.where(blank, np.nan, level_db), columns))
+    without = solve(problem(level_db[~blank], columns[~blank]))
+    np.testing.assert_allclose(with_blanks.coefficients, without.coefficients, atol=0.02)
+
+
+def test_what_paths_add_and_receivers_compress_is_undone():
+    columns, truth, _ = draw(4, n=6000)
+    rng = np.random.default_rng(4)
+    added = 10 ** (rng.uniform(-95, -70, 6000) / 10)
+    law = 10 ** ((columns[:, 0] * truth[0] + columns[:, 1] * truth[1]) / 10)
+    arriving = 10 * np.log10(law + added) + truth[2] * columns[:, 2]
+    level_db = np.where(arriving > -72, -72 + 0.5 * (arriving + 72), arriving) + rng.normal(0, 0.5, 6000)
+
+    def paths(mean):
+        total = 10 * np.log10(10 ** (mean / 10) + added)
+        return total, 10 ** ((mean - total) / 10)
+
+    def receiver(mean):
+        strong = mean > -72
+        return np.where(strong, -72 + 0.5 * (mean + 72), mean), np.where(strong, 0.5, 1.0)
+
+    given = problem(level_db, columns, split=2, paths=paths, receiver=receiver, dof=30.0)
+    found = solve(given)
+    np.testing.assert_allclose(found.coefficients, truth, atol=0.15)
+    assert np.sqrt(np.mean(residual_db(given, found) ** 2)) == pytest.approx(0.5, rel=0.1)
+    step = np.zeros(3)
+    for i in range(3):  # the derivative against differences
+        step[:] = 0
+        step[i] = 1e-4
+        slope = (given.mean(found.coefficients + step)[0] - given.mean(found.coefficients - step)[0]) / 2e-4
+        smooth = np.abs(mean_db(given, found) + 72) > 0.01
+        np.testing.assert_allclose(given.mean(found.coefficients)[1][smooth, i], slope[smooth], atol=1e-4)
+
+
+def test_with_many_degrees_of_freedom_the_errors_are_normal():
+    given = problem(np.array([-80.0, np.nan]), np.ones((2, 1)), -90.0, dof=1e6)
+    fixed = type(solve(problem(np.full(20, -81.0) + np.arange(20) % 2, np.ones((20, 1)))))(
+        np.array([-84.0]), np.array([4.0]), 0.0)
+    expected = [-norm.logpdf(-80, -84, 4), -norm.logcdf(-90, -84, 4)]
+    np.testing.assert_allclose(nll(given, fixed), expected, atol=1e-4)

@@ -1,0 +1,107 @@
+"""The loop on worlds without a map that were made by other formulas: the hidden effect is named and the error falls."""
+
+import numpy as np
+import pytest
+
+from radiotwin.closeloop.report import make_report
+from radiotwin.closeloop.run import close_loop
+from radiotwin.errors import BadInput
+
+
+def run(measurements, seed=0):
+    loop = close_loop(measurements, None, "log-distance", seed, lambda text: None)
+    return make_report(loop)
+
+
+def named(report):
+    return [effect["name"] for effect in report["effects"]]
+
+
+def value(report, name, parameter):
+    effect = next(effect for effect in report["effects"] if effect["name"] == name)
+    return effect["parameters"][parameter]["value"]
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_where_nothing_is_missing_nothing_is_named(open_ground, seed):
+    report = run(open_ground.measured(open_ground.fly(seed)))
+    assert report["verdict"] == "none" and not report["effects"] and not report["remaining"]["structured"]
+    assert report["error"]["before"]["rmse_db"] == pytest.approx(2.0, rel=0.06)
+    assert report["error"]["before"] == report["error"]["after"]
+
+
+def test_a_receiver_that_reads_too_much_is_named_and_measured(open_ground):
+    world = open_ground.fly(2)
+    world.gain_db[world.receiver == 1] += 5.0
+    report = run(open_ground.measured(world))
+    assert named(report) == ["receiver_gain_offset"]
+    difference = value(report, "receiver_gain_offset", "offset_db[r1]") - \
+        value(report, "receiver_gain_offset", "offset_db[r0]")
+    assert difference == pytest.approx(5.0, abs=0.5)
+    assert report["error"]["after"]["rmse_db"] < 1.05 * 2.0 < report["error"]["before"]["rmse_db"]
+
+
+def test_a_receiver_that_warms_up_is_named_and_not_an_offset(open_ground):
+    world = open_ground.fly(3)
+    mine = world.receiver == 0
+    world.gain_db[mine] += 7.0 * 0.5 ** (world.slot[mine] / 10.0)
+    report = run(open_ground.measured(world))
+    assert named(report)[0] == "receiver_drift"
+    assert value(report, "receiver_drift", "warm_up_each_flight_db[r0]") == pytest.approx(7.0, abs=1.5)
+
+
+def test_a_step_in_time_is_found_where_it_is(open_ground):
+    world = open_ground.fly(4)
+    world.gain_db[(world.receiver == 1) & (world.time_s > 530)] -= 6.0
+    report = run(open_ground.measured(world))
+    assert named(report)[0] == "receiver_drift"
+    assert value(report, "receiver_drift", "step_db[r1]") == pytest.approx(-6.0, abs=1.0)
+
+
+def test_a_sector_antenna_is_named_and_its_direction_found(open_ground):
+    world = open_ground.fly(5)
+    mine = world.device == np.abs(world.device_m[:, :2] - 250).max(axis=1).argmin()  # seen from all sides
+    device = world.device[mine][0]
+    azimuth_deg = np.degrees(np.arctan2(world.offset_m[:, 0], world.offset_m[:, 1]))
+    # A cardioid, which is not the pattern that is fitted.
+    world.gain_db[mine] += 20 * np.log10(0.08 + 0.46 * (1 + np.cos(np.radians(azimuth_deg[mine] - 70))))
+    report = run(open_ground.measured(world))
+    assert named(report)[0] == "antenna_pattern"
+    found = value(report, "antenna_pattern", f"azimuth_deg[d{device}]")
+    assert abs((found - 70 + 180) % 360 - 180) < 20
+
+
+def test_an_anchor_that_stands_elsewhere_is_found(open_ground):
+    world = open_ground.fly(6)
+    measurements = open_ground.measured(world)
+    measurements.devices.loc[1, "x_m"] += 45.0  # declared wrongly
+    report = run(measurements)
+    assert named(report)[0] == "device_position_error"
+    assert value(report, "device_position_error", "x_m[d1]") == pytest.approx(world.device_m[1, 0], abs=10)
+    assert value(report, "device_position_error", "y_m[d1]") == pytest.approx(world.device_m[1, 1], abs=10)
+
+
+def test_what_no_effect_explains_is_called_unexplained_and_its_driver_named(open_ground):
+    world = open_ground.fly(7)
+    world.gain_db += 3.0 * np.sign(np.sin(2 * np.pi * world.receiver_m[:, 0] / 160)
+                                   * np.sin(2 * np.pi * world.receiver_m[:, 1] / 160))
+    report = run(open_ground.measured(world))
+    assert report["verdict"] == "unexplained" and not report["effects"]
+    assert "place_of_receiver" in [driver["variable"] for driver in report["remaining"]["drivers"]]
+
+
+def test_the_same_seed_gives_the_same_report(open_ground):
+    world = open_ground.fly(8)
+    world.gain_db[world.receiver == 1] += 3.0
+    assert run(open_ground.measured(world), 4) == run(open_ground.measured(world), 4)
+
+
+def test_bad_data_is_one_message(open_ground):
+    measurements = open_ground.measured(open_ground.fly(0))
+    with pytest.raises(BadInput, match="allowed are auto, twin, raytrace, log-distance"):
+        close_loop(measurements, None, "oracle", 0, print)
+    with pytest.raises(BadInput, match="give --scene"):
+        close_loop(measurements, None, "raytrace", 0, print)
+    measurements.table["gain_db"] = -80.0
+    with pytest.raises(BadInput, match="always reads -80|at least 60|all levels are"):
+        close_loop(measurements, None, "log-distance", 0, print)
