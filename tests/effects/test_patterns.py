@@ -1,0 +1,63 @@
+"""Antennas and receivers against closed forms."""
+
+import numpy as np
+import pytest
+
+from radiotwin.effects.noise_floor import _floored
+from radiotwin.effects.receiver_saturation import _compress
+from radiotwin.effects.sector_antenna import NO_VERTICAL, sector_pattern_db
+from radiotwin.effects.tilted_dipole import dipole_gain_db
+
+
+def test_the_sector_loses_3_db_at_half_its_beamwidth_and_no_more_than_its_front_to_back_ratio():
+    pattern = np.array([40.0, 65.0, 25.0, *NO_VERTICAL])
+    azimuth_deg = np.array([40.0, 72.5, 7.5, 220.0, 400.0])
+    np.testing.assert_allclose(sector_pattern_db(azimuth_deg, np.zeros(5), pattern), [0, -3, -3, -25, 0], atol=1e-9)
+
+
+def test_the_sector_looks_up_or_down_by_its_tilt():
+    pattern = np.array([0.0, 65.0, 30.0, -6.0, 10.0])
+    elevation_deg = np.array([-6.0, -1.0, -11.0, 40.0])
+    np.testing.assert_allclose(sector_pattern_db(np.zeros(4), elevation_deg, pattern), [0, -3, -3, -30], atol=1e-9)
+
+
+def upright_db(elevation_rad):
+    """A half-wave dipole, as textbooks write it over the angle from its axis."""
+    theta = np.pi / 2 - elevation_rad
+    return 20 * np.log10(np.cos(np.pi / 2 * np.cos(theta)) / np.sin(theta))
+
+
+@pytest.mark.parametrize("elevation_deg", [0.0, 20.0, 45.0])
+def test_a_dipole_that_leans_towards_the_device_has_the_textbooks_pattern_of_the_smaller_angle(elevation_deg):
+    """Leaning in the plane of the link turns the pattern and leaves the polarisation in that plane."""
+    gain_db = dipole_gain_db(np.array([90.0]), np.array([elevation_deg]), 25.0, 90.0)[0]
+    expected_db = upright_db(np.radians(elevation_deg + 25)) - upright_db(np.radians(elevation_deg))
+    assert gain_db == pytest.approx(expected_db, abs=1e-6)
+
+
+def test_a_dipole_that_leans_across_loses_the_polarisation_only():
+    gain_db = dipole_gain_db(np.array([0.0, 180.0]), np.zeros(2), 30.0, 90.0)
+    np.testing.assert_allclose(gain_db, 20 * np.log10(np.cos(np.radians(30))), atol=1e-6)
+
+
+def test_an_upright_dipole_changes_nothing():
+    rng = np.random.default_rng(0)
+    gain_db = dipole_gain_db(rng.uniform(0, 360, 50), rng.uniform(-80, 80, 50), 0.0, 77.0)
+    np.testing.assert_allclose(gain_db, 0, atol=1e-9)
+
+
+def test_compression_follows_rapp_and_knows_its_slope():
+    level_db = np.linspace(-120, -30, 500)
+    read_db, slope = _compress(level_db, -60.0, 2.0)
+    amplitude, limit = 10 ** (level_db / 20), 10 ** (-60.0 / 20)
+    expected_db = 20 * np.log10(amplitude / (1 + (amplitude / limit) ** 4) ** 0.25)
+    np.testing.assert_allclose(read_db, expected_db, atol=1e-9)
+    np.testing.assert_allclose(slope, np.gradient(read_db, level_db), atol=2e-3)
+
+
+def test_the_floor_adds_as_power_and_knows_its_slope():
+    level_db = np.linspace(-130, -60, 500)
+    read_db, slope = _floored(level_db, -100.0)
+    np.testing.assert_allclose(10 ** (read_db / 10), 10 ** (level_db / 10) + 1e-10, rtol=1e-9)
+    np.testing.assert_allclose(slope, np.gradient(read_db, level_db), atol=2e-3)
+    assert read_db[0] == pytest.approx(-100, abs=0.01)
