@@ -1,0 +1,143 @@
+"""The two declared cities: drawn once, written as scene folders, and redrawn with a survey's errors for the truth.
+
+`oldtown` has crooked lanes between boxes, L-shapes and pentagons at all angles; `grid` has straight streets between
+rows of houses and courtyards. Neither is drawn as the cities in `scenes/` are.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from radiotwin.scene import Scene
+from radiotwin.scene.config import Extent, LatticeConfig, RadioConfig, SceneConfig, write_config
+from radiotwin.scene.materials import Material, permittivity
+from radiotwin.scene.writer import CityShape, write_city
+from tests.undeclared.shapes import corners_of, fits, prism, turned
+
+FOLDER = Path(__file__).parent / "scenes"
+SIDE_M = 500.0
+MARGIN_M = 80.0  # of ground around the extent, so that reflections near the border find it
+CITIES = ("oldtown", "grid")
+RADIO = {"oldtown": RadioConfig(frequency_hz=1.8e9, sensitivity_dbm=-108.0),
+         "grid": RadioConfig(frequency_hz=3.5e9, sensitivity_dbm=-122.0)}
+ROOM_M = 6.0  # between two buildings, so that moved walls never touch
+GROUND = "asphalt_concrete"
+
+
+@dataclass(frozen=True, eq=False)
+class Building:
+    """A prism: footprint (k, 2) counter-clockwise [m], the inner corner of an L first; height [m]; ITU material."""
+
+    footprint_m: np.ndarray
+    height_m: float
+    material: str
+
+
+@cache
+def buildings(city: str) -> tuple[Building, ...]:
+    """The buildings that the map of a city declares."""
+    return tuple({"oldtown": _oldtown, "grid": _grid}[city](np.random.default_rng(CITIES.index(city) + 41)))
+
+
+def _oldtown(rng: np.random.Generator) -> list[Building]:
+    footprints, found = [], []
+    for _ in range(2500):
+        centre = rng.uniform(0, SIDE_M, 2)
+        turn = np.radians(17 + 28 * np.sin(2 * np.pi * (centre[0] / 430 + centre[1] / 610)) + rng.normal(0, 8))
+        kind = rng.choice(["box", "ell", "pentagon"], p=[0.5, 0.35, 0.15])
+        corners = turned(corners_of(kind, rng.uniform(18, 52), rng.uniform(14, 34), rng), turn) + centre
+        height_m = float(np.clip(rng.lognormal(np.log(15), 0.4), 7, 38))
+        material = str(rng.choice(["brick", "concrete", "wood"], p=[0.6, 0.3, 0.1]))
+        square = np.hypot(*(centre - (260, 215))) < 45  # a market square stays free
+        if square or corners.min() < 2 or corners.max() > SIDE_M - 2 or not fits(corners, footprints, ROOM_M):
+            continue
+        footprints.append(corners)
+        found.append(Building(corners.round(2), round(height_m, 1), material))
+    return found
+
+
+def _grid(rng: np.random.Generator) -> list[Building]:
+    found = []
+    street_m, width_m, depth_m = 17.0, 76.0, 104.0
+    for x0 in np.arange(9.0, SIDE_M - width_m, width_m + street_m):
+        for y0 in np.arange(-52.0, SIDE_M, depth_m + street_m):
+            if rng.random() < 0.12:  # a park
+                continue
+            tall = 1.7 if np.hypot(x0 - 330, y0 - 300) < 150 else 1.0
+            for side in (0, 1):  # two rows of houses, back to back around a yard
+                at = y0
+                while at < y0 + depth_m - 16:
+                    front_m = min(rng.uniform(18, 44), y0 + depth_m - at)
+                    deep_m = rng.uniform(15, 29)
+                    low = x0 if side == 0 else x0 + width_m - deep_m
+                    corners = corners_of("box", deep_m, front_m, rng) + (low + deep_m / 2, at + front_m / 2)
+                    height_m = float(np.clip(tall * rng.lognormal(np.log(15), 0.45), 6, 44))
+                    material = str(rng.choice(["concrete", "brick", "glass"], p=[0.6, 0.25, 0.15]))
+                    if rng.random() > 0.1 and corners.min() >= 1 and corners.max() <= SIDE_M - 1:
+                        found.append(Building(corners.round(2), round(height_m, 1), material))
+                    at += front_m + ROOM_M
+    return found
+
+
+@cache
+def declared_scene(city: str) -> Scene:
+    """The scene folder that a user would have; it names no device and no UAV."""
+    return Scene.load(FOLDER / city)
+
+
+def write_declared(city: str) -> None:
+    """Write the scene folder of a city (without the preview, for its size)."""
+    folder = FOLDER / city
+    folder.mkdir(parents=True, exist_ok=True)
+    _write(folder, list(buildings(city)), {b.material: Material(b.material, itu=b.material) for b in buildings(city)},
+           Material(GROUND, itu=GROUND))
+    write_config(SceneConfig(
+        name=city, radio=RADIO[city], extent=Extent(x_min_m=0, x_max_m=SIDE_M, y_min_m=0, y_max_m=SIDE_M),
+        lattice=LatticeConfig(step_m=20, altitudes_m=[50, 65, 80]), provenance={"generator": "tests/undeclared"},
+    ), folder / "scene.toml")
+
+
+def write_truth(folder: Path, city: str, seed: int, *, without: int | None = None, more: list[Building] = ()) -> Path:
+    """Write the city as it is, which no survey knows: walls elsewhere, other materials, some roughness.
+
+    Args:
+        folder: existing.
+        city: a key of `CITIES`.
+        seed: of the survey's errors.
+        without: index of a building that was pulled down.
+        more: buildings that no map shows.
+
+    Returns:
+        Path of `city.xml`.
+    """
+    rng = np.random.default_rng([seed, 7])
+    real = []
+    for number, building in enumerate(buildings(city)):
+        # Drawn for every building, so that one that is missing moves no other.
+        shift, taller = rng.normal(0, 0.3, 2), rng.normal(0, 0.5)
+        if number != without:
+            real.append(Building(building.footprint_m + shift, building.height_m + taller, building.material))
+    names = sorted({b.material for b in buildings(city)} | {b.material for b in more} | {GROUND})
+    materials = {name: _real_material(name, RADIO[city].frequency_hz, rng) for name in names}
+    _write(folder, [*real, *more], materials, materials[GROUND])
+    return folder / "city.xml"
+
+
+def _real_material(name: str, frequency_hz: float, rng: np.random.Generator) -> Material:
+    relative, conductivity, _ = permittivity(name, frequency_hz)
+    relative, conductivity = np.array([relative, conductivity]) * rng.uniform(0.85, 1.15, 2)
+    return Material(f"{name}-real", relative_permittivity=float(relative), conductivity_s_per_m=float(conductivity),
+                    thickness_m=0.3, scattering_coefficient=0.1 if name == GROUND else 0.25, xpd_coefficient=0.1)
+
+
+def _write(folder: Path, solids: list[Building], materials: dict[str, Material], ground: Material) -> None:
+    low, high = -MARGIN_M, SIDE_M + MARGIN_M
+    plane = trimesh.Trimesh([[low, low, 0], [high, low, 0], [high, high, 0], [low, high, 0]],
+                            [[0, 1, 2], [0, 2, 3]], process=False)
+    shapes = [CityShape("ground", plane, ground)]
+    shapes += [CityShape(f"b{number:03d}", prism(solid.footprint_m, solid.height_m), materials[solid.material])
+               for number, solid in enumerate(solids)]
+    write_city(folder, shapes)

@@ -1,0 +1,79 @@
+"""Faults of a receiver, as its electronics would make them; each acts on the levels (k, p) of one UAV."""
+
+import numpy as np
+
+from tests.undeclared.worlds import SLOTS, UAVS, World
+
+
+def receiver_gain_offset(world: World, rng: np.random.Generator, clean_db: np.ndarray) -> dict:
+    """One receiver reads 4 to 8 dB too much or too little."""
+    offset_db = rng.choice([-1, 1]) * rng.uniform(4, 8)
+    return {"name": "receiver_gain_offset", "receiver": _one(rng), "offset_db": round(float(offset_db), 2)}
+
+
+def warm_up(world: World, rng: np.random.Generator, clean_db: np.ndarray) -> dict:
+    """One receiver's gain moves by 3 to 6 dB while its amplifier gets warm."""
+    final_db = rng.choice([-1, -1, 1]) * rng.uniform(3, 6)
+    return {"name": "receiver_drift", "kind": "warm_up", "receiver": _one(rng), "final_db": round(float(final_db), 2),
+            "time_constant_s": round(float(rng.uniform(150, 600)), 1)}
+
+
+def step(world: World, rng: np.random.Generator, clean_db: np.ndarray) -> dict:
+    """A connector gives way at some slot: from then on one receiver reads 3 to 6 dB less (or, mended, more)."""
+    flight = int(rng.integers(1, 5))
+    slot = int(rng.integers(5, SLOTS - 5))
+    time_s = world.time_s[world.flight == flight][slot]
+    return {"name": "receiver_drift", "kind": "step", "receiver": _one(rng), "time_s": float(time_s),
+            "step_db": round(float(rng.choice([-1, -1, 1]) * rng.uniform(3, 6)), 2)}
+
+
+def receiver_saturation(world: World, rng: np.random.Generator, clean_db: np.ndarray) -> dict:
+    """One receiver's amplifier compresses the strongest tenth to quarter of its links."""
+    receiver = _one(rng)
+    levels_db = clean_db[:, world.receiver == _number(receiver)]
+    saturation_db = np.nanquantile(levels_db, 1 - rng.uniform(0.1, 0.25))
+    return {"name": "receiver_saturation", "receiver": receiver, "saturation_db": round(float(saturation_db), 2),
+            "knee": round(float(rng.uniform(0.8, 2.0)), 2)}
+
+
+def reading_db(effect: dict, world: World, level_db: np.ndarray) -> np.ndarray:
+    """What the receivers read in place of the level at their antennas.
+
+    Args:
+        effect: of this module, as an entry of the answer.
+        world: names the links' receivers and times.
+        level_db: (k, p) [dB]
+
+    Returns:
+        (k, p) [dB]
+    """
+    faulty = (world.receiver == _number(effect["receiver"]))[None]
+    if effect["name"] == "receiver_gain_offset":
+        return level_db + faulty * effect["offset_db"]
+    if effect["name"] == "receiver_saturation":
+        return np.where(faulty, _compressed(level_db, effect["saturation_db"], effect["knee"]), level_db)
+    if effect["kind"] == "step":
+        return level_db + faulty * (world.time_s >= effect["time_s"]) * effect["step_db"]
+    return level_db + faulty * effect["final_db"] * _warmth(world.time_s, effect["time_constant_s"])
+
+
+def _compressed(level_db: np.ndarray, saturation_db: float, knee: float) -> np.ndarray:
+    """Rapp's amplifier: linear far below the saturated output power, which is never passed."""
+    over = 10 ** ((level_db - saturation_db) / 10)
+    return level_db - 10 * np.log10(1 + over**knee) / knee
+
+
+def _warmth(time_s: np.ndarray, time_constant_s: float) -> np.ndarray:
+    """Share of the final temperature, stepped second by second, on from the first slot (batteries change hot)."""
+    warmth = np.zeros(int(time_s.max()) + 2)
+    for second in range(1, len(warmth)):
+        warmth[second] = warmth[second - 1] + (1 - warmth[second - 1]) / time_constant_s
+    return warmth[np.round(time_s).astype(int)]
+
+
+def _one(rng: np.random.Generator) -> str:
+    return f"uav{rng.integers(UAVS)}"
+
+
+def _number(receiver: str) -> int:
+    return int(receiver.removeprefix("uav"))
