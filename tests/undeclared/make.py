@@ -92,12 +92,13 @@ def main() -> None:
 
 def make_table(group: str, seed: int, family: str | None) -> None:
     """Trace a world, or a case in it, and write the table, unless it is there; a case's world comes first."""
-    path = tables.path_of(family or group, seed)
+    where = world(group, seed)
+    path = tables.path_of(family, seed) if family else tables.world_path(where)
     if path.is_file():
         return
     if family is not None:
         make_table(group, seed, None)
-    started, where = time.monotonic(), world(group, seed)
+    started = time.monotonic()
     if family is None:
         effects, gain_db = [], trace_world(where)
     else:

@@ -14,7 +14,7 @@ NO_PATH = -32768
 
 
 def path_of(family: str, seed: int) -> Path:
-    """File of a case's trace, or of a world's where `family` is a group."""
+    """File of a case's trace."""
     return FOLDER / f"{family}-{seed}.npz"
 
 
@@ -53,7 +53,7 @@ def load(path: Path, world: World) -> tuple[np.ndarray, list[dict]]:
 
 def world_path(world: World) -> Path:
     """File of the trace of a world with nothing hidden."""
-    return path_of(world.group, world.seed)
+    return FOLDER / f"world-{world.group}-{world.seed}.npz"  # a group may be called as a family is
 
 
 def _steps(path: Path) -> np.ndarray:
