@@ -12,7 +12,9 @@ from radiotwin.closeloop.regression import Problem, Solution, covariance, mean_d
 from radiotwin.effects.base import Effect, Found, Setting, Term, View
 
 MOST_TRIALS = 60  # of settings while one is refined
-REFINED_ON = 8000  # links at most
+REFINED_ON = 5000  # links at most
+MOST_FITS = 2  # of proposals of one effect
+WORTH_REFINING_NATS = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,16 +156,19 @@ def add(side: Side, effect: Effect, solution: Solution) -> tuple[Side, Solution]
     Returns:
         the side with the effect, and its fit; None where nothing in the residual looks like the effect
     """
+    view = side.view(solution)
+    parts = [side.part(effect, setting) for setting in effect.propose(view)]
+    if effect.stage == "gain" and len(parts) > MOST_FITS:  # the others do not say what they add to a residual
+        parts = sorted(parts, key=lambda part: -view.score(part.term.select(side.train)))[:MOST_FITS]
     best = None
-    for setting in effect.propose(side.view(solution)):
-        tried = side.with_parts([*side.parts, side.part(effect, setting)])
+    for part in parts:
+        tried = side.with_parts([*side.parts, part])
         fitted = tried.fit()
         if best is None or fitted.objective < best[1].objective:
             best = tried, fitted
-    if best is None:
-        return None
-    refined = _refine(*best)
-    return refined
+    if best is None or solution.objective - best[1].objective < WORTH_REFINING_NATS:
+        return best
+    return _refine(*best)
 
 
 def _refine(side: Side, fitted: Solution) -> tuple[Side, Solution]:
@@ -175,13 +180,10 @@ def _refine(side: Side, fitted: Solution) -> tuple[Side, Solution]:
     rows = np.flatnonzero(side.train)
     rows = rows[:: max(len(rows) // REFINED_ON, 1)]
     part_records = side.records.select(rows)
-    terms = [p.term for p in side.parts[:-1]]
     small = replace(
         side, records=part_records, train=np.ones(len(rows), bool), usable=np.ones(len(rows), bool),
         base_db=side.base_db[rows], base_columns=side.base_columns[rows], group=side.group[rows],
-        parts=[replace(p, term=Term(t.offset_db[rows], t.columns[rows], t.spread_db, t.names,
-                                      None if t.extra is None else t.extra[rows]))
-               for p, t in zip(side.parts[:-1], terms)])
+        parts=[replace(p, term=p.term.select(rows)) for p in side.parts[:-1]])
 
     def objective(numbers: np.ndarray) -> float:
         inside = np.clip(numbers, variation.low, variation.high)

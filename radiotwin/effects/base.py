@@ -35,6 +35,11 @@ class Term:
     names: list[str]
     extra: np.ndarray | None = None
 
+    def select(self, rows: np.ndarray) -> "Term":
+        """For the links of a mask or index."""
+        return Term(self.offset_db[rows], self.columns[rows], self.spread_db, self.names,
+                    None if self.extra is None else self.extra[rows])
+
     @classmethod
     def of_columns(cls, columns: np.ndarray, spread_db: float, names: list[str]) -> "Term":
         """A term that is all linear."""

@@ -19,6 +19,7 @@ class _Paths(Effect):
     """Power of some kinds of paths, with one common strength."""
 
     stage = "paths"
+    nlos_only = True  # where there is line of sight they add tenths of a decibel
     kinds: tuple[str, ...]
 
     def lacks(self, records) -> str | None:
