@@ -79,8 +79,15 @@ class TwinBase(Base):
 
     def __init__(self, scene: Scene | None, seed: int):
         self._scene, self._seed = scene, seed
+        self._fitted: dict[bytes, FittedBase] = {}  # another base may ask for the same again
 
     def fit(self, records: Records) -> FittedBase:
+        key = records.level_db.tobytes()
+        if key not in self._fitted:
+            self._fitted[key] = self._fit(records)
+        return self._fitted[key]
+
+    def _fit(self, records: Records) -> FittedBase:
         if self._scene is not None:
             twin = _fit_twin(records, self._scene, "segmented_log_distance", self._seed)
             return FittedChannel(twin.channel, _located_m(twin))
@@ -92,8 +99,8 @@ class RaytraceBase(Base):
 
     name = "raytrace"
 
-    def __init__(self, scene: Scene | None, seed: int):
-        self._twin = TwinBase(scene, seed)
+    def __init__(self, twin: TwinBase):
+        self._twin = twin
 
     def fit(self, records: Records) -> FittedBase:
         return _FittedPaths(self._twin.fit(records))

@@ -20,7 +20,7 @@ from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 
-BASES: dict[str, type[Base]] = {base.name: base for base in (TwinBase, RaytraceBase, LogDistanceBase)}
+BASES = ("twin", "raytrace", "log-distance")
 STRUCTURED = 0.01
 LEAST_EFFECT_DB = 0.5  # a dependence that is weaker is of no use to anybody
 MOST_FOR_KRIGING = 30_000
@@ -85,7 +85,7 @@ def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed:
     Args:
         measurements: links.
         scene: 3D map and radio; None: every link counts as one with line of sight.
-        base: a key of `BASES`, or `auto`: the one with the least held-out error.
+        base: one of `BASES`, or `auto`: the one with the least held-out error.
         seed: of folds, fits and permutations.
         tell: called with what is being done.
 
@@ -99,10 +99,13 @@ def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed:
     records = make_records(measurements, scene)
     folds = make_folds(records, seed)
     names = [base] if base != "auto" else ["twin", "raytrace"] if scene is not None else ["log-distance"]
+    twin = TwinBase(scene, seed)
+    bases: dict[str, Base] = {"twin": twin, "raytrace": RaytraceBase(twin),
+                              "log-distance": LogDistanceBase(scene, seed)}
     models = {}
     for name in names:
         tell(f"fitting the base {name}")
-        models[name] = make_model(records, BASES[name](scene, seed), folds, lambda _: None)
+        models[name] = make_model(records, bases[name], folds)
     everything = np.ones(len(records), dtype=bool)
     best = min(models, key=lambda name: rmse_db(models[name], everything))
     before = models[best]

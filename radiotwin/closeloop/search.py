@@ -79,17 +79,15 @@ class Model:
         return self.held_out(lambda side, fit: np.where(side.usable, side.mean_db(fit), np.nan))
 
 
-def make_model(records: Records, base: Base, folds: Folds, advance: Callable[[int], None]) -> Model:
+def make_model(records: Records, base: Base, folds: Folds) -> Model:
     """Fit a base to all links and to those outside each fold."""
     everything = np.ones(len(records), dtype=bool)
     whole = base.fit(records)
-    advance(1)
     dof = _best_dof(records, everything, whole)
     sides = []
     for number in range(folds.count):
         train = folds.index != number
         sides.append(Side.make(records, train, base.fit(records.select(train)), dof))
-        advance(1)
     model = Model(Side.make(records, everything, whole, dof), sides, [], folds.index)
     model.fits = [side.fit() for side in model.sides]
     return model
