@@ -104,13 +104,14 @@ class Side:
                     mean_db(problem, solution), self.base.shifted_db)
 
     def found(self, solution: Solution) -> list[Found]:
-        """Of each part: what was fitted, and how surely."""
-        spread = covariance(self.problem(self.train), solution)
+        """Of each part: what was fitted, and how surely, in view of how many links count as one."""
+        design_effect = self.view(solution).design_effect
+        spread = design_effect * covariance(self.problem(self.train), solution)
         at, result = self.base_columns.shape[1], []
         for number, part in enumerate(self.parts):
             place = slice(at, at + part.term.columns.shape[1])
             result.append(Found(solution.coefficients[place], spread[place, place],
-                                self._setting_deviations(number, solution)))
+                                np.sqrt(design_effect) * self._setting_deviations(number, solution)))
             at = place.stop
         return result
 

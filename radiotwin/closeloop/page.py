@@ -23,6 +23,9 @@ VERDICTS = {
 }
 
 
+LABELS = {"los": "with line of sight", "nlos": "without line of sight"}
+
+
 def lead(report: dict) -> str:
     """The result in a sentence or two, whichever way it comes out."""
     names = [effect["name"] for effect in report["effects"]]
@@ -37,12 +40,13 @@ def lead(report: dict) -> str:
 
 def write_page(report: dict, folder: Path, title: str) -> None:
     """Write `closeloop.html` from the report and the figures that lie in `folder`."""
-    parts = [f"<h1>{html.escape(title)}</h1>", f'<p class="lead">{html.escape(lead(report))}</p>', _effects(report),
-             _errors(report)]
+    parts = [f"<h1>{html.escape(title)}</h1>", f'<p class="lead">{html.escape(lead(report))}</p>',
+             _errors(report, ("los",))]
     for name, heading, text in FIGURES:
         data = base64.b64encode((folder / name).read_bytes()).decode()
         parts.append(f'<h2>{heading}</h2><p>{text}</p><img alt="{heading}" src="data:image/png;base64,{data}">')
-    parts += [_candidates(report), _remarks(report)]
+    parts += [_effects(report), _candidates(report), "<h2>By device, receiver and flight</h2>",
+              _errors(report, ("device", "receiver", "flight")), _remarks(report)]
     page = (f'<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
             f"<title>{html.escape(title)}</title><style>{STYLE}</style><main>{''.join(parts)}</main></html>")
     with atomic_path(folder / "closeloop.html") as temporary:
@@ -57,18 +61,19 @@ def _effects(report: dict) -> str:
     return _table("What was missing", columns, rows) if rows else ""
 
 
-def _errors(report: dict) -> str:
+def _errors(report: dict, kinds: tuple[str, ...]) -> str:
     columns = ("n", "bias_db", "std_db", "correlation", "rmse_db", "mae_db", "nll")
     rows = []
-    groups = {"all": {"all links": report["error"]}} | {
-        name: report["error"].get(f"by_{name}", {}) for name in ("los", "device", "receiver", "flight")}
+    groups = {"all": {"all links": report["error"]}} if "los" in kinds else {}
+    groups |= {name: report["error"].get(f"by_{name}", {}) for name in kinds}
     for name, group in groups.items():
         for label, both in group.items():
-            if len(group) <= 40:
-                rows += [[f"{name}: {label}" if name != "all" else label, when,
+            if len(group) <= 40 and both["before"]["n"]:
+                rows += [[LABELS.get(label, f"{name} {label}") if name != "all" else label, when,
                           *(_number(both[when][column]) for column in columns)] for when in ("before", "after")]
-    rows += [[name.replace("_", " "), "", "", "", "", "", _number(value["rmse_db"]), "", ""]
-             for name, value in report["baselines"].items()]
+    if "los" in kinds:
+        rows += [[name.replace("_", " "), "", "", "", "", "", _number(value["rmse_db"]), "", ""]
+                 for name, value in report["baselines"].items()]
     return _table(f"Error on held-out links (by {report['heldout']['by']}, {report['heldout']['folds']} folds)",
                   ["links", "", "n", "mean [dB]", "standard deviation [dB]", "correlation", "RMSE [dB]", "MAE [dB]",
                    "−log-likelihood [nats]"], rows)
