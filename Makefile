@@ -35,7 +35,7 @@ demo: llvm
 test: $(INSTALLED)
 	@$(MAKE) --no-print-directory llvm \
 	|| echo "make test: without a libLLVM the tests that trace rays are skipped; all the others run." >&2
-	$(BIN)/python -m pytest $(TESTS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(TESTS)
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check

@@ -87,7 +87,7 @@ def draw_waterfall(loop: Loop, path: Path) -> None:
 
 
 def _outline(ax, scene: Scene) -> None:
-    x_min, y_min, x_max, y_max = scene.config.extent.bounds
+    x_min, x_max, y_min, y_max = scene.config.extent.bounds
     x_m, y_m = np.linspace(x_min, x_max, 300), np.linspace(y_min, y_max, 300)
     height_m = scene.city.height_at(*np.meshgrid(x_m, y_m))
     ax.contourf(x_m, y_m, height_m, levels=[2.0, 1e4], colors=["0.85"])

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from scipy.special import logsumexp
 
 from radiotwin.closeloop.bases import Base
 from radiotwin.closeloop.folds import Folds, evidence_blocks
@@ -17,6 +18,7 @@ LEAST_GAIN_NATS = 25.0
 LEAST_GAIN_PER_LINK = 0.01  # nats; 0.02 is what an RMSE lower by 2 % gains
 LEAST_FOLDS = 0.6  # of the folds must gain
 SIGNIFICANCE = 0.01
+CONSISTENT = 0.1
 FLIPS = 20_000
 MOST_EFFECTS = 6
 WORTH_A_LOOK_NATS = 10.0
@@ -32,7 +34,7 @@ class Judged:
         reason: why not, in words; empty where it was.
         nll_gain: held-out likelihood gained [nats]; NaN where it was not tried.
         rmse_db: held-out RMSE with it.
-        p_value: of no gain, corrected for the number of candidates.
+        p_value: of no gain, links that err alike counted as one, corrected for the number of candidates.
         step: number of effects that were there before.
     """
 
@@ -174,12 +176,16 @@ def _judge(model: Model, effect: Effect, block: np.ndarray, tried: int, step: in
     by_fold = np.bincount(model.index[usable], weights=gain[usable], minlength=len(sides))
     after = rmse_db(extended, usable)
     per_link = max(gain[rows].mean() for rows in (usable, usable & los) if rows.any())
-    p_value = min(tried * sign_flip_p(np.bincount(block[usable], weights=gain[usable]), seed), 1.0)
+    design_effect = model.whole.view(model.fits[0]).design_effect
+    p_value = min(tried * gain_p(by_fold / design_effect), 1.0)
+    one_sided = sign_flip_p(np.bincount(block[usable], weights=gain[usable]), seed)
     numbers = total, after, p_value
     if total < LEAST_GAIN_NATS:
         return refused(f"gains {total:.0f} nats on held-out links, {LEAST_GAIN_NATS:.0f} are needed", *numbers)
     if p_value > SIGNIFICANCE:
         return refused(f"its gain may be chance (p = {p_value:.2g} after correction)", *numbers)
+    if one_sided > CONSISTENT:
+        return refused(f"its gain hangs on a few places (p = {one_sided:.2g} if signs are flipped)", *numbers)
     if (by_fold > 0).mean() < LEAST_FOLDS:
         return refused(f"gains in {(by_fold > 0).sum()} of {len(by_fold)} folds only", *numbers)
     if per_link < LEAST_GAIN_PER_LINK:
@@ -193,6 +199,16 @@ def rmse_db(model: Model, rows: np.ndarray) -> float:
     """Held-out root mean square error of the detected links among `rows` [dB]."""
     error = (model.whole.records.level_db - model.held_out_mean_db())[rows]
     return float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else np.nan
+
+
+def gain_p(gains: np.ndarray) -> float:
+    """Bound on the chance of such held-out gains (folds,) [nats] if the effect is not there.
+
+    A likelihood ratio whose parameters were fitted elsewhere is at most 1 on average then, and so is its mean over the
+    folds; by Markov's inequality (Wasserman, Ramdas and Balakrishnan 2020, 'Universal inference', PNAS 117(29), the
+    cross-fit test).
+    """
+    return float(np.exp(-max(logsumexp(gains) - np.log(len(gains)), 0.0)))
 
 
 def sign_flip_p(gains: np.ndarray, seed: int) -> float:

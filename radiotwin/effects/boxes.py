@@ -7,6 +7,8 @@ import numpy as np
 SAMPLES_M = 5.0  # along a link
 CELL_M = 12.5
 HEIGHTS_M = (6.0, 9.0, 12.0, 16.0, 22.0, 30.0, 40.0, 52.0, 66.0, 85.0, 110.0)
+APART_M = 25.0
+MISSES, DOF = 0.4, 4.0
 CHUNK = 2000  # links a time: bounds memory
 
 
@@ -76,6 +78,31 @@ def cross(box: Box, a_m: np.ndarray, b_m: np.ndarray) -> Crossing:
     values = (np.maximum(below, 0) * length, box.height_m - (a_m[:, 2] + middle * rise), across.max(axis=1),
               -across.min(axis=1), middle * track, (1 - middle) * track)
     return Crossing(np.where(crosses, values[0], 0.0), *(np.where(crosses, value, np.nan) for value in values[1:]))
+
+
+def lacks_nats(residual_db: np.ndarray, scale_db: np.ndarray, losses_db: tuple[float, ...]) -> np.ndarray:
+    """(n,) how much likelier a residual is if something may be in the link's way than if nothing is [nats].
+
+    "May": a cell of the search is not the box, and a link through it misses the box in `MISSES` of the cases; so a link
+    that lacks nothing speaks against a box only a little.
+    """
+    def density(value_db):
+        return (1 + (value_db / scale_db) ** 2 / DOF) ** (-0.5 * (DOF + 1))
+
+    lossy = np.mean([density(residual_db + loss_db) for loss_db in losses_db], axis=0)
+    return np.log(MISSES + (1 - MISSES) * lossy / density(residual_db))
+
+
+def best_cells(centres_m: np.ndarray, total: np.ndarray, count: int) -> list[tuple[np.ndarray, int, float]]:
+    """The best cells that are not neighbours: centre, index of the height, and nats."""
+    found = []
+    for place in np.argsort(-total.max(axis=1)):
+        if all(np.linalg.norm(centres_m[place] - other[0]) > APART_M for other in found):
+            height = int(total[place].argmax())
+            found.append((centres_m[place], height, float(total[place, height])))
+        if len(found) == count:
+            break
+    return found
 
 
 def back_project(a_m: np.ndarray, b_m: np.ndarray, gain: np.ndarray, ground_m: float = 0.0):

@@ -8,12 +8,12 @@ which direction it lies.
 import numpy as np
 
 from radiotwin.effects.base import Effect, Parameter, Term, Variation, View
-from radiotwin.effects.boxes import CELL_M, HEIGHTS_M, Box, back_project, cross
+from radiotwin.effects.boxes import CELL_M, HEIGHTS_M, Box, back_project, best_cells, cross, lacks_nats
 from radiotwin.effects.missing_obstacle import NAMES
 
 LEAST_NATS = 6.0
 LOWEST, HIGHEST = 3.0, 26.0  # tops of trees [m]
-TYPICAL_LOSS_DB = 8.0
+LOSSES_DB = (3.0, 6.0, 9.0, 12.0, 16.0, 20.0)
 STARTS = 3
 SIDES_M = (25.0, 55.0)
 FIRST_LAW = (0.6, 15.0)  # specific attenuation [dB/m], greatest loss [dB]
@@ -27,19 +27,13 @@ class Foliage(Effect):
     confused_with = ("missing_obstacle", "excess_attenuation", "device_gain_offset")
 
     def propose(self, view: View) -> list[dict]:
-        records, residual_db = view.records, view.residual_db
-        gain = 0.5 * view.weight * (residual_db**2 - (residual_db + TYPICAL_LOSS_DB) ** 2)
-        centres, total = back_project(records.device_m[records.device], records.receiver_m, gain)
+        records = view.records
+        nats = lacks_nats(view.residual_db, view.scale_db, LOSSES_DB) / view.design_effect
+        centres_m, total = back_project(records.device_m[records.device], records.receiver_m, nats)
         allowed = [i for i, height in enumerate(HEIGHTS_M) if LOWEST <= height <= HIGHEST]
-        total = total[:, allowed]
-        found = []
-        for place in np.argsort(-total.max(axis=1))[:STARTS]:
-            best = int(total[place].argmax())
-            if total[place, best] > LEAST_NATS:
-                height = HEIGHTS_M[allowed[best]]
-                found += [{"box": [*map(float, centres[place]), side, side, height, 0.0], "law": list(FIRST_LAW)}
-                          for side in SIDES_M]
-        return found
+        return [{"box": [*map(float, centre_m), side, side, HEIGHTS_M[allowed[height]], 0.0], "law": list(FIRST_LAW)}
+                for centre_m, height, nats in best_cells(centres_m, total[:, allowed], STARTS) if nats > LEAST_NATS
+                for side in SIDES_M]
 
     def term(self, records, setting, at) -> Term:
         crossing = cross(Box(*setting["box"]), records.device_m[records.device], records.receiver_m)

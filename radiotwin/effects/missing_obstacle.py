@@ -8,12 +8,12 @@ without line of sight), added as powers.
 import numpy as np
 
 from radiotwin.effects.base import Effect, Parameter, Term, Variation, View
-from radiotwin.effects.boxes import CELL_M, HEIGHTS_M, Box, back_project, cross, knife_edge_db
+from radiotwin.effects.boxes import CELL_M, HEIGHTS_M, Box, back_project, best_cells, cross, knife_edge_db, lacks_nats
 
 LIGHT_M_S = 299_792_458.0
 LEAST_NATS = 6.0
-TYPICAL_LOSS_DB = 15.0
-STARTS = 3
+LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)
+STARTS = 4
 NAMES = ("x_m", "y_m", "length_m", "width_m", "height_m", "turn_deg")
 MOST_BLANK_DB = 25.0
 
@@ -33,17 +33,10 @@ class MissingObstacle(Effect):
     def propose(self, view: View) -> list[dict]:
         records = view.records
         rows = np.flatnonzero(records.los)
-        residual_db, weight = view.residual_db[rows], view.weight[rows]
-        # How much better a link is explained by a typical loss; by more where it lacks more.
-        loss_db = np.clip(-residual_db, TYPICAL_LOSS_DB, 2 * TYPICAL_LOSS_DB)
-        gain = 0.5 * weight * (residual_db**2 - (residual_db + loss_db) ** 2)
-        centres, total = back_project(records.device_m[records.device[rows]], records.receiver_m[rows], gain)
-        found = []
-        for place in np.argsort(-total.max(axis=1))[:STARTS]:
-            best = int(total[place].argmax())
-            if total[place, best] > LEAST_NATS:
-                found.append({"box": [*map(float, centres[place]), 1.5 * CELL_M, 1.5 * CELL_M, HEIGHTS_M[best], 0.0]})
-        return found
+        nats = lacks_nats(view.residual_db[rows], view.scale_db[rows], LOSSES_DB) / view.design_effect
+        centres_m, total = back_project(records.device_m[records.device[rows]], records.receiver_m[rows], nats)
+        return [{"box": [*map(float, centre_m), 1.5 * CELL_M, 1.5 * CELL_M, HEIGHTS_M[height], 0.0]}
+                for centre_m, height, nats in best_cells(centres_m, total, STARTS) if nats > LEAST_NATS]
 
     def term(self, records, setting, at) -> Term:
         box = Box(*setting["box"])

@@ -5,6 +5,7 @@ import pytest
 
 from radiotwin.closeloop.report import make_report
 from radiotwin.closeloop.run import close_loop
+from radiotwin.closeloop.search import gain_p, sign_flip_p
 from radiotwin.errors import BadInput
 
 
@@ -105,3 +106,21 @@ def test_bad_data_is_one_message(open_ground):
     measurements.table["gain_db"] = -80.0
     with pytest.raises(BadInput, match="always reads -80|at least 60|all levels are"):
         close_loop(measurements, None, "log-distance", 0, print)
+
+
+def test_the_chance_of_a_gain_is_bounded_where_there_is_none():
+    """Likelihood ratios of a mean that was fitted elsewhere, when the true mean is zero."""
+    rng = np.random.default_rng(0)
+    p_values = []
+    for _ in range(4000):
+        data, elsewhere = rng.normal(size=(2, 5, 20))
+        guess = elsewhere.mean(axis=1, keepdims=True)
+        p_values.append(gain_p((0.5 * data**2 - 0.5 * (data - guess) ** 2).sum(axis=1)))
+    for level in (0.5, 0.1, 0.02):
+        assert np.mean(np.array(p_values) <= level) <= level
+
+
+def test_signs_that_agree_are_no_chance_and_signs_that_do_not_are():
+    rng = np.random.default_rng(1)
+    assert sign_flip_p(np.abs(rng.normal(size=30)), 0) < 1e-3
+    assert sign_flip_p(np.r_[np.abs(rng.normal(size=15)), -np.abs(rng.normal(size=15))], 0) > 0.01

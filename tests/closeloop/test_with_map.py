@@ -1,0 +1,112 @@
+"""The loop with a 3D map: buildings that the map has too many or too few of, in worlds made of two plain laws."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.closeloop.report import make_report
+from radiotwin.closeloop.run import close_loop
+from radiotwin.measurements import Measurements
+
+LAWS = {True: (-30.0, -2.5, 1.4), False: (-35.0, -3.04, 2.2)}  # with line of sight, and without: level, slope, noise
+
+
+def hits(corner_m, size_m, a_m, b_m):
+    """Whether segments pass through an upright box on the ground: points along them, one by one."""
+    share = np.linspace(0, 1, 400)[:, None, None]
+    points_m = a_m + share * (b_m - a_m)
+    low, high = np.array([*corner_m, 0.0]), np.array([*corner_m, 0.0]) + size_m
+    return ((points_m >= low) & (points_m <= high)).all(axis=2).any(axis=0)
+
+
+def survey(scene, seed, blocked):
+    """Four flights of two receivers over a scene; all devices are anchors. `blocked(device_m, receiver_m)` decides."""
+    rng = np.random.default_rng(seed)
+    x_min, x_max, y_min, y_max = scene.config.extent.bounds
+    rows = []
+    for flight in range(4):
+        for receiver in range(2):
+            place_m = rng.uniform((x_min + 20, y_min + 20), (x_max - 20, y_max - 20))
+            heading = rng.uniform(0, 2 * np.pi)
+            for slot in range(70):
+                heading += rng.normal(0, 0.3)
+                place_m = place_m + 8 * np.array([np.cos(heading), np.sin(heading)])
+                place_m = np.clip(place_m, (x_min, y_min), (x_max, y_max))
+                rows.append((flight, receiver, 100 * flight + slot, *place_m, 55.0 + 10 * receiver))
+    flight, receiver, time_s, x, y, z = np.repeat(np.array(rows), len(scene.device_m), axis=0).T
+    device = np.tile(np.arange(len(scene.device_m)), len(rows))
+    receiver_m, device_m = np.column_stack([x, y, z]), scene.device_m[device]
+    hidden = blocked(device_m, receiver_m)
+    distance_m = np.linalg.norm(receiver_m - device_m, axis=1)
+    gain_db = np.empty(len(device))
+    for los, (level, slope, noise) in LAWS.items():
+        mine = hidden != los
+        gain_db[mine] = (level + 10 * slope * np.log10(distance_m) + rng.normal(0, noise, len(device)))[mine]
+    gain_db[gain_db < scene.config.gain_limit_db] = np.nan
+    names = [d.device for d in scene.config.devices]
+    table = pd.DataFrame({
+        "time_s": time_s, "flight": [f"f{int(i)}" for i in flight], "receiver": [f"r{int(i)}" for i in receiver],
+        "receiver_x_m": x, "receiver_y_m": y, "receiver_z_m": z, "device": np.array(names)[device], "gain_db": gain_db})
+    devices = pd.DataFrame({"device": names, "x_m": scene.device_m[:, 0], "y_m": scene.device_m[:, 1],
+                            "z_m": scene.device_m[:, 2], "role": "anchor"})
+    return Measurements(table, devices)
+
+
+def run(measurements, scene):
+    return make_report(close_loop(measurements, scene, "twin", 0, lambda text: None))
+
+
+def test_a_map_that_is_right_is_left_alone(small_scene):
+    report = run(survey(small_scene, 0, lambda a, b: ~small_scene.city.line_of_sight(a, b)), small_scene)
+    assert report["verdict"] == "none", [effect["name"] for effect in report["effects"]]
+
+
+def test_a_building_that_no_map_shows_is_found(small_scene):
+    middle_m = free_place(small_scene)
+    box = (middle_m - 9.0, np.array([18.0, 18.0, 60.0]))
+    report = run(survey(small_scene, 1, lambda a, b: ~small_scene.city.line_of_sight(a, b) | hits(*box, a, b)),
+                 small_scene)
+    assert report["effects"][0]["name"] == "missing_obstacle"
+    parameters = report["effects"][0]["parameters"]
+    found_m = np.array([parameters["x_m"]["value"], parameters["y_m"]["value"]])
+    assert np.linalg.norm(found_m - middle_m) < 8
+    assert report["error"]["after"]["rmse_db"] < 0.85 * report["error"]["before"]["rmse_db"]
+
+
+def test_a_building_that_is_gone_is_named(small_scene):
+    from radiotwin.effects.removed_obstacle import buildings
+    from radiotwin.scene.citymap import CityMap
+
+    label, centres_m = buildings(small_scene.city)
+    seen = [(~small_scene.city.line_of_sight(a, b)).sum() for a, b in [samples(small_scene)]][0]
+    most, gone = 0, 0
+    for building in range(len(centres_m)):
+        city = CityMap(small_scene.city.vertices, small_scene.city.faces[label != building])
+        freed = seen - (~city.line_of_sight(*samples(small_scene))).sum()
+        if freed > most:
+            most, gone = freed, building
+    city = CityMap(small_scene.city.vertices, small_scene.city.faces[label != gone])
+    report = run(survey(small_scene, 2, lambda a, b: ~city.line_of_sight(a, b)), small_scene)
+    assert report["effects"][0]["name"] == "removed_obstacle"
+    parameters = report["effects"][0]["parameters"]
+    assert (parameters["x_m"]["value"], parameters["y_m"]["value"]) == pytest.approx(tuple(centres_m[gone, :2]))
+
+
+def samples(scene):
+    rng = np.random.default_rng(0)
+    x_min, x_max, y_min, y_max = scene.config.extent.bounds
+    receiver_m = np.column_stack([rng.uniform(x_min, x_max, 400), rng.uniform(y_min, y_max, 400), np.full(400, 60.0)])
+    return np.tile(scene.device_m, (400, 1)), np.repeat(receiver_m, len(scene.device_m), axis=0)
+
+
+def free_place(scene):
+    """The middle of the largest gap between buildings and devices: where a tower has room."""
+    x_min, x_max, y_min, y_max = scene.config.extent.bounds
+    x_m, y_m = (axis.ravel() for axis in np.meshgrid(np.arange(x_min + 40, x_max - 40, 4),
+                                                     np.arange(y_min + 40, y_max - 40, 4)))
+    built_x, built_y = (axis.ravel() for axis in np.meshgrid(np.arange(x_min, x_max, 3), np.arange(y_min, y_max, 3)))
+    built = scene.city.height_at(built_x, built_y) > 2
+    taken_m = np.vstack([np.column_stack([built_x, built_y])[built], scene.device_m[:, :2]])
+    gap_m = np.array([np.hypot(*(taken_m - place).T).min() for place in np.column_stack([x_m, y_m])])
+    best = int(gap_m.argmax())
+    return np.array([x_m[best], y_m[best]])
