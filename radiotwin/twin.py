@@ -73,6 +73,7 @@ class _TwinFile(BaseModel):
     level: Literal["gain_db", "rssi_dbm"]
     limit_db: float | None
     provenance: dict
+    effects: dict | list[dict] = {}  # a list, always empty, in twins of earlier versions
 
     @field_validator("devices")
     @classmethod
@@ -93,6 +94,7 @@ class Twin:
         level: `gain_db`, or `rssi_dbm` where transmit power is unknown.
         limit_db: the level below which receivers do not detect; None where it was not known.
         provenance: measurements, scene, seed and version that made it.
+        effects: what `close-loop` found, as `radiotwin.closeloop.corrected` reads it; empty where it did not look.
     """
 
     channel: ChannelModel
@@ -100,6 +102,7 @@ class Twin:
     level: str
     limit_db: float | None
     provenance: dict = field(default_factory=dict)
+    effects: dict = field(default_factory=dict)
 
     @property
     def device_m(self) -> np.ndarray:
@@ -118,6 +121,11 @@ class Twin:
         if self.provenance.get("scene_hash", scene.content_hash()) != scene.content_hash():
             warnings.warn(f"the twin was learnt in another scene ({self.provenance.get('scene')}) than {scene.folder}, "
                           "or this one has changed since: geometry, radio or declared devices differ", stacklevel=2)
+        if self.effects:
+            # Effects are built upon the twin, and only they know what they do; a map without them would be wrong.
+            from radiotwin.closeloop.corrected import corrected_map
+
+            return corrected_map(self, scene)
         known = np.flatnonzero(np.isfinite(self.device_m).all(axis=1))
         receiver_m = scene.lattice.positions_m
         shape = (len(known), len(receiver_m))
@@ -151,7 +159,7 @@ class Twin:
         record = {"schema": SCHEMA, "channel": {"model": self.channel.name, "file": CHANNEL_FILE},
                   "level": self.level, "limit_db": self.limit_db,
                   "devices": [_without_nan(asdict(device)) for device in self.devices],
-                  "effects": [], "provenance": self.provenance}
+                  "effects": self.effects, "provenance": self.provenance}
         with atomic_folder(folder) as temporary:
             save_channel(self.channel, temporary / CHANNEL_FILE)
             (temporary / "twin.json").write_text(json.dumps(record, indent=1, allow_nan=False), encoding="utf-8")
@@ -172,7 +180,7 @@ class Twin:
             content = _TwinFile.model_validate(record)
             devices = [TwinDevice(**_with_nan(device.model_dump())) for device in content.devices]
             channel = load_channel(folder / CHANNEL_FILE)
-            return cls(channel, devices, content.level, content.limit_db, content.provenance)
+            return cls(channel, devices, content.level, content.limit_db, content.provenance, content.effects or {})
         except (FileNotFoundError, NotADirectoryError):
             raise BadInput(f"{folder} is not a twin's folder (no twin.json); `radiotwin fit` makes one") from None
         except (OSError, KeyError, TypeError, ValueError) as error:

@@ -24,6 +24,7 @@ def close_loop(
     seed: Annotated[int, typer.Option(min=0, help="Of folds, fits and permutations.")] = 0,
 ) -> None:
     """Find what the model lacks, add it, and say by how much the error falls."""
+    from radiotwin.closeloop.corrected import corrected_twin
     from radiotwin.closeloop.figures import draw_drivers, draw_residual_map, draw_waterfall
     from radiotwin.closeloop.page import lead, write_page
     from radiotwin.closeloop.report import make_report, write_report
@@ -44,6 +45,8 @@ def close_loop(
     draw_residual_map(loop, world, out / "residual_map.png")
     draw_drivers(loop, out / "drivers.png")
     write_report(report, out / "closeloop.json")
+    if world is not None:
+        corrected_twin(loop, world).save(out / "twin")
     write_page(report, out, f"What the model of {measurements.name} lacks")
     for remark in report["remarks"]:
         say(f"note: {remark}")

@@ -103,12 +103,14 @@ class RaytraceBase(Base):
         self._twin = twin
 
     def fit(self, records: Records) -> FittedBase:
-        return _FittedPaths(self._twin.fit(records))
+        return FittedPaths(self._twin.fit(records))
 
 
-class _FittedPaths(FittedBase):
+class FittedPaths(FittedBase):
+    """Powers of paths; `law` has the positions, and says what moving an end changes."""
+
     def __init__(self, law: FittedBase):
-        self._law, self.device_m = law, law.device_m
+        self.law, self.device_m = law, law.device_m
 
     def mean_db(self, records: Records) -> np.ndarray:
         power = paths_of(records, COMPONENTS)
@@ -117,7 +119,7 @@ class _FittedPaths(FittedBase):
         return 10 * np.log10(np.maximum(power, least))
 
     def shifted_db(self, records: Records) -> np.ndarray:
-        return self._law.mean_db(records)
+        return self.law.mean_db(records)
 
     def columns(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
         los = records.los

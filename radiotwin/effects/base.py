@@ -130,6 +130,7 @@ class Effect(ABC):
         nlos_only: acts on links without line of sight only, so those with it need not support it.
         confused_with: names of effects that may look alike.
         repeatable: whether there may be several, each found in a step of its own.
+        of_receiver: whether it belongs to a receiver, so that it is no part of a map.
         stage: `gain` adds decibels (its `term`); `paths` adds power to that of the base, before any gain; `receiver`
             comes last. The latter two say with `bend` what they do.
     """
@@ -140,6 +141,7 @@ class Effect(ABC):
     confused_with: ClassVar[tuple[str, ...]] = ()
     repeatable: ClassVar[bool] = False
     stage: ClassVar[str] = "gain"
+    of_receiver: ClassVar[bool] = False
 
     def lacks(self, records: Records) -> str | None:
         """Why the data does not allow this effect to be looked for; None where it does."""

@@ -17,6 +17,7 @@ class BodyShadowing(Effect):
     """Each receiver loses more on one side."""
 
     name = "body_shadowing"
+    of_receiver = True
     confused_with = ("antenna_pattern",)
 
     def lacks(self, records) -> str | None:

@@ -67,6 +67,7 @@ class ReceiverGainOffset(_GainOffset):
     """A receiver reads more or less than the others do."""
 
     name = "receiver_gain_offset"
+    of_receiver = True
     confused_with = ("receiver_drift", "antenna_pattern")
 
     def _index(self, records):

@@ -16,6 +16,7 @@ class NoiseFloor(Effect):
     """A floor for each receiver."""
 
     name = "noise_floor_censoring"
+    of_receiver = True
     stage = "receiver"
     confused_with = ("interference", "excess_attenuation")
 

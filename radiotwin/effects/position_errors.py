@@ -71,6 +71,7 @@ class ReceiverPositionError(Effect):
     """All positions of a receiver are off by a constant; one step finds one receiver, the worst."""
 
     name = "receiver_position_error"
+    of_receiver = True
     repeatable = True
     confused_with = ("receiver_gain_offset",)
 

@@ -23,6 +23,7 @@ class ReceiverDrift(Effect):
     """For each receiver the one of three forms that explains it best; none where none does."""
 
     name = "receiver_drift"
+    of_receiver = True
     confused_with = ("receiver_gain_offset", "interference")
 
     def lacks(self, records) -> str | None:

@@ -17,6 +17,7 @@ class ReceiverSaturation(Effect):
     """Receivers that read less than they receive at the strong end; those that are helped share one curve each."""
 
     name = "receiver_saturation"
+    of_receiver = True
     stage = "receiver"
     confused_with = ("antenna_pattern", "excess_attenuation")
 

@@ -45,6 +45,7 @@ class TiltedDipole(Effect):
     """A receiver's dipole leans; the same for each receiver that it helps."""
 
     name = "antenna_pattern"
+    of_receiver = True
     variant = "tilted dipole of a receiver"
     confused_with = ("body_shadowing", "receiver_gain_offset")
 

@@ -4,9 +4,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from radiotwin.closeloop.corrected import corrected_twin
 from radiotwin.closeloop.report import make_report
 from radiotwin.closeloop.run import close_loop
 from radiotwin.measurements import Measurements
+from radiotwin.twin import Twin
 
 LAWS = {True: (-30.0, -2.5, 1.4), False: (-35.0, -3.04, 2.2)}  # with line of sight, and without: level, slope, noise
 
@@ -56,21 +58,42 @@ def run(measurements, scene):
     return make_report(close_loop(measurements, scene, "twin", 0, lambda text: None))
 
 
+def error_db(radio_map, scene, blocked):
+    """RMSE of a map against the two laws."""
+    receiver_m = np.tile(scene.lattice.positions_m, (len(scene.device_m), 1))
+    device_m = np.repeat(scene.device_m, len(scene.lattice.positions_m), axis=0)
+    hidden, distance_m = blocked(device_m, receiver_m), np.linalg.norm(receiver_m - device_m, axis=1)
+    truth_db = np.where(hidden, LAWS[False][0] + 10 * LAWS[False][1] * np.log10(distance_m),
+                        LAWS[True][0] + 10 * LAWS[True][1] * np.log10(distance_m))
+    error = radio_map.gain_db.reshape(-1) - truth_db
+    return float(np.sqrt(np.nanmean(error**2)))
+
+
 def test_a_map_that_is_right_is_left_alone(small_scene):
     report = run(survey(small_scene, 0, lambda a, b: ~small_scene.city.line_of_sight(a, b)), small_scene)
     assert report["verdict"] == "none", [effect["name"] for effect in report["effects"]]
 
 
-def test_a_building_that_no_map_shows_is_found(small_scene):
+def test_a_building_that_no_map_shows_is_found_and_goes_into_the_twin(small_scene, tmp_path):
     middle_m = free_place(small_scene)
     box = (middle_m - 9.0, np.array([18.0, 18.0, 60.0]))
-    report = run(survey(small_scene, 1, lambda a, b: ~small_scene.city.line_of_sight(a, b) | hits(*box, a, b)),
-                 small_scene)
+    measurements = survey(small_scene, 1, lambda a, b: ~small_scene.city.line_of_sight(a, b) | hits(*box, a, b))
+    loop = close_loop(measurements, small_scene, "twin", 0, lambda text: None)
+    report = make_report(loop)
     assert report["effects"][0]["name"] == "missing_obstacle"
     parameters = report["effects"][0]["parameters"]
     found_m = np.array([parameters["x_m"]["value"], parameters["y_m"]["value"]])
     assert np.linalg.norm(found_m - middle_m) < 8
     assert report["error"]["after"]["rmse_db"] < 0.85 * report["error"]["before"]["rmse_db"]
+    corrected_twin(loop, small_scene).save(tmp_path / "twin")
+    corrected = Twin.load(tmp_path / "twin")
+    plain = Twin(corrected.channel, corrected.devices, corrected.level, corrected.limit_db)
+
+    def blocked(a, b):
+        return ~small_scene.city.line_of_sight(a, b) | hits(*box, a, b)
+
+    before = error_db(plain.radio_map(small_scene), small_scene, blocked)
+    assert error_db(corrected.radio_map(small_scene), small_scene, blocked) < 0.75 * before
 
 
 def test_a_building_that_is_gone_is_named(small_scene):

@@ -1,5 +1,6 @@
 """Cities of boxes, turned as one likes."""
 
+import mapbox_earcut
 import numpy as np
 import pytest
 import trimesh
@@ -25,6 +26,16 @@ def box_mesh():
         mesh = trimesh.creation.box(extents=[x_max - x_min, y_max - y_min, height])
         mesh.apply_translation([(x_min + x_max) / 2, (y_min + y_max) / 2, height / 2])
         return mesh
+    return build
+
+
+@pytest.fixture(scope="session")
+def prism():
+    """A closed prism over an outline of (n, 2) corners, counter-clockwise."""
+    def build(outline_m, height_m):
+        corners = np.array(outline_m, dtype=float)
+        faces = mapbox_earcut.triangulate_float64(corners, np.array([len(corners)], dtype=np.uint32)).reshape(-1, 3)
+        return trimesh.creation.extrude_triangulation(corners, faces, height_m)
     return build
 
 

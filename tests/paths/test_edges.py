@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import trimesh
 
 from radiotwin.paths import extract_edges
 from radiotwin.scene.citymap import CityMap
@@ -25,9 +24,8 @@ def test_pieces_of_an_edge_are_one(box_mesh, city_of):
     assert lengths_m(extract_edges(city_of(mesh))).tolist() == [10, 10, 20, 20, 30, 30, 30, 30]
 
 
-def test_an_inner_corner_does_not_diffract():
-    outline = trimesh.path.polygons.Polygon([(0, 0), (30, 0), (30, 10), (10, 10), (10, 30), (0, 30)])
-    mesh = trimesh.creation.extrude_polygon(outline, 12.0)
+def test_an_inner_corner_does_not_diffract(prism):
+    mesh = prism([(0, 0), (30, 0), (30, 10), (10, 10), (10, 30), (0, 30)], 12.0)
     edges = extract_edges(CityMap(mesh.vertices, mesh.faces))
     upright = np.abs(edges.direction[:, 2]) > 0.9
     assert upright.sum() == 5 and (~upright).sum() == 6
@@ -39,9 +37,8 @@ def test_a_roof_goes_on_over_a_shared_wall(city_of):
     assert not (np.isclose(edges.start_m[:, 0], 10) & (np.abs(edges.direction[:, 1]) > 0.9)).any()
 
 
-def test_the_angle_of_a_gable():
-    outline = trimesh.path.polygons.Polygon([(0, 0), (10, 0), (10, 6), (5, 11), (0, 6)])
-    mesh = trimesh.creation.extrude_polygon(outline, 20.0)
+def test_the_angle_of_a_gable(prism):
+    mesh = prism([(0, 0), (10, 0), (10, 6), (5, 11), (0, 6)], 20.0)
     turned = mesh.vertices[:, [2, 0, 1]]  # the outline stands upright; a cyclic swap keeps the winding
     edges = extract_edges(CityMap(turned, mesh.faces))
     ridge = np.isclose(edges.start_m[:, 2], 11) & np.isclose(edges.end_m[:, 2], 11)

@@ -49,9 +49,8 @@ def test_faces_of_the_ground_belong_to_no_facet(city_of):
     assert len(facets) == 5 and (facets.of_face[-2:] == -1).all()
 
 
-def test_a_bend_is_on_the_facet_but_not_beyond_it():
-    outline = trimesh.path.polygons.Polygon([(0, 0), (30, 0), (30, 10), (10, 10), (10, 30), (0, 30)])
-    mesh = trimesh.creation.extrude_polygon(outline, 12.0)
+def test_a_bend_is_on_the_facet_but_not_beyond_it(prism):
+    mesh = prism([(0, 0), (30, 0), (30, 10), (10, 10), (10, 30), (0, 30)], 12.0)
     city = CityMap(mesh.vertices, mesh.faces)
     facets = extract_facets(city)
     roof = int(np.flatnonzero(facets.normal[:, 2] > 0.9)[0])

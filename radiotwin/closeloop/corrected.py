@@ -1,0 +1,110 @@
+"""The twin with what the loop found in it: saved in `twin.json`, and applied wherever the twin predicts a map."""
+
+import numpy as np
+
+import radiotwin
+from radiotwin.closeloop.bases import FittedBase, FittedChannel, FittedPaths
+from radiotwin.closeloop.records import Records
+from radiotwin.closeloop.run import Loop
+from radiotwin.effects import CATALOGUE
+from radiotwin.effects.base import Effect
+from radiotwin.errors import BadInput
+from radiotwin.progress import progress
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.twin import Twin, TwinDevice
+
+CHUNK = 20_000  # links at once
+
+
+def corrected_twin(loop: Loop, scene: Scene) -> Twin:
+    """The twin of a loop, fitted to all its links, with all effects.
+
+    What belongs to a receiver (its offset, drift, antenna, …) is kept in the record, too, but a map is of what arrives
+    at a faultless receiver.
+    """
+    whole, fit = loop.after.whole, loop.after.fits[0]
+    records, law = whole.records, whole.base
+    split = whole.base_columns.shape[1]
+    parts = [{"name": part.effect.name, "variant": part.effect.variant, "setting": part.setting,
+              "coefficients": found.coefficients.tolist()} for part, found in zip(whole.parts, whole.found(fit))]
+    located = np.isfinite(law.device_m).all(axis=1)
+    devices = [TwinDevice(name, *(place_m if sure else (np.nan,) * 3), "anchor" if i in records.anchors else "unknown",
+                          bool(sure), 0.0 if i in records.anchors else np.inf, None)
+               for i, (name, place_m, sure) in enumerate(zip(records.device_names, law.device_m, located))]
+    effects = {"base": loop.base, "coefficients": fit.coefficients[:split].tolist(), "dof": whole.dof,
+               "scale_db": fit.scale_db.tolist(), "receivers": records.receiver_names, "parts": parts}
+    provenance = {"scene": scene.config.name, "scene_hash": scene.content_hash(), "links": len(records),
+                  "radiotwin_version": radiotwin.__version__}
+    return Twin(_channel(law), devices, "gain_db" if records.is_gain else "rssi_dbm", records.limit_db, provenance,
+                effects)
+
+
+def corrected_map(twin: Twin, scene: Scene) -> RadioMap:
+    """What a twin with effects predicts over a scene's lattice.
+
+    Raises:
+        BadInput: effects that this version does not know.
+    """
+    found = twin.effects
+    base = FittedChannel(twin.channel, twin.device_m)
+    if found["base"] == "raytrace":
+        base = FittedPaths(base)
+    parts = [(_effect(part["name"], part["variant"]), part) for part in found["parts"]]
+    known = np.flatnonzero(np.isfinite(twin.device_m).all(axis=1))
+    receiver_m = scene.lattice.positions_m
+    shape = (len(known), len(receiver_m))
+    mean_db, sigma_db, los = np.empty(shape), np.empty(shape), np.empty(shape, dtype=bool)
+    scale_db = np.array(found["scale_db"]) * np.sqrt(found["dof"] / (found["dof"] - 2))
+    with progress("mapping", total=len(known)) as advance:
+        for row, device in enumerate(known):
+            for start in range(0, len(receiver_m), CHUNK):
+                place = slice(start, start + CHUNK)
+                records = _records(twin, scene, receiver_m[place], device)
+                mean_db[row, place] = _mean_db(base, records, np.array(found["coefficients"]), parts)
+                sigma_db[row, place] = scale_db[base.group(records)]
+                los[row, place] = records.los
+            advance(1)
+    if twin.level == "rssi_dbm":
+        mean_db -= scene.config.radio.tx_power_dbm
+    names = ", ".join(part["name"] for part in found["parts"]) or "nothing"
+    attributes = {"source": f"twin:{found['base']} with {names}",
+                  "frequency_hz": scene.config.radio.frequency_hz, "gain_limit_db": scene.config.gain_limit_db,
+                  "scene_hash": scene.content_hash(), "radiotwin_version": radiotwin.__version__}
+    return RadioMap.build([twin.devices[i].device for i in known], scene.lattice, mean_db, los, sigma_db, attributes)
+
+
+def _mean_db(base: FittedBase, records: Records, coefficients: np.ndarray,
+             parts: list[tuple[Effect, dict]]) -> np.ndarray:
+    level_db = base.mean_db(records) + base.columns(records)[0] @ coefficients
+    gain_db = np.zeros(len(records))
+    for effect, part in parts:
+        if effect.of_receiver:
+            continue
+        term = effect.term(records, part["setting"], base.shifted_db)
+        if effect.stage == "paths":
+            level_db, _ = effect.bend(level_db, records, part["setting"], term.extra)
+        gain_db += term.offset_db + term.columns @ np.array(part["coefficients"])
+    return level_db + gain_db
+
+
+def _records(twin: Twin, scene: Scene, receiver_m: np.ndarray, device: int) -> Records:
+    """Links of nobody in particular: no receiver, no flight, no time."""
+    n = len(receiver_m)
+    nobody, unknown = np.full(n, -1), np.full(n, np.nan)
+    anchors = frozenset(i for i, known in enumerate(twin.devices) if known.role == "anchor")
+    return Records(unknown, twin.limit_db, receiver_m, np.nan_to_num(twin.device_m), np.full(n, device), nobody, nobody,
+                   unknown, unknown, [known.device for known in twin.devices], [], [],
+                   scene.config.radio.frequency_hz, scene.city, twin.level == "gain_db", anchors)
+
+
+def _effect(name: str, variant: str) -> Effect:
+    for effect in CATALOGUE:
+        if (effect.name, effect.variant) == (name, variant):
+            return effect()
+    raise BadInput(f"the twin has the effect {name!r} ({variant}), which this version of radiotwin does not know; it "
+                   f"knows {', '.join(sorted({effect.name for effect in CATALOGUE}))}")
+
+
+def _channel(base: FittedBase):
+    return base.law.channel if isinstance(base, FittedPaths) else base.channel
