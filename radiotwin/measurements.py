@@ -23,6 +23,8 @@ TEXT = {"flight", "receiver", "device", "role"}
 ROLES = ("anchor", "unknown")
 GREATEST_LEVEL_DB = 300.0
 GREATEST_COORDINATE_M = 1e7
+FREQUENCIES_HZ = (1e6, 450e9)
+NEEDED = "every row needs one: fill it in, or leave the row out"
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,10 +146,13 @@ def read_devices(path: Path | str) -> pd.DataFrame:
     """Read `devices.csv`; raises BadInput as `read_measurements` does."""
     path = Path(path)
     devices = _read_table(path, DEVICE_REQUIRED, DEVICE_OPTIONAL, may_be_empty={"x_m", "y_m", "z_m", *DEVICE_OPTIONAL})
+    if devices.empty:
+        raise BadInput(f"{path}: has no rows; it needs one for each device")
     double = devices["device"].duplicated()
     if double.any():
         row = int(np.flatnonzero(double)[0])
-        raise BadInput(f"{path}: row {row + 2}, column device: {devices['device'][row]!r} stands there twice")
+        raise BadInput(f"{path}: row {row + 2}, column device: {devices['device'][row]!r} stands there twice; every "
+                       "device needs one row, and a name of its own")
     wrong = ~devices["role"].isin(ROLES)
     if wrong.any():
         row = int(np.flatnonzero(wrong)[0])
@@ -198,6 +203,8 @@ def _read_csv(path: Path) -> pd.DataFrame:
     means "not detected"."""
     rows = _fields(path)
     header = [name.strip() for name in next(rows, [])]
+    if not header:
+        raise BadInput(f"{path} is empty; it needs a first row with the names of the columns")
     _check_header(path, header)
     if len(header) == 1 and not header[0].isidentifier():
         raise BadInput(f"{path}: its header {header[0][:60]!r} is one single column; allowed is comma-separated, UTF-8")
@@ -231,18 +238,24 @@ def _numbers(path: Path, name: str, column: pd.Series, may_be_empty: bool) -> pd
         numbers = pd.to_numeric(text, errors="coerce")
         not_a_number = text.str.lower().isin(["nan", "na", "none"])
         _refuse(path, name, column, numbers.isna() & ~empty & ~not_a_number, "is not a number")
-        _refuse(path, name, column, not_a_number, "is not a number; leave the cell empty where there is no value")
+        _refuse(path, name, column, not_a_number,
+                f"is not a number; {'leave the cell empty where there is no value' if may_be_empty else NEEDED}")
         numbers = numbers.astype(float)
     _refuse(path, name, column, np.isinf(numbers), "is not finite; leave the cell empty where nothing was detected"
             if name in LEVELS else "is not finite")
     if not may_be_empty:
-        _refuse(path, name, column, empty, "is empty")
+        _refuse(path, name, column, empty, f"is empty; {NEEDED}")
     if name in LEVELS:
         _refuse(path, name, column, numbers.abs() > GREATEST_LEVEL_DB,
                 f"is no level; allowed are -{GREATEST_LEVEL_DB:g} to {GREATEST_LEVEL_DB:g}")
     if name == "gain_db":
         _refuse(path, name, column, numbers > 0,
-                "is above 0 dB, which no channel gain is; received power [dBm] goes into a column rssi_dbm")
+                "is above 0 dB, which no channel gain is; received power [dBm] goes into a column rssi_dbm, and a "
+                "path loss needs a minus sign")
+    if name == "frequency_hz":
+        low, high = FREQUENCIES_HZ
+        _refuse(path, name, column, (numbers < low) | (numbers > high),
+                f"is no frequency; allowed are {low:g} to {high:g} Hz; the unit is Hz")
     if name.endswith("_m"):
         _refuse(path, name, column, numbers.abs() > GREATEST_COORDINATE_M,
                 f"is too far away; allowed are -{GREATEST_COORDINATE_M:g} to {GREATEST_COORDINATE_M:g} m in the "

@@ -19,13 +19,19 @@ def close_loop(
     devices: Annotated[Path | None, typer.Option(help="Table of devices [devices.csv beside the file].")] = None,
     base: Annotated[str, typer.Option(help="Whose residual: twin, raytrace, log-distance; auto: the best of them.")
                     ] = "auto",
+    hold_out: Annotated[str, typer.Option(help="What is held out together: flight, block, device; auto: by flight if "
+                                               "there are enough.")] = "auto",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for closeloop.json, closeloop.html and figures.")
                    ] = Path("closeloop"),
+    write_scene: Annotated[Path | None, typer.Option(
+        metavar="DIR", help="Scene folder to write: SCENE with traced boxes, without buildings that are gone, anchors "
+                            "where they were found.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of folds, fits and permutations.")] = 0,
 ) -> None:
     """Find what the model lacks, add it, and say by how much the error falls."""
     from radiotwin.closeloop.corrected import corrected_twin
-    from radiotwin.closeloop.figures import draw_drivers, draw_residual_map, draw_waterfall
+    from radiotwin.closeloop.corrected_scene import check_corrected_target, write_corrected_scene
+    from radiotwin.closeloop.figures import draw_figures
     from radiotwin.closeloop.page import lead, write_page
     from radiotwin.closeloop.report import make_report, write_report
     from radiotwin.closeloop.run import close_loop as run
@@ -38,12 +44,12 @@ def close_loop(
     data = read_measurements(measurements, devices)
     world = Scene.load(scene) if scene else None
     require_writable(out / "closeloop.json")
+    if write_scene is not None:
+        check_corrected_target(write_scene, world, out)
     with progress("closing the loop", total=None) as advance:
-        loop = run(data, world, base, seed, lambda text: advance(1, text))
+        loop = run(data, world, base, seed, lambda text: advance(1, text), hold_out)
     report = make_report(loop)
-    draw_waterfall(loop, out / "waterfall.png")
-    draw_residual_map(loop, world, out / "residual_map.png")
-    draw_drivers(loop, out / "drivers.png")
+    draw_figures(loop, world, report, out)
     write_report(report, out / "closeloop.json")
     if world is not None:
         corrected_twin(loop, world).save(out / "twin")
@@ -65,3 +71,7 @@ def close_loop(
                  p["unit"]] for effect in report["effects"] for name, p in effect["parameters"].items()])
     say(lead(report))
     say(f"wrote {out / 'closeloop.html'}")
+    if write_scene is not None:
+        changes = write_corrected_scene(loop, world, write_scene)
+        say(f"wrote {write_scene}: {'; '.join(changes)}" if changes else
+            f"{write_scene} is not written: no building and no anchor was found to be wrong in {scene}")

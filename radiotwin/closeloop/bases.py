@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 import pandas as pd
+from scipy.optimize import minimize
 
 from radiotwin.channel import ChannelModel, Links, check_fit_data
 from radiotwin.channel.log_distance import LogDistance
@@ -18,6 +19,11 @@ from radiotwin.twin import Twin, fit_twin
 LEVEL_SPREAD_DB = 20.0
 SLOPE_SPREAD_DB = 10.0  # per decade
 ANY_LEVEL_DB = 300.0
+LOST_M = 40.0  # a device that may be that far from where it seems to be says nothing about the channel
+LEAST_HIDDEN = 30  # links without line of sight that the rest is fitted to
+REST_LOW_DB, REST_EXPONENT = -150.0, 3.0
+REST_BOUNDS = np.array([[REST_LOW_DB, 2.0], [-60.0, 6.0]])
+REST_SCALE_DB = 4.0
 
 
 class FittedBase(ABC):
@@ -90,7 +96,7 @@ class TwinBase(Base):
     def _fit(self, records: Records) -> FittedBase:
         if self._scene is not None:
             twin = _fit_twin(records, self._scene, "segmented_log_distance", self._seed)
-            return FittedChannel(twin.channel, _located_m(twin))
+            return FittedChannel(twin.channel, _located_m(twin, LOST_M))
         return _fit_channel(records, SegmentedLogDistance(), self._seed)
 
 
@@ -103,20 +109,24 @@ class RaytraceBase(Base):
         self._twin = twin
 
     def fit(self, records: Records) -> FittedBase:
-        return FittedPaths(self._twin.fit(records))
+        law = self._twin.fit(records)
+        return FittedPaths(law, _fit_rest(records, law.device_m))
 
 
 class FittedPaths(FittedBase):
-    """Powers of paths; `law` has the positions, and says what moving an end changes."""
+    """Powers of paths, and of what reaches any place on ways that are not followed.
 
-    def __init__(self, law: FittedBase):
-        self.law, self.device_m = law, law.device_m
+    Attributes:
+        law: has the positions, and says what moving an end changes.
+        rest: power of the paths that are not followed (more bounces and edges, rough walls): gain at 100 m [dB], and
+            exponent of its fall with distance.
+    """
+
+    def __init__(self, law: FittedBase, rest: tuple[float, float]):
+        self.law, self.device_m, self.rest = law, law.device_m, rest
 
     def mean_db(self, records: Records) -> np.ndarray:
-        power = paths_of(records, COMPONENTS)
-        # Where no path was found: as little as any other link has.
-        least = power[power > 0].min(initial=1e-15)
-        return 10 * np.log10(np.maximum(power, least))
+        return _with_rest_db(paths_of(records, COMPONENTS), records, *self.rest)
 
     def shifted_db(self, records: Records) -> np.ndarray:
         return self.law.mean_db(records)
@@ -127,6 +137,35 @@ class FittedPaths(FittedBase):
 
     def group(self, records: Records) -> np.ndarray:
         return records.los.astype(int)
+
+
+def _with_rest_db(power: np.ndarray, records: Records, rest_db: float, exponent: float) -> np.ndarray:
+    return 10 * np.log10(power + 10 ** (rest_db / 10) * (records.distance_m / 100.0) ** -exponent)
+
+
+def _fit_rest(records: Records, device_m: np.ndarray) -> tuple[float, float]:
+    """What explains the levels of links without line of sight best, beside a level of their own."""
+    rows = np.isfinite(device_m).all(axis=1)[records.device]
+    placed = records.with_devices(np.where(np.isfinite(device_m), device_m, 0.0)).select(rows)
+    hidden = placed.select(~placed.los)
+    power = paths_of(hidden, COMPONENTS)
+    level_db = np.where(np.isnan(hidden.level_db), -np.inf if hidden.limit_db is None else hidden.limit_db,
+                        hidden.level_db)
+    blank, told = np.isnan(hidden.level_db), np.isfinite(level_db)
+    if told.sum() < LEAST_HIDDEN:
+        return REST_LOW_DB, REST_EXPONENT
+
+    def loss(numbers: np.ndarray) -> float:
+        rest_db, exponent = np.clip(numbers, *REST_BOUNDS)
+        error_db = level_db - _with_rest_db(power, hidden, rest_db, exponent)
+        error_db = error_db - np.median(error_db[told & ~blank])
+        error_db = np.where(blank, np.minimum(error_db, 0.0), error_db)[told]
+        return float(np.log1p((error_db / REST_SCALE_DB) ** 2).sum() + np.abs(numbers - [rest_db, exponent]).sum())
+
+    starts = [np.array([rest_db, REST_EXPONENT]) for rest_db in (-100.0, -110.0, -120.0, -130.0)]
+    found = minimize(loss, min(starts, key=loss), method="Nelder-Mead", options={"xatol": 0.1, "fatol": 0.5}).x
+    rest_db, exponent = np.clip(found, *REST_BOUNDS)
+    return float(rest_db), float(exponent)
 
 
 class FittedChannel(FittedBase):
@@ -163,9 +202,9 @@ def _fit_channel(records: Records, channel: ChannelModel, seed: int) -> FittedBa
     return FittedChannel(channel.fit(links, records.level_db, records.limit_db, seed), records.device_m)
 
 
-def _located_m(twin: Twin) -> np.ndarray:
-    """(k, 3) positions that may be relied on."""
-    located = np.array([device.located for device in twin.devices])
+def _located_m(twin: Twin, lost_m: float = np.inf) -> np.ndarray:
+    """(k, 3) positions that may be relied on: NaN where nine in ten of the guesses are farther off than `lost_m`."""
+    located = np.array([device.located and device.credible_radius_m <= lost_m for device in twin.devices])
     return np.where(located[:, None], twin.device_m, np.nan)
 
 

@@ -6,6 +6,7 @@ import radiotwin
 from radiotwin.closeloop.bases import FittedBase, FittedChannel, FittedPaths
 from radiotwin.closeloop.records import Records
 from radiotwin.closeloop.run import Loop
+from radiotwin.closeloop.shadowing import Shadowing
 from radiotwin.effects import CATALOGUE
 from radiotwin.effects.base import Effect
 from radiotwin.errors import BadInput
@@ -34,6 +35,10 @@ def corrected_twin(loop: Loop, scene: Scene) -> Twin:
                for i, (name, place_m, sure) in enumerate(zip(records.device_names, law.device_m, located))]
     effects = {"base": loop.base, "coefficients": fit.coefficients[:split].tolist(), "dof": whole.dof,
                "scale_db": fit.scale_db.tolist(), "receivers": records.receiver_names, "parts": parts}
+    if isinstance(law, FittedPaths):
+        effects["rest"] = list(law.rest)
+    if loop.after.shadowing:
+        effects["shadowing"] = loop.after.shadowing[0].state()
     provenance = {"scene": scene.config.name, "scene_hash": scene.content_hash(), "links": len(records),
                   "radiotwin_version": radiotwin.__version__}
     return Twin(_channel(law), devices, "gain_db" if records.is_gain else "rssi_dbm", records.limit_db, provenance,
@@ -49,8 +54,9 @@ def corrected_map(twin: Twin, scene: Scene) -> RadioMap:
     found = twin.effects
     base = FittedChannel(twin.channel, twin.device_m)
     if found["base"] == "raytrace":
-        base = FittedPaths(base)
+        base = FittedPaths(base, tuple(found["rest"]))
     parts = [(_effect(part["name"], part["variant"]), part) for part in found["parts"]]
+    shadowing = Shadowing.from_state(found["shadowing"]) if "shadowing" in found else None
     known = np.flatnonzero(np.isfinite(twin.device_m).all(axis=1))
     receiver_m = scene.lattice.positions_m
     shape = (len(known), len(receiver_m))
@@ -61,14 +67,19 @@ def corrected_map(twin: Twin, scene: Scene) -> RadioMap:
             for start in range(0, len(receiver_m), CHUNK):
                 place = slice(start, start + CHUNK)
                 records = _records(twin, scene, receiver_m[place], device)
+                group = base.group(records)
                 mean_db[row, place] = _mean_db(base, records, np.array(found["coefficients"]), parts)
-                sigma_db[row, place] = scale_db[base.group(records)]
+                sigma_db[row, place] = scale_db[group]
+                if shadowing is not None and shadowing.receivers_move:
+                    shift, left = shadowing.at(records)
+                    mean_db[row, place] += shift * np.array(found["scale_db"])[group]
+                    sigma_db[row, place] *= left
                 los[row, place] = records.los
             advance(1)
     if twin.level == "rssi_dbm":
         mean_db -= scene.config.radio.tx_power_dbm
-    names = ", ".join(part["name"] for part in found["parts"]) or "nothing"
-    attributes = {"source": f"twin:{found['base']} with {names}",
+    names = [part["name"] for part in found["parts"]] + ["correlated_shadowing"] * (shadowing is not None)
+    attributes = {"source": f"twin:{found['base']} with {', '.join(names) or 'nothing'}",
                   "frequency_hz": scene.config.radio.frequency_hz, "gain_limit_db": scene.config.gain_limit_db,
                   "scene_hash": scene.content_hash(), "radiotwin_version": radiotwin.__version__}
     return RadioMap.build([twin.devices[i].device for i in known], scene.lattice, mean_db, los, sigma_db, attributes)

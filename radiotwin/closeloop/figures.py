@@ -1,119 +1,188 @@
-"""Pictures of the residual: where it is, what drives it, and what each step took of it."""
+"""Pictures of the report: the error from step to step, and what it depended on."""
 
 from pathlib import Path
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
-from radiotwin.closeloop.run import Loop
-from radiotwin.closeloop.search import rmse_db
+from radiotwin.closeloop.drawing import (
+    AFTER,
+    BEFORE,
+    FITTED,
+    Means,
+    bins,
+    means,
+    new_figure,
+    on_axis,
+    save,
+    shorten,
+    tidy,
+)
+from radiotwin.closeloop.effect_figures import draw_effects
+from radiotwin.closeloop.folds import evidence_blocks
+from radiotwin.closeloop.map_figures import Ground, draw_residual_map
+from radiotwin.closeloop.run import Loop, significant
+from radiotwin.closeloop.shadowing import NAME as LAST_RESORT
 from radiotwin.closeloop.structure import variables
-from radiotwin.files import atomic_path
+from radiotwin.closeloop.words import plainly
 from radiotwin.scene import Scene
 
-MOST_POINTS = 20_000
-BEFORE, AFTER = "#c2571a", "#1f6f8b"
-BINS = 24
-RANGE_DB = 15.0
+BINS = 20
+MOST_PANELS = 6
+MOST_MEMBERS = 24  # receivers, devices or flights in one panel
+ADDED = "what the effects add"
+PLACES = ("place_of_ray", "place_of_receiver")  # the map shows them
 
 
-def draw_residual_map(loop: Loop, scene: Scene | None, path: Path) -> None:
-    """Held-out residual at the receivers' places, before and after."""
-    figure = _figure(11, 5.2)
-    records = loop.after.whole.records
-    rows = _some(np.flatnonzero(np.isfinite(records.level_db)))
-    moving = len(np.unique(records.receiver_m[:, :2].round(), axis=0)) >= len(records.device_names)
-    place_m = (records.receiver_m if moving else records.device_m[records.device])[rows]
-    for column, (name, model) in enumerate((("before", loop.before), ("after", loop.after))):
-        ax = figure.add_subplot(1, 2, column + 1)
-        if scene is not None:
-            _outline(ax, scene)
-        residual_db = (records.level_db - model.held_out_mean_db())[rows]
-        dots = ax.scatter(place_m[:, 0], place_m[:, 1], c=residual_db, s=4, cmap="RdBu", vmin=-RANGE_DB, vmax=RANGE_DB,
-                          linewidths=0, rasterized=True)
-        if moving:
-            known = records.device_m[np.unique(records.device)]
-            ax.plot(known[:, 0], known[:, 1], "k^", markersize=5, label="devices")
-        _boxes(ax, loop)
-        ax.set(title=f"{name}: {rmse_db(model, np.ones(len(records), bool)):.2f} dB", xlabel="x, east [m]",
-               ylabel="y, north [m]", aspect="equal")
-    figure.colorbar(dots, ax=figure.axes, label="measured − predicted [dB]", shrink=0.8)
-    _save(figure, path)
+def draw_figures(loop: Loop, scene: Scene | None, report: dict, folder: Path) -> None:
+    """Write all pictures of a report into its folder."""
+    ground = Ground(loop.after.whole.records, scene)
+    draw_waterfall(report, folder / "waterfall.png")
+    draw_residual_map(loop, ground, folder / "residual_map.png")
+    draw_drivers(loop, folder / "drivers.png")
+    draw_effects(loop, ground, folder)
+
+
+def draw_waterfall(report: dict, path: Path) -> None:
+    """Held-out RMSE: the base, what each kept effect takes off, and the end; other models as lines."""
+    before, after = (report["error"][when]["rmse_db"] or 0.0 for when in ("before", "after"))
+    kept = [(candidate["name"], candidate["heldout_rmse_db"]) for candidate in report["candidates"]
+            if candidate["kept"] and candidate["heldout_rmse_db"] is not None]
+    levels = [before, *(rmse_db for _, rmse_db in kept)]
+    steps = [plainly(name) for name, _ in kept]
+    if kept and abs(levels[-1] - after) > 0.005:
+        levels.append(after)
+        steps.append("all fitted again")
+    figure = new_figure(max(1.15 * (len(steps) + 2) + 2.6, 6.5), 4.6)
+    ax = figure.add_subplot()
+    _bar(ax, 0, 0.0, before, BEFORE, f"{before:.2f} dB")
+    for place, (high, low) in enumerate(zip(levels, levels[1:]), start=1):
+        colour = AFTER if low <= high else BEFORE
+        if steps[place - 1] == plainly(LAST_RESORT):
+            colour = "0.5"
+        _bar(ax, place, high, low, colour, f"{low - high:+.2f}".replace("-", "−"), alpha=0.55)
+        ax.plot([place - 0.65, place + 0.35], [high, high], color="0.5", linewidth=0.8)
+    names = [f"before: {plainly(report['base'])} alone", *steps]
+    if kept:
+        end = len(steps) + 1
+        ax.plot([end - 0.65, end + 0.35], [after, after], color="0.5", linewidth=0.8)
+        _bar(ax, end, 0.0, after, AFTER, f"{after:.2f} dB")
+        names.append("after")
+    lines = [(value["rmse_db"], plainly(name), "--") for name, value in report["baselines"].items()
+             if value["rmse_db"] is not None]
+    if report["error"]["noise_floor_db"] is not None:
+        lines.append((report["error"]["noise_floor_db"], "noise of one\nmeasurement", ":"))
+    top = 1.12 * max(before, after, *levels, *(value for value, *_ in lines))
+    ax.set(xlim=(-0.6, len(names) - 0.4), ylim=(0, max(top, 0.1)), ylabel="error on held-out links, RMSE [dB]",
+           title=_change(before, after) if kept else "no effect of the catalogue lowers the error")
+    ax.set_xticks(range(len(names)), [_wrapped(name) for name in names])
+    _lines(ax, lines)
+    ax.tick_params(axis="x", length=0)
+    tidy(ax)
+    save(figure, path)
 
 
 def draw_drivers(loop: Loop, path: Path) -> None:
-    """Mean held-out residual against the variables that it depended on most, before and after."""
+    """Mean held-out residual against the strongest variables before and after, and what the effects add there."""
     records = loop.after.whole.records
-    names = [driver.variable for driver in loop.drivers_before][:6]
-    means = [records.level_db - model.held_out_mean_db() for model in (loop.before, loop.after)]
     values = variables(records, loop.before.held_out_mean_db())
-    figure = _figure(11, 3.1 * ((len(names) + 2) // 3))
+    names = _strongest(loop, values)
+    residual_db = [records.level_db - model.held_out_mean_db() for model in (loop.before, loop.after)]
+    seen = np.isfinite(residual_db[0]) & np.isfinite(residual_db[1])
+    block = evidence_blocks(records)
+    columns = {1: 1, 2: 2, 4: 2}.get(len(names), 3)
+    rows = max(-(-len(names) // columns), 1)
+    figure = new_figure(4.1 * columns, 3.2 * rows + 0.4)
     for number, name in enumerate(names):
-        ax = figure.add_subplot((len(names) + 2) // 3, 3, number + 1)
-        value = values[name].astype(float)
-        for residual_db, colour, label in zip(means, (BEFORE, AFTER), ("before", "after")):
-            seen = np.isfinite(value) & np.isfinite(residual_db)
-            edges = np.unique(np.quantile(value[seen], np.linspace(0, 1, BINS + 1)))
-            place = np.clip(np.searchsorted(edges, value[seen], side="right") - 1, 0, max(len(edges) - 2, 0))
-            count = np.maximum(np.bincount(place), 1)
-            centre = np.bincount(place, weights=value[seen]) / count
-            mean = np.bincount(place, weights=residual_db[seen]) / count
-            used = np.bincount(place) > 5
-            ax.plot(centre[used], mean[used], "o-", color=colour, markersize=3, linewidth=1.2, label=label)
-        ax.axhline(0, color="0.6", linewidth=0.8)
-        ax.set(xlabel=name, ylabel="mean residual [dB]" if number % 3 == 0 else "")
+        ax = figure.add_subplot(rows, columns, number + 1)
+        value, axis_label = on_axis(records, name, values[name])
+        used = seen & np.isfinite(value)
+        labels = _labels(records, name)
+        level = bins(value[used], BINS) if labels is None else value[used]
+        before, after = (means(level, value[used].astype(float), each[used], block[used]) for each in residual_db)
+        if labels is None:
+            _curves(ax, before, after, loop.after is not loop.before)
+        else:
+            _categories(ax, before, after, labels, loop.after is not loop.before)
+        ax.set(xlabel=axis_label, ylabel="mean residual [dB]" if number % columns == 0 else "")
+        ax.axhline(0, color="0.6", linewidth=0.8, zorder=0)
+        tidy(ax)
     if names:
-        figure.axes[0].legend(frameon=False)
-    _save(figure, path)
+        found = dict(zip(*figure.axes[0].get_legend_handles_labels()[::-1]))
+        labels = [label for label in ("before", "after", ADDED) if label in found]
+        figure.legend([found[label] for label in labels], labels, loc="outside upper center", ncols=3, frameon=False)
+    else:
+        figure.text(0.5, 0.5, "no variable could be tested", ha="center", va="center", fontsize=12)
+    save(figure, path)
 
 
-def draw_waterfall(loop: Loop, path: Path) -> None:
-    """Held-out RMSE from the base over each kept effect to the end, beside other models."""
-    everything = np.ones(len(loop.records), dtype=bool)
-    names = [f"base: {loop.base}", *(f"+ {entry.name}" for entry in loop.search.log if entry.kept)]
-    values = [rmse_db(loop.before, everything), *(entry.rmse_db for entry in loop.search.log if entry.kept)]
-    figure = _figure(8, 0.55 * (len(names) + len(loop.baselines)) + 1.0)
-    ax = figure.add_subplot()
-    colours = [BEFORE, *[AFTER] * (len(values) - 1), *["0.7"] * len(loop.baselines)]
-    names += [name.replace("_", " ") for name in loop.baselines]
-    values += list(loop.baselines.values())
-    ax.barh(names[::-1], values[::-1], color=colours[::-1])
-    for row, value in enumerate(values[::-1]):
-        ax.text(value, row, f" {value:.2f}", va="center")
-    ax.set(xlabel="error on held-out links, RMSE [dB]", xlim=(0, 1.12 * max(values)))
-    ax.spines[["top", "right"]].set_visible(False)
-    _save(figure, path)
+def _strongest(loop: Loop, values: dict[str, np.ndarray]) -> list[str]:
+    """Variables that matter before, then those that matter after; where none does, the likeliest three."""
+    found = [driver.variable for driver in (*significant(loop.drivers_before), *significant(loop.drivers_after))]
+    found = found or [driver.variable for driver in loop.drivers_before][:3]
+    return [name for name in dict.fromkeys(found) if name in values and name not in PLACES][:MOST_PANELS]
 
 
-def _outline(ax, scene: Scene) -> None:
-    x_min, x_max, y_min, y_max = scene.config.extent.bounds
-    x_m, y_m = np.linspace(x_min, x_max, 300), np.linspace(y_min, y_max, 300)
-    height_m = scene.city.height_at(*np.meshgrid(x_m, y_m))
-    ax.contourf(x_m, y_m, height_m, levels=[2.0, 1e4], colors=["0.85"])
+def _labels(records, name: str) -> list[str] | None:
+    """Names of the values of a variable that is no number."""
+    return {"receiver": records.receiver_names, "device": records.device_names, "flight": records.flight_names,
+            "los": ["without", "with"]}.get(name)
 
 
-def _boxes(ax, loop: Loop) -> None:
-    """Traced boxes, drawn."""
-    for part in loop.after.whole.parts:
-        if "box" in part.setting:
-            x_m, y_m, length_m, width_m, _, turn_deg = part.setting["box"]
-            turn = np.radians(turn_deg)
-            corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * 0.5 * (length_m, width_m)
-            corners = corners @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]]) + (x_m, y_m)
-            ax.plot(corners[:, 0], corners[:, 1], color="#7a0177", linewidth=2)
+def _curves(ax, before: Means, after: Means, changed: bool) -> None:
+    styles = [(before, BEFORE, "before"), (after, AFTER, "after")]
+    for curve, colour, label in styles if changed else styles[:1]:
+        ax.fill_between(curve.at, curve.mean - curve.error, curve.mean + curve.error, color=colour, alpha=0.2,
+                        linewidth=0)
+        ax.plot(curve.at, curve.mean, "o-", color=colour, markersize=3, linewidth=1.3, label=label)
+    if changed:
+        ax.plot(before.at, before.mean - after.mean, color=FITTED, linewidth=1.3, linestyle="--",
+                label=ADDED)
 
 
-def _some(rows: np.ndarray) -> np.ndarray:
-    return rows[:: max(len(rows) // MOST_POINTS, 1)]
+def _categories(ax, before: Means, after: Means, labels: list[str], changed: bool) -> None:
+    shown = np.sort(np.argsort(-np.abs(before.mean))[:MOST_MEMBERS])
+    place = np.arange(len(shown))
+    shift = 0.16 if changed else 0.0
+    ax.errorbar(place - shift, before.mean[shown], before.error[shown], fmt="o", color=BEFORE, markersize=5,
+                elinewidth=1.5, label="before")
+    if changed:
+        ax.errorbar(place + shift, after.mean[shown], after.error[shown], fmt="o", color=AFTER, markersize=5,
+                    elinewidth=1.5, label="after")
+        ax.plot(place, (before.mean - after.mean)[shown], "_", color=FITTED, markersize=12, markeredgewidth=1.5,
+                label=ADDED)
+    names = [shorten(labels[int(before.at[each])]) for each in shown]
+    crowded = sum(map(len, names)) > 36
+    ax.set_xticks(place, names, rotation=90 if crowded else 0, fontsize=8 if crowded else 10)
+    ax.set_xlim(-0.6, len(shown) - 0.4)
 
 
-def _figure(width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
+def _bar(ax, place: int, start: float, end: float, colour: str, text: str, **style) -> None:
+    low, high = sorted((start, end))
+    ax.bar(place, high - low, bottom=low, width=0.7, color=colour, zorder=2, **style)
+    ax.annotate(text, (place, high), xytext=(0, 3), textcoords="offset points", ha="center", va="bottom",
+                fontweight="bold", zorder=5)
 
 
-def _save(figure: Figure, path: Path) -> None:
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=110, format="png")
+def _lines(ax, lines: list[tuple[float, str, str]]) -> None:
+    """Thin lines across, each with its name and value at the right, moved apart where they would overlap."""
+    top, last = ax.get_ylim()[1], -np.inf
+    for value, name, style in sorted(lines):
+        ax.axhline(value, color="0.45", linewidth=0.9, linestyle=style, zorder=1)
+        last = max(value, last + 0.085 * top)
+        ax.annotate(f"{name} {value:.2f}", (1.0, last), xycoords=("axes fraction", "data"), xytext=(4, 0),
+                    textcoords="offset points", va="center", fontsize=9, color="0.3", annotation_clip=False)
+
+
+def _change(before: float, after: float) -> str:
+    return f"{before:.2f} → {after:.2f} dB on links that took no part" + (
+        f": {abs(1 - after / before):.0%} {'less' if after <= before else 'more'}" if before else "")
+
+
+def _wrapped(name: str) -> str:
+    """On lines of a word or two."""
+    lines = [""]
+    for word in name.split():
+        if lines[-1] and len(lines[-1]) + len(word) > 11:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    return "\n".join(lines)

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from radiotwin.closeloop.records import Records
+from radiotwin.errors import BadInput
 
 FEWEST_FLIGHTS = 4
 MOST_FOLDS = 6
+WAYS = ("flight", "block", "device")
 BLOCK_M = 60.0
 EVIDENCE_M = 100.0
 LEAST_CELLS = 10
@@ -19,8 +21,8 @@ class Folds:
     """A partition of n links.
 
     Attributes:
-        by: `flight` or `block`.
-        index: (n,) fold of each link.
+        by: one of `WAYS`.
+        index: (n,) fold of each link; -1 = never held out.
     """
 
     by: str
@@ -31,16 +33,32 @@ class Folds:
         return int(self.index.max()) + 1
 
 
-def make_folds(records: Records, seed: int) -> Folds:
-    """By flight where most links are of devices and receivers that are in at least four, else by blocks on the ground.
+def make_folds(records: Records, seed: int, by: str = "auto") -> Folds:
+    """Which links are held out together.
 
     Args:
         records: n links.
         seed: of which go together.
+        by: one of `WAYS`; or `auto`: by flight where most links are of devices and receivers that are in at least four,
+            else by blocks on the ground.
+
+    Raises:
+        BadInput: an unknown way, or one that this data does not allow.
     """
     rng = np.random.default_rng(seed)
-    if _flights_are_alike(records):
-        return Folds("flight", _spread(records.flight, rng))
+    if by == "auto":
+        by = "flight" if _flights_are_alike(records) else "block"
+    if by == "flight":
+        return Folds(by, _spread(_several(records.flight, by), rng))
+    if by == "device":
+        # A device whose position is to be found from its own links cannot be left out.
+        known = np.isin(records.device, sorted(records.anchors))
+        _several(records.device[known], by)
+        index = np.full(len(records), -1)
+        index[known] = _spread(records.device[known], rng)
+        return Folds(by, index)
+    if by != "block":
+        raise BadInput(f"links cannot be held out by {by!r}; allowed are auto, {', '.join(WAYS)}")
     ends = (records.receiver_m, np.nan_to_num(records.device_m[records.device]))
     blocks = [np.unique(np.floor(end[:, :2] / BLOCK_M).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
               for end in ends]
@@ -48,7 +66,15 @@ def make_folds(records: Records, seed: int) -> Folds:
     if block.max() + 1 < LEAST_CELLS:
         # Nothing moves: stretches of the file.
         block = np.arange(len(records)) * MOST_FOLDS * 4 // len(records)
-    return Folds("block", _spread(block, rng))
+    return Folds(by, _spread(block, rng))
+
+
+def _several(index: np.ndarray, by: str) -> np.ndarray:
+    if len(np.unique(index)) < 2:
+        raise BadInput(f"links cannot be held out by {by}: fewer than two are{' declared' * (by == 'device')} "
+                       "there; "
+                       "hold them out by block, or leave the choice to auto")
+    return index
 
 
 def evidence_blocks(records: Records) -> np.ndarray:

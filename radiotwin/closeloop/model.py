@@ -8,10 +8,10 @@ from scipy.optimize import minimize
 
 from radiotwin.closeloop.bases import FittedBase
 from radiotwin.closeloop.records import Records
-from radiotwin.closeloop.regression import Problem, Solution, covariance, mean_db, nll, residual_db, solve
-from radiotwin.effects.base import Effect, Found, Setting, Term, View
+from radiotwin.closeloop.regression import Problem, Solution, covariance, mean_db, residual_db, solve
+from radiotwin.effects.base import Effect, Found, Setting, Term, View, some
 
-MOST_TRIALS = 60  # of settings while one is refined
+TRIALS = 25  # for each number of a setting, while it is refined
 REFINED_ON = 5000  # links at most
 MOST_FITS = 2  # of proposals of one effect
 WORTH_REFINING_NATS = 5.0
@@ -83,15 +83,11 @@ class Side:
             sum((term.offset_db[rows] for term in terms), np.zeros(len(self.base_db[rows]))),
             np.hstack([np.zeros((len(self.base_db[rows]), 0)), *(term.columns[rows] for term in terms)]),
             np.concatenate([self.base_spread, *(term.spread_db for term in terms)]), self.group[rows],
-            _bend(parts, "receiver", mine, rows), self.dof)
+            _bend(parts, "receiver", mine, rows), self.dof, _lost(parts, mine))
 
     def fit(self, start: Solution | None = None) -> Solution:
         """Fit to the training links."""
         return solve(self.problem(self.train), start)
-
-    def nll(self, solution: Solution) -> np.ndarray:
-        """(n,) negative log-likelihood of all links [nats]; NaN where the base has no position."""
-        return np.where(self.usable, nll(self.problem(slice(None)), solution), np.nan)
 
     def mean_db(self, solution: Solution) -> np.ndarray:
         """(n,) expected level of all links [dB]."""
@@ -151,6 +147,15 @@ def _bend(parts: list[Part], stage: str, records: Records | None, rows: np.ndarr
     return bend
 
 
+def _lost(parts: list[Part], records: Records | None) -> np.ndarray | float:
+    """(n,) probability that a link is lost to any of the parts; 0 where there is none that loses links."""
+    kept = 1.0
+    for part in parts:
+        if part.effect.stage == "detection":
+            kept = kept * (1.0 - part.effect.loses(records, part.setting))
+    return 1.0 - kept
+
+
 def add(side: Side, effect: Effect, solution: Solution) -> tuple[Side, Solution] | None:
     """Find the best setting of an effect on the training links of a side, beside the effects that it has.
 
@@ -178,8 +183,7 @@ def _refine(side: Side, fitted: Solution) -> tuple[Side, Solution]:
     variation = part.effect.vary(part.setting)
     if variation is None or not len(variation.values):
         return side, fitted
-    rows = np.flatnonzero(side.train)
-    rows = rows[:: max(len(rows) // REFINED_ON, 1)]
+    rows = some(np.flatnonzero(side.train), REFINED_ON)
     part_records = side.records.select(rows)
     small = replace(
         side, records=part_records, train=np.ones(len(rows), bool), usable=np.ones(len(rows), bool),
@@ -194,7 +198,8 @@ def _refine(side: Side, fitted: Solution) -> tuple[Side, Solution]:
 
     simplex = np.vstack([variation.values, variation.values + np.diag(variation.steps)])
     found = minimize(objective, variation.values, method="Nelder-Mead",
-                     options={"initial_simplex": simplex, "maxfev": MOST_TRIALS, "xatol": 1e-2, "fatol": 0.1})
+                     options={"initial_simplex": simplex, "maxfev": TRIALS * len(simplex), "xatol": 1e-2,
+                              "fatol": 0.1})
     setting = variation.setting(np.clip(found.x, variation.low, variation.high))
     better = side.with_parts([*side.parts[:-1], side.part(part.effect, setting)])
     solution = better.fit(fitted)

@@ -6,13 +6,20 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
+from radiotwin.closeloop.oddities import (
+    LEAST_ROWS,
+    fill_value,
+    odd_names,
+    odd_places,
+    refuse_empty_levels,
+    unheard_devices,
+    useless_receivers,
+)
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
 
-LEAST_ROWS = 60
-FEW_ROWS = 5
 FAR_M = 100_000.0
 MISSING_HEIGHT_M = 1.5
 
@@ -135,10 +142,11 @@ def make_records(measurements: Measurements, scene: Scene | None) -> Records:
     """Prepare measurements: what cannot be used is left out and told.
 
     Raises:
-        BadInput: nothing that can be used is left.
+        BadInput: nothing that can be used is left, or positions or levels that cannot be what they are said to be.
     """
     table = measurements.table.reset_index(drop=True)
-    level_db = measurements.level_db
+    level_db, receiver_m, device_index = measurements.level_db, measurements.receiver_m, measurements.device_index
+    refuse_empty_levels(level_db, measurements.level_column)
     remarks: list[str] = []
     keep = np.ones(len(table), dtype=bool)
 
@@ -148,9 +156,13 @@ def make_records(measurements: Measurements, scene: Scene | None) -> Records:
             remarks.append(f"{bad.sum():,} of {len(table):,} links left out: {why}")
             keep[bad] = False
 
-    receiver_m = measurements.receiver_m
+    device_m = np.where(measurements.is_anchor[:, None], measurements.device_m, np.nan)
+    device_m[:, 2] = np.where(np.isnan(measurements.device_m[:, 2]), MISSING_HEIGHT_M, measurements.device_m[:, 2])
+    remarks += odd_names(measurements) + odd_places(receiver_m, device_m, scene)
     leave_out(np.abs(receiver_m[:, :2] - np.median(receiver_m[:, :2], axis=0)).max(axis=1) > FAR_M,
               f"their receiver is more than {FAR_M / 1000:.0f} km from the others")
+    leave_out(np.abs(receiver_m[:, :2] - device_m[device_index, :2]).max(axis=1) > FAR_M,
+              f"their receiver is more than {FAR_M / 1000:.0f} km from the device; both need one frame, in metres")
     leave_out(table.duplicated().to_numpy(), "they stand there twice")
     low_z = np.isnan(receiver_m[:, 2])
     if low_z.any() and scene is not None:
@@ -158,43 +170,42 @@ def make_records(measurements: Measurements, scene: Scene | None) -> Records:
     elif low_z.any():
         remarks.append(f"{low_z.sum():,} receiver heights are empty and taken for {MISSING_HEIGHT_M} m")
         receiver_m = np.where(np.isnan(receiver_m), MISSING_HEIGHT_M, receiver_m)
-    device_m = np.where(measurements.is_anchor[:, None], measurements.device_m, np.nan)
-    device_m[:, 2] = np.where(np.isnan(measurements.device_m[:, 2]), MISSING_HEIGHT_M, measurements.device_m[:, 2])
-    if scene is None:
-        unknown = np.isnan(device_m).any(axis=1)[measurements.device_index]
-        leave_out(unknown, "without a scene, devices of unknown position cannot be located")
-    for name in sorted(set(table["receiver"])):
-        mine = (table["receiver"] == name).to_numpy()
-        seen = level_db[mine & keep]
-        if (mine & keep).any() and np.isnan(seen).all():
-            leave_out(mine, f"receiver {name} never detected anything")
-        elif len(seen) > FEW_ROWS and np.nanstd(seen) == 0:
-            leave_out(mine, f"receiver {name} always reads {np.nanmin(seen):g}")
-        elif 0 < len(seen) < FEW_ROWS:
-            leave_out(mine, f"receiver {name} has {len(seen)} only")
-    fill_db, share = _fill_value(level_db[keep])
+    flat = np.isnan(measurements.device_m[:, 2]).sum()
+    if flat:
+        remarks.append(f"{flat:,} device heights are empty and taken for {MISSING_HEIGHT_M} m")
+    placed = np.isfinite(device_m).all(axis=1) | (scene is not None)
+    leave_out(~placed[device_index], "without a scene, devices of unknown position cannot be located")
+    for bad, why in useless_receivers(table, level_db, keep):
+        leave_out(bad, why)
+    fill_db, share = fill_value(level_db[keep])
     if fill_db is not None:
         at_fill = (level_db == fill_db) & keep
         level_db = np.where(at_fill, np.nan, level_db)
         remarks.append(f"{at_fill.sum():,} links read exactly {fill_db:g}, the lowest value, {share:.0%} of all: taken "
                        "for not detected")
+    leave_out(*unheard_devices(table, level_db, keep))
     if keep.sum() < LEAST_ROWS or np.isfinite(level_db[keep]).sum() < LEAST_ROWS // 2:
         raise BadInput(f"{int(keep.sum())} links can be used, {int(np.isfinite(level_db[keep]).sum())} of them "
-                       f"detected; at least {LEAST_ROWS} are needed, {LEAST_ROWS // 2} of them detected. "
-                       + "; ".join(remarks))
-    if np.nanstd(level_db[keep]) == 0:
-        raise BadInput(f"all levels are {np.nanmin(level_db[keep]):g}: there is nothing to explain; check the column "
-                       f"{measurements.level_column}")
+                       f"detected; at least {LEAST_ROWS} are needed, {LEAST_ROWS // 2} of them detected: "
+                       + ("; ".join(remarks) or "measure more"))
+    refuse_empty_levels(level_db[keep], measurements.level_column)
     table = table[keep]
     receiver, receiver_names = pd.factorize(table["receiver"], sort=True)
     flight, flight_names = pd.factorize(table["flight"])
+    heading_deg = _column(table, "heading_deg")
+    turned = np.abs(heading_deg) > 360
+    if turned.any():
+        remarks.append(f"{turned.sum():,} headings lie beyond 360° (such as {heading_deg[turned][0]:g}) and are taken "
+                       "for their remainder; heading_deg is in degrees, clockwise from north")
     is_gain = measurements.level_column == "gain_db"
     limit_db = _limit(level_db[keep], scene, is_gain)
     return Records(
-        level_db[keep], limit_db, receiver_m[keep], device_m, measurements.device_index[keep], receiver, flight,
-        _column(table, "time_s"), _column(table, "heading_deg"), list(measurements.devices["device"]),
+        level_db[keep], limit_db, receiver_m[keep], device_m[placed],
+        (np.cumsum(placed) - 1)[device_index[keep]], receiver, flight,
+        _column(table, "time_s"), heading_deg % 360, list(measurements.devices["device"][placed]),
         list(receiver_names), list(flight_names), _frequency(measurements, scene),
-        scene.city if scene else None, is_gain, frozenset(np.flatnonzero(measurements.is_anchor).tolist()), remarks)
+        scene.city if scene else None, is_gain,
+        frozenset(np.flatnonzero(measurements.is_anchor[placed]).tolist()), remarks)
 
 
 def _limit(level_db: np.ndarray, scene: Scene | None, is_gain: bool) -> float | None:
@@ -214,18 +225,3 @@ def _frequency(measurements: Measurements, scene: Scene | None) -> float:
 
 def _column(table: pd.DataFrame, name: str) -> np.ndarray:
     return table[name].to_numpy(dtype=float) if name in table else np.full(len(table), np.nan)
-
-
-def _fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
-    """The lowest value and its share, where it stands for "not detected": far more often there than a tail would be,
-    and with a gap, or a heap, that no tail has."""
-    seen = level_db[np.isfinite(level_db)]
-    if len(seen) < LEAST_ROWS:
-        return None, 0.0
-    values, counts = np.unique(seen, return_counts=True)
-    if len(values) < 3:
-        return None, 0.0
-    steps = np.diff(values)
-    heap = counts[0] >= 10 and counts[0] > 5 * counts[1:6].max()
-    gap = counts[0] >= 3 and steps[0] > 10 * np.median(steps[:20]) and steps[0] > 3.0
-    return (float(values[0]), counts[0] / len(seen)) if heap or gap else (None, 0.0)

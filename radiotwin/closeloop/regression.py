@@ -2,7 +2,9 @@
 
 Errors follow a Student-t distribution with `dof` degrees of freedom and a scale for each group of links (Lange, Little
 and Taylor 1989, 'Robust statistical modeling using the t distribution', JASA 84); a blank level counts as "below the
-limit" (Tobin 1958). Solved by Newton steps on the exact likelihood: few EM steps would leave a bias of a decibel.
+limit" (Tobin 1958) or, where links are lost whatever their level, as one of the two (Deaton and Irish 1984,
+'Statistical models for zero expenditures in household budgets', Journal of Public Economics 23). Solved by Newton steps
+on the exact likelihood: few EM steps would leave a bias of a decibel.
 """
 
 from collections.abc import Callable
@@ -36,6 +38,7 @@ class Problem:
         group: (n,) index of the error scale.
         receiver: what the receiver does to the level that arrives; None = nothing.
         dof: degrees of freedom of the errors.
+        lost: (n,) probability that a link is blank whatever its level; or one for all.
     """
 
     level_db: np.ndarray
@@ -49,6 +52,7 @@ class Problem:
     group: np.ndarray
     receiver: Bend | None
     dof: float
+    lost: np.ndarray | float = 0.0
 
     def mean(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(n,) expected level [dB], and (n, p) its derivative in the coefficients.
@@ -123,16 +127,31 @@ def mean_db(problem: Problem, solution: Solution) -> np.ndarray:
 
 def nll(problem: Problem, solution: Solution) -> np.ndarray:
     """(n,) negative log-likelihood of each link [nats]."""
-    return _nll(problem, problem.mean(solution.coefficients)[0], solution.scale_db[problem.group])
+    return nll_at(problem, problem.mean(solution.coefficients)[0], solution.scale_db[problem.group])
+
+
+def detected_db(mean_db: np.ndarray, scale_db: np.ndarray, limit_db: float | None, dof: float) -> np.ndarray:
+    """(n,) mean level of links of a kind that are detected [dB]: near the limit only the strong ones are.
+
+    The mean of Student's t above a = (limit - mean) / scale is f(a) / F(-a) * (dof + a²) / (dof - 1).
+    """
+    if limit_db is None:
+        return mean_db
+    a = (limit_db - mean_db) / scale_db
+    density = np.exp(gammaln(0.5 * (dof + 1)) - gammaln(0.5 * dof) - 0.5 * (dof + 1) * np.log1p(a * a / dof)) \
+        / np.sqrt(dof * np.pi)
+    return mean_db + scale_db * density / np.maximum(stdtr(dof, -a), 1e-300) * (dof + a * a) / (dof - 1)
 
 
 def residual_db(problem: Problem, solution: Solution) -> np.ndarray:
     """(n,) measured minus expected [dB]; of a blank level, how much lower than expected it is to be thought: the
-    least change of the mean after which it is as likely detected as not, 0 where it already is less likely."""
+    least change of the mean after which it is as likely detected as not, 0 where it already is less likely, times the
+    probability that it is blank for its level rather than lost."""
     mean = mean_db(problem, solution)
     blank = np.isnan(problem.level_db)
-    return np.where(blank, np.minimum(np.where(np.isfinite(problem.limit_db), problem.limit_db, mean) - mean, 0.0),
-                    problem.level_db - mean)
+    lack_db = np.minimum(np.where(np.isfinite(problem.limit_db), problem.limit_db, mean) - mean, 0.0)
+    below = (1 - problem.lost) * stdtr(problem.dof, lack_db / solution.scale_db[problem.group])
+    return np.where(blank, lack_db * below / np.maximum(problem.lost + below, 1e-300), problem.level_db - mean)
 
 
 def _least_squares(problem: Problem) -> np.ndarray:
@@ -143,21 +162,24 @@ def _least_squares(problem: Problem) -> np.ndarray:
                            columns[seen].T @ (problem.level_db - mean)[seen])
 
 
-def _nll(problem: Problem, mean: np.ndarray, scale: np.ndarray) -> np.ndarray:
+def nll_at(problem: Problem, mean: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """(n,) negative log-likelihood of each link [nats] around any mean (n,) with any error scale (n,) [dB]."""
     dof = problem.dof
     blank = np.isnan(problem.level_db)
+    lost = np.broadcast_to(problem.lost, mean.shape)
     z = np.where(blank, 0.0, (problem.level_db - mean) / scale)
     value = 0.5 * (dof + 1) * np.log1p(z * z / dof) + np.log(scale) + 0.5 * np.log(dof * np.pi) \
-        + gammaln(0.5 * dof) - gammaln(0.5 * (dof + 1))
+        + gammaln(0.5 * dof) - gammaln(0.5 * (dof + 1)) - np.log1p(-lost)
     if blank.any():
         limit, told = problem.limit_db[blank], np.isfinite(problem.limit_db[blank])
         z = np.where(told, (np.where(told, limit, 0.0) - mean[blank]) / scale[blank], np.inf)
-        value[blank] = np.where(told, -np.log(np.maximum(stdtr(dof, np.where(told, z, 0.0)), 1e-300)), 0.0)
+        chance = lost[blank] + (1 - lost[blank]) * stdtr(dof, np.where(told, z, 0.0))
+        value[blank] = np.where(told, -np.log(np.maximum(chance, 1e-300)), 0.0)
     return value
 
 
 def _objective(problem: Problem, beta: np.ndarray, scale_db: np.ndarray, precision: np.ndarray) -> float:
-    value = _nll(problem, problem.mean(beta)[0], scale_db[problem.group]).sum()
+    value = nll_at(problem, problem.mean(beta)[0], scale_db[problem.group]).sum()
     return float(value + 0.5 * np.sum(precision * beta**2))
 
 
@@ -174,7 +196,8 @@ def _derivatives(problem: Problem, mean: np.ndarray, scale_db: np.ndarray):
         z = (np.where(told, problem.limit_db[blank], mean[blank]) - mean[blank]) / scale[blank]
         log_density = gammaln(0.5 * (dof + 1)) - gammaln(0.5 * dof) - 0.5 * np.log(dof * np.pi) \
             - 0.5 * (dof + 1) * np.log1p(z * z / dof)
-        ratio = np.exp(log_density) / np.maximum(stdtr(dof, z), 1e-300)
+        lost = np.broadcast_to(problem.lost, mean.shape)[blank]
+        ratio = (1 - lost) * np.exp(log_density) / np.maximum(lost + (1 - lost) * stdtr(dof, z), 1e-300)
         bending = ratio * (ratio + z * (dof + 1) / (dof + z * z))
         slope[blank] = np.where(told, -ratio / scale[blank], 0.0)
         curvature[blank] = np.where(told, np.maximum(bending, CURVATURE) / scale[blank] ** 2, CURVATURE)

@@ -7,12 +7,13 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from radiotwin.channel import Links
+from radiotwin.channel.likelihood import mean_if_detected
 from radiotwin.channel.log_distance import LogDistance
 from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.closeloop.bases import Base, LogDistanceBase, RaytraceBase, TwinBase
 from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.records import Records, make_records
-from radiotwin.closeloop.search import Model, Search, make_model, rmse_db, search_effects
+from radiotwin.closeloop.search import Model, Search, add_shadowing, make_model, rmse_db, search_effects
 from radiotwin.closeloop.structure import Driver, find_drivers
 from radiotwin.effects import CATALOGUE
 from radiotwin.effects.base import Parameter
@@ -36,7 +37,7 @@ class Loop:
         folds: how they were held out.
         before, search: the base alone; base and effects.
         drivers_before, drivers_after: what the held-out residual depends on.
-        baselines: held-out RMSE of other models [dB].
+        baselines: (n,) held-out expectation of other models for each link [dB].
         noise_floor_db: from links measured twice at one place; NaN where there are none.
     """
 
@@ -47,7 +48,7 @@ class Loop:
     search: Search
     drivers_before: list[Driver]
     drivers_after: list[Driver]
-    baselines: dict[str, float] = field(default_factory=dict)
+    baselines: dict[str, np.ndarray] = field(default_factory=dict)
     noise_floor_db: float = np.nan
 
     @property
@@ -64,7 +65,7 @@ class Loop:
         """`effect`, `none` or `unexplained`."""
         if self.after.whole.parts:
             return "effect"
-        return "unexplained" if significant(self.drivers_before) else "none"
+        return "unexplained" if self.after.shadowing or significant(self.drivers_before) else "none"
 
     def parameters(self) -> list[dict[str, Parameter]]:
         """Of each kept effect."""
@@ -79,7 +80,7 @@ def significant(drivers: list[Driver]) -> list[Driver]:
 
 
 def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed: int,
-               tell: Callable[[str], None]) -> Loop:
+               tell: Callable[[str], None], hold_out: str = "auto") -> Loop:
     """Find what a base model lacks.
 
     Args:
@@ -88,16 +89,17 @@ def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed:
         base: one of `BASES`, or `auto`: the one with the least held-out error.
         seed: of folds, fits and permutations.
         tell: called with what is being done.
+        hold_out: which links are held out together, see `make_folds`.
 
     Raises:
-        BadInput: an unknown base, or data of which nothing can be used.
+        BadInput: an unknown base or way to hold out, or data of which nothing can be used.
     """
     if base not in (*BASES, "auto"):
         raise BadInput(f"base {base!r} is unknown; allowed are auto, {', '.join(BASES)}")
     if scene is None and base == "raytrace":
         raise BadInput("base 'raytrace' follows paths over a 3D map; give --scene, or take the base log-distance")
     records = make_records(measurements, scene)
-    folds = make_folds(records, seed)
+    folds = make_folds(records, seed, hold_out)
     names = [base] if base != "auto" else ["twin", "raytrace"] if scene is not None else ["log-distance"]
     twin = TwinBase(scene, seed)
     bases: dict[str, Base] = {"twin": twin, "raytrace": RaytraceBase(twin),
@@ -114,6 +116,9 @@ def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed:
     search = search_effects(before, [effect() for effect in CATALOGUE], seed, tell)
     tell("looking at what is left")
     drivers_after = _drivers(search.model, seed) if search.model is not before else drivers_before
+    if significant(drivers_after):
+        tell("correlated_shadowing")
+        add_shadowing(search, seed)
     tell("other models")
     return Loop(best, records, folds, before, search, drivers_before, drivers_after,
                 _baselines(before, records), _noise_floor_db(records))
@@ -125,21 +130,23 @@ def _drivers(model: Model, seed: int) -> list[Driver]:
     return find_drivers(model.whole.records, model.whole.records.level_db - mean_db, scale_db, mean_db, seed)
 
 
-def _baselines(model: Model, records: Records) -> dict[str, float]:
-    """Held-out RMSE of the log-distance law and of regression kriging, at the base's positions."""
+def _baselines(model: Model, records: Records) -> dict[str, np.ndarray]:
+    """(n,) held-out expectation of the log-distance law and of regression kriging [dB], at the base's positions."""
     result = {}
     for name, channel in (("log_distance", LogDistance), ("regression_kriging", RegressionKriging)):
         if name == "regression_kriging" and len(records) > MOST_FOR_KRIGING:
             continue
-        error = np.full(len(records), np.nan)
+        mean_db = np.full(len(records), np.nan)
         for number, side in enumerate(model.folds):
             test = (model.index == number) & side.usable
             train, links = side.train, side.records
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of classes with few links: nothing is predicted for them here
                 fitted = channel().fit(_links(links, train), links.level_db[train], links.limit_db, 0)
-            error[test] = links.level_db[test] - fitted.predict(_links(links, test))[0]
-        result[name] = float(np.sqrt(np.nanmean(error**2)))
+            expected_db, sigma_db = fitted.predict(_links(links, test))
+            mean_db[test] = expected_db if links.limit_db is None else mean_if_detected(
+                expected_db, sigma_db, links.limit_db)
+        result[name] = mean_db
     return result
 
 

@@ -1,7 +1,8 @@
 """Which effects the data supports: fitted on training folds, judged on held-out ones, kept one after the other."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import logsumexp
@@ -10,7 +11,9 @@ from radiotwin.closeloop.bases import Base
 from radiotwin.closeloop.folds import Folds, evidence_blocks
 from radiotwin.closeloop.model import Side, add
 from radiotwin.closeloop.records import Records
-from radiotwin.closeloop.regression import Solution
+from radiotwin.closeloop.regression import Solution, detected_db, nll_at
+from radiotwin.closeloop.shadowing import NAME as SHADOWING
+from radiotwin.closeloop.shadowing import Shadowing
 from radiotwin.effects.base import Effect
 
 DOFS = (3.0, 5.0, 10.0, 30.0)
@@ -19,6 +22,8 @@ LEAST_GAIN_PER_LINK = 0.01  # nats; 0.02 is what an RMSE lower by 2 % gains
 LEAST_FOLDS = 0.6  # of the folds must gain
 SIGNIFICANCE = 0.01
 CONSISTENT = 0.1
+SUPPORTED = 0.1
+CLEARLY_NATS = np.log(100.0)  # how much likelier the data must be than with another effect, to tell it from that one
 FLIPS = 20_000
 MOST_EFFECTS = 6
 WORTH_A_LOOK_NATS = 10.0
@@ -36,6 +41,8 @@ class Judged:
         rmse_db: held-out RMSE with it.
         p_value: of no gain, links that err alike counted as one, corrected for the number of candidates.
         step: number of effects that were there before.
+        gain_by_fold: (folds,) `nll_gain` of each fold over the number of links that count as one; empty where it was
+            not tried.
     """
 
     name: str
@@ -45,6 +52,7 @@ class Judged:
     rmse_db: float
     p_value: float
     step: int
+    gain_by_fold: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(eq=False)
@@ -55,12 +63,16 @@ class Model:
         whole: learned from all links.
         folds: learned from all but one fold each.
         fits: the whole's solution, then the folds'.
+        index: (n,) fold of each link.
+        shadowing: the whole's, then the folds', of what all effects leave over; empty where there is none.
     """
 
     whole: Side
     folds: list[Side]
     fits: list[Solution]
     index: np.ndarray
+    shadowing: list[Shadowing] = field(default_factory=list)
+    _known: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def sides(self) -> list[Side]:
@@ -74,11 +86,33 @@ class Model:
             result[mine] = of(side, self.fits[number + 1])[mine]
         return result
 
+    @cached_property
+    def held_out_shadowing(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) what shadowing adds [error scales], and (n,) the factor that it leaves of the error scale."""
+        shift, left = np.zeros(len(self.index)), np.ones(len(self.index))
+        for number, shadowing in enumerate(self.shadowing[1:]):
+            mine = np.flatnonzero(self.index == number)
+            shift[mine], left[mine] = shadowing.at(self.folds[number].records.select(mine))
+        return shift, left
+
     def held_out_nll(self) -> np.ndarray:
-        return self.held_out(lambda side, fit: side.nll(fit))
+        """(n,) negative log-likelihood [nats]; NaN where there is none."""
+        shift, left = self.held_out_shadowing
+        return self._once("nll", lambda side, fit: np.where(side.usable, nll_at(
+            side.problem(slice(None)), side.mean_db(fit) + shift * fit.scale_db[side.group],
+            fit.scale_db[side.group] * left), np.nan))
 
     def held_out_mean_db(self) -> np.ndarray:
-        return self.held_out(lambda side, fit: np.where(side.usable, side.mean_db(fit), np.nan))
+        """(n,) expected level of a link that is detected [dB]; NaN where there is none."""
+        shift, left = self.held_out_shadowing
+        return self._once("mean_db", lambda side, fit: np.where(side.usable, detected_db(
+            side.mean_db(fit) + shift * fit.scale_db[side.group], fit.scale_db[side.group] * left,
+            side.records.limit_db, side.dof), np.nan))
+
+    def _once(self, name: str, of: Callable[[Side, Solution], np.ndarray]) -> np.ndarray:
+        if name not in self._known:
+            self._known[name] = self.held_out(of)
+        return self._known[name]
 
 
 def make_model(records: Records, base: Base, folds: Folds) -> Model:
@@ -107,12 +141,12 @@ class Search:
     Attributes:
         model: base and kept effects.
         log: every candidate of every step.
-        gains: held-out gain of each kept effect when it was added [nats], and its corrected p-value.
+        rivals: of each kept effect, names of those that the data cannot tell from it.
     """
 
     model: Model
     log: list[Judged] = field(default_factory=list)
-    gains: list[tuple[float, float]] = field(default_factory=list)
+    rivals: list[list[str]] = field(default_factory=list)
 
 
 def search_effects(model: Model, catalogue: list[Effect], seed: int,
@@ -140,59 +174,85 @@ def search_effects(model: Model, catalogue: list[Effect], seed: int,
         if best is None:
             break
         judged, result.model = best
-        place = next(i for i, entry in enumerate(result.log) if entry is judged)
-        result.log[place] = Judged(judged.name, True, "", judged.nll_gain, judged.rmse_db, judged.p_value, step)
-        for i, entry in enumerate(result.log):
-            if entry.step == step and entry.reason == "" and not entry.kept:
-                result.log[i] = Judged(entry.name, False, f"{judged.name} gains more", entry.nll_gain, entry.rmse_db,
-                                       entry.p_value, step)
-        result.gains.append((judged.nll_gain, judged.p_value))
+        passed = [i for i, entry in enumerate(result.log) if entry.step == step and entry.reason == ""]
+        rivals = [result.log[i].name for i in passed if result.log[i].name != judged.name
+                  and judged.gain_by_fold.sum() - result.log[i].gain_by_fold.sum() < CLEARLY_NATS]
+        for i in passed:
+            mine = result.log[i] is judged
+            result.log[i] = replace(result.log[i], kept=mine, reason="" if mine else f"{judged.name} gains more")
+        result.rivals.append(rivals)
+    # A rival that gains beside the effect is another effect; one that does not is another name for it.
+    last = max((entry.step for entry in result.log), default=0)
+    alive = {entry.name for entry in result.log if entry.kept or (entry.step == last and entry.reason == "")}
+    result.rivals = [sorted(set(rivals) - alive) for rivals in result.rivals]
     return result
+
+
+def add_shadowing(search: Search, seed: int) -> None:
+    """Interpolate over the ground what is left, and keep that where held-out links are better predicted."""
+    model = search.model
+    step = len(model.whole.parts)
+    fields = [Shadowing.fit(side, fit, seed) for side, fit in zip(model.sides, model.fits)]
+    extended = replace(model, shadowing=fields, _known={})
+    judged = _weigh(model, extended, Judged(SHADOWING, False, "", np.nan, np.nan, np.nan, step),
+                    evidence_blocks(model.whole.records), 1, seed, nlos_only=True)
+    if not judged.reason:
+        judged, search.model = replace(judged, kept=True), extended
+    search.log.append(judged)
 
 
 def _judge(model: Model, effect: Effect, block: np.ndarray, tried: int, step: int, seed: int):
     """Fit a candidate everywhere; returns what is said of it, and the model with it where it passes."""
-    def refused(reason: str, gain=np.nan, rmse=np.nan, p_value=np.nan):
-        return Judged(effect.name, False, reason, gain, rmse, p_value, step), None
-
+    judged = Judged(effect.name, False, "", np.nan, np.nan, np.nan, step)
     whole = add(model.whole, effect, model.fits[0])
     if whole is None:
-        return refused("nothing in the residual looks like it")
+        return replace(judged, reason="nothing in the residual looks like it"), None
     strange = effect.unphysical(whole[0].parts[-1].setting, whole[0].found(whole[1])[-1].coefficients)
     if strange:
-        return refused(strange)
+        return replace(judged, reason=strange), None
     if model.fits[0].objective - whole[1].objective < WORTH_A_LOOK_NATS:
-        return refused(f"gains less than {WORTH_A_LOOK_NATS:.0f} nats even on the links that it is fitted to")
+        why = f"gains less than {WORTH_A_LOOK_NATS:.0f} nats even on the links that it is fitted to"
+        return replace(judged, reason=why), None
     sides, fits = [], [whole[1]]
     for side, fit in zip(model.folds, model.fits[1:]):
         added = add(side, effect, fit) or (side, fit)
         sides.append(added[0])
         fits.append(added[1])
     extended = Model(whole[0], sides, fits, model.index)
+    judged = _weigh(model, extended, judged, block, tried, seed, nlos_only=effect.nlos_only)
+    return judged, None if judged.reason else extended
+
+
+def _weigh(model: Model, extended: Model, judged: Judged, block: np.ndarray, tried: int, seed: int,
+           nlos_only: bool = False) -> Judged:
+    """What held-out links say of an extended model; with the reason where it is to be refused."""
     gain = model.held_out_nll() - extended.held_out_nll()
-    usable = np.isfinite(gain)
-    los = model.whole.records.los
-    total = float(gain[usable].sum())
-    by_fold = np.bincount(model.index[usable], weights=gain[usable], minlength=len(sides))
-    after = rmse_db(extended, usable)
-    per_link = max(gain[rows].mean() for rows in (usable, usable & los) if rows.any())
+    usable, los = np.isfinite(gain), model.whole.records.los
     design_effect = model.whole.view(model.fits[0]).design_effect
-    p_value = min(tried * gain_p(by_fold / design_effect), 1.0)
+
+    def by_fold(rows: np.ndarray) -> np.ndarray:
+        return np.bincount(model.index[rows], weights=gain[rows], minlength=len(model.folds)) / design_effect
+
+    total, shares = float(gain[usable].sum()), by_fold(usable)
+    per_link = max(gain[rows].mean() for rows in (usable, usable & los) if rows.any())
+    p_value = min(tried * gain_p(shares), 1.0)
     one_sided = sign_flip_p(np.bincount(block[usable], weights=gain[usable]), seed)
-    numbers = total, after, p_value
+    unsupported = gain_p(by_fold(usable & los)) if los.any() and not los.all() and not nlos_only else 0.0
+    reason = ""
     if total < LEAST_GAIN_NATS:
-        return refused(f"gains {total:.0f} nats on held-out links, {LEAST_GAIN_NATS:.0f} are needed", *numbers)
-    if p_value > SIGNIFICANCE:
-        return refused(f"its gain may be chance (p = {p_value:.2g} after correction)", *numbers)
-    if one_sided > CONSISTENT:
-        return refused(f"its gain hangs on a few places (p = {one_sided:.2g} if signs are flipped)", *numbers)
-    if (by_fold > 0).mean() < LEAST_FOLDS:
-        return refused(f"gains in {(by_fold > 0).sum()} of {len(by_fold)} folds only", *numbers)
-    if per_link < LEAST_GAIN_PER_LINK:
-        return refused(f"gains {per_link:.3f} nats a link only, {LEAST_GAIN_PER_LINK} are needed", *numbers)
-    if los.any() and not los.all() and not effect.nlos_only and gain[usable & los].sum() <= 0:
-        return refused("links with line of sight do not support it", *numbers)
-    return Judged(effect.name, False, "", *numbers, step), extended
+        reason = f"gains {total:.0f} nats on held-out links, {LEAST_GAIN_NATS:.0f} are needed"
+    elif p_value > SIGNIFICANCE:
+        reason = f"its gain may be chance (p = {p_value:.2g} after correction)"
+    elif one_sided > CONSISTENT:
+        reason = f"its gain hangs on a few places (p = {one_sided:.2g} if signs are flipped)"
+    elif (shares > 0).mean() < LEAST_FOLDS:
+        reason = f"gains in {(shares > 0).sum()} of {len(shares)} folds only"
+    elif per_link < LEAST_GAIN_PER_LINK:
+        reason = f"gains {per_link:.3f} nats a link only, {LEAST_GAIN_PER_LINK} are needed"
+    elif unsupported > SUPPORTED:
+        reason = f"links with line of sight, where the base is surest, do not support it (p = {unsupported:.2g})"
+    return replace(judged, reason=reason, nll_gain=total, rmse_db=rmse_db(extended, usable), p_value=p_value,
+                   gain_by_fold=shares)
 
 
 def rmse_db(model: Model, rows: np.ndarray) -> float:

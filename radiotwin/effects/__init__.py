@@ -5,6 +5,9 @@ from radiotwin.effects.body_shadowing import BodyShadowing
 from radiotwin.effects.excess_attenuation import ExcessAttenuation
 from radiotwin.effects.foliage import Foliage
 from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
+from radiotwin.effects.ground_reflection import GroundReflection
+from radiotwin.effects.interference import Interference
+from radiotwin.effects.lock_loss import LockLoss
 from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.noise_floor import NoiseFloor
 from radiotwin.effects.paths import Diffraction, WallReflection
@@ -18,5 +21,5 @@ from radiotwin.effects.tilted_dipole import TiltedDipole
 CATALOGUE: tuple[type[Effect], ...] = (
     DeviceGainOffset, ReceiverGainOffset, ReceiverDrift, ReceiverSaturation, NoiseFloor, SectorAntenna, TiltedDipole,
     BodyShadowing, ExcessAttenuation, DevicePositionError, ReceiverPositionError,
-    MissingObstacle, RemovedObstacle, Foliage, WallReflection, Diffraction)
+    MissingObstacle, RemovedObstacle, Foliage, WallReflection, Diffraction, GroundReflection, Interference, LockLoss)
 """In no order: candidates compete by what the held-out links say."""

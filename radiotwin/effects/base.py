@@ -132,7 +132,8 @@ class Effect(ABC):
         repeatable: whether there may be several, each found in a step of its own.
         of_receiver: whether it belongs to a receiver, so that it is no part of a map.
         stage: `gain` adds decibels (its `term`); `paths` adds power to that of the base, before any gain; `receiver`
-            comes last. The latter two say with `bend` what they do.
+            comes last. The latter two say with `bend` what they do. `detection` leaves levels as they are and says with
+            `loses` which links are blank all the same.
     """
 
     name: ClassVar[str]
@@ -158,7 +159,12 @@ class Effect(ABC):
 
     def bend(self, level_db: np.ndarray, records: Records, setting: Setting,
              extra: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """What it makes of the mean level of links (n,), and the slope of that; not for the stage `gain`."""
+        """What it makes of the mean level of links (n,), and the slope of that; for the stages `paths` and
+        `receiver`."""
+        raise NotImplementedError
+
+    def loses(self, records: Records, setting: Setting) -> np.ndarray:
+        """(n,) probability, less than 1, that a link is blank whatever its level; for the stage `detection`."""
         raise NotImplementedError
 
     def vary(self, setting: Setting) -> "Variation | None":
@@ -210,6 +216,14 @@ class Variation:
     low: np.ndarray
     high: np.ndarray
     setting: Callable[[np.ndarray], Setting]
+
+
+def some(rows: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of the rows (n,), in order, at random and always the same: links of devices, receivers and slots
+    take turns in a file, and every k-th would be those of a few."""
+    if len(rows) <= most:
+        return rows
+    return np.sort(np.random.default_rng(0).choice(rows, most, replace=False))
 
 
 def one_hot(index: np.ndarray, members: list[int]) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 Found by back-projecting the loss along the links' rays; then a box is fitted. Loss behind it: what comes over the roof
 and round both sides (knife edges of ITU-R P.526), and what reaches any shadow by reflections (the base's own level
-without line of sight), added as powers.
+without line of sight, give or take what is fitted), added as powers.
 """
 
 import numpy as np
@@ -14,7 +14,8 @@ LIGHT_M_S = 299_792_458.0
 LEAST_NATS = 6.0
 LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)
 STARTS = 4
-NAMES = ("x_m", "y_m", "length_m", "width_m", "height_m", "turn_deg")
+NAMES = ("x_m", "y_m", "length_m", "width_m", "height_m", "turn_deg", "scattered_db")
+UNITS = {"turn_deg": "deg", "scattered_db": "dB"}
 MOST_BLANK_DB = 25.0
 
 
@@ -35,8 +36,9 @@ class MissingObstacle(Effect):
         rows = np.flatnonzero(records.los)
         nats = lacks_nats(view.residual_db[rows], view.scale_db[rows], LOSSES_DB) / view.design_effect
         centres_m, total = back_project(records.device_m[records.device[rows]], records.receiver_m[rows], nats)
-        return [{"box": [*map(float, centre_m), 1.5 * CELL_M, 1.5 * CELL_M, HEIGHTS_M[height], 0.0]}
-                for centre_m, height, nats in best_cells(centres_m, total, STARTS) if nats > LEAST_NATS]
+        boxes = [[*map(float, centre_m), 1.5 * CELL_M, 1.5 * CELL_M, HEIGHTS_M[height], 0.0]
+                 for centre_m, height, nats in best_cells(centres_m, total, STARTS) if nats > LEAST_NATS]
+        return [{"box": box, "scattered_db": 0.0} for box in boxes]
 
     def term(self, records, setting, at) -> Term:
         box = Box(*setting["box"])
@@ -51,7 +53,7 @@ class MissingObstacle(Effect):
         wavelength_m = LIGHT_M_S / records.frequency_hz
         mine = records.select(rows)
         scattered_db = at(mine.with_los(np.zeros(len(rows), bool))) - at(mine)
-        power = 10 ** (np.minimum(scattered_db, 0) / 10) if records.city is not None else 0.0
+        power = 10 ** (np.minimum(scattered_db + setting["scattered_db"], 0) / 10) if records.city is not None else 0.0
         over_db = knife_edge_db(over_m, first_m, second_m, wavelength_m)
         for side_m in (left_m, right_m):
             power = power + 10 ** (-knife_edge_db(side_m, first_m, second_m, wavelength_m) / 10)
@@ -62,11 +64,12 @@ class MissingObstacle(Effect):
 
     def vary(self, setting) -> Variation:
         x_m, y_m = setting["box"][:2]
-        return Variation(np.array(setting["box"]), np.array([6.0, 6.0, 8.0, 8.0, 8.0, 20.0]),
-                         np.array([x_m - 60, y_m - 60, 4.0, 4.0, 3.0, -90.0]),
-                         np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0]),
-                         lambda numbers: {"box": [float(v) for v in numbers]})
+        return Variation(np.array([*setting["box"], setting["scattered_db"]]),
+                         np.array([6.0, 6.0, 8.0, 8.0, 8.0, 20.0, 4.0]),
+                         np.array([x_m - 60, y_m - 60, 4.0, 4.0, 3.0, -90.0, -20.0]),
+                         np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0, 10.0]),
+                         lambda numbers: {"box": [float(v) for v in numbers[:-1]], "scattered_db": float(numbers[-1])})
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        return {name: Parameter.normal(value, spread, "deg" if name == "turn_deg" else "m")
-                for name, value, spread in zip(NAMES, setting["box"], found.setting_deviations)}
+        values = zip(NAMES, (*setting["box"], setting["scattered_db"]), found.setting_deviations)
+        return {name: Parameter.normal(value, spread, UNITS.get(name, "m")) for name, value, spread in values}

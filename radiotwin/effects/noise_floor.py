@@ -27,7 +27,7 @@ class NoiseFloor(Effect):
             rows = seen & (records.receiver == receiver)
             mean, residual, weight = view.mean_db[rows], view.residual_db[rows], view.weight[rows]
             found[str(receiver)] = max(
-                (-float(weight @ (residual + mean - _floored(mean, floor)[0]) ** 2), float(floor))
+                (-float(weight @ (residual + mean - floored(mean, floor)[0]) ** 2), float(floor))
                 for floor in np.quantile(records.level_db[rows], QUANTILES))[1]
         return [{"receivers": found}] if found else []
 
@@ -38,7 +38,7 @@ class NoiseFloor(Effect):
         floor = np.full(len(records.receiver_names), -np.inf)
         for receiver, floor_db in setting["receivers"].items():
             floor[int(receiver)] = floor_db
-        return _floored(level_db, floor[records.receiver])
+        return floored(level_db, floor[records.receiver])
 
     def vary(self, setting) -> Variation | None:
         if len(setting["receivers"]) > 8:
@@ -60,7 +60,7 @@ class NoiseFloor(Effect):
                 for (receiver, floor), spread in zip(setting["receivers"].items(), spreads)}
 
 
-def _floored(level_db, floor_db):
+def floored(level_db, floor_db):
     """What is read, and the slope of it."""
     read = np.logaddexp(level_db * np.log(10) / 10, floor_db * np.log(10) / 10) * 10 / np.log(10)
     return read, 10 ** ((level_db - read) / 10)

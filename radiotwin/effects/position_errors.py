@@ -5,7 +5,7 @@ No law of its own: the base model is asked again with the end elsewhere, lines o
 
 import numpy as np
 
-from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured
+from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured, some
 
 LEAST_LINKS = 60
 LEAST_NATS = 6.0
@@ -37,8 +37,7 @@ class DevicePositionError(Effect):
         moves = [(radius * np.sin(angle), radius * np.cos(angle)) for radius in RADII_M
                  for angle in np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS]
         for device in _anchors(records):
-            rows = np.flatnonzero(records.device == device)
-            rows = rows[:: max(len(rows) // ENOUGH_LINKS, 1)]
+            rows = some(np.flatnonzero(records.device == device), ENOUGH_LINKS)
             mine, share = records.select(rows), (records.device == device).sum() / len(rows)
             before_db = view.at(mine)
             squares = view.weight[rows] @ view.residual_db[rows] ** 2
@@ -86,8 +85,7 @@ class ReceiverPositionError(Effect):
         axes = [(1, 0, 0), (0, 1, 0), (0.7, 0.7, 0), (0.7, -0.7, 0), (0, 0, 1)]
         moves = [sign * size * np.array(axis) for axis in axes for size in RECEIVER_OFFSETS_M for sign in (-1, 1)]
         for receiver in measured(records.receiver, LEAST_LINKS):
-            rows = np.flatnonzero(records.receiver == receiver)
-            rows = rows[:: max(len(rows) // ENOUGH_LINKS, 1)]
+            rows = some(np.flatnonzero(records.receiver == receiver), ENOUGH_LINKS)
             mine, share = records.select(rows), (records.receiver == receiver).sum() / len(rows)
             before_db = view.at(mine)
             weight, residual_db = view.weight[rows], view.residual_db[rows]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.channel import regression_kriging
+from radiotwin.channel import residual_field
 from radiotwin.channel.links import Links
 from radiotwin.channel.regression_kriging import RegressionKriging
 
@@ -39,7 +39,7 @@ def test_nine_in_ten_fall_within_their_interval(world):
     mean_db, sigma_db = model.predict(data.links.select(test))
     z = (level_db[test] - mean_db) / sigma_db
     assert np.mean(np.abs(z) < 1.645) == pytest.approx(0.9, abs=0.05)
-    assert 30.0 < model.length_m < 200.0
+    assert 30.0 < model.field.length_m < 200.0
 
 
 def test_far_away_and_for_an_unmeasured_device_it_is_the_law(world):
@@ -89,9 +89,9 @@ def test_batches_do_not_show(world):
 
 def test_too_many_points_are_thinned_by_the_seed(world, monkeypatch):
     data = world(10, 600)
-    monkeypatch.setattr(regression_kriging, "MAX_POINTS", 150)
+    monkeypatch.setattr(residual_field, "MAX_POINTS", 150)
     fits = [RegressionKriging().fit(data.links, data.level_db, None, seed=seed) for seed in (1, 1, 2)]
-    assert {len(field.residual) for field in fits[0].fields.values()} == {150}
+    assert {len(field.residual) for field in fits[0].field.fields.values()} == {150}
     first, again, other = ({k: v.tobytes() for k, v in fit.state()[0].items()} for fit in fits)
     assert first == again
     assert first != other
@@ -101,7 +101,7 @@ def test_repeated_visits_become_one_point(world):
     data = world(11, 40)
     links = data.links.select(np.tile(np.arange(40), 5))
     model = RegressionKriging().fit(links, np.tile(data.level_db, 5), None, seed=0)
-    assert sum(len(field.residual) for field in model.fields.values()) == 40
+    assert sum(len(field.residual) for field in model.field.fields.values()) == 40
 
 
 def test_one_position_only(world):

@@ -1,12 +1,14 @@
 """The regression against data drawn from its own assumptions, and against closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from radiotwin.closeloop.regression import Problem, covariance, mean_db, nll, residual_db, solve
+from radiotwin.closeloop.regression import Problem, _derivatives, covariance, mean_db, nll, nll_at, residual_db, solve
 
 
 def problem(level_db, columns, limit_db=-np.inf, dof=5.0, split=1, paths=None, receiver=None, spread=np.inf):
@@ -72,6 +74,49 @@ def test_a_blank_without_a_limit_tells_nothing():
     with_blanks = solve(problem(np.where(blank, np.nan, level_db), columns))
     without = solve(problem(level_db[~blank], columns[~blank]))
     np.testing.assert_allclose(with_blanks.coefficients, without.coefficients, atol=0.02)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_links_that_are_lost_whatever_their_level_do_not_bend_it(seed):
+    columns, truth, level_db = draw(seed)
+    limit_db = np.quantile(level_db, 0.2)
+    chance = np.where(np.arange(len(level_db)) % 2, 0.3, 0.0)
+    lost = np.random.default_rng(seed).random(len(level_db)) < chance
+    given = problem(np.where((level_db < limit_db) | lost, np.nan, level_db), columns, limit_db)
+    told = replace(given, lost=chance)
+    found, deviation = solve(told), np.sqrt(np.diag(covariance(told, solve(told))))
+    assert (np.abs(found.coefficients - truth) < 4.5 * deviation).all() and deviation.max() < 0.2
+    assert found.scale_db[0] == pytest.approx(3.0, rel=0.08)
+    assert abs(solve(given).coefficients[0] - truth[0]) > 1
+    # A strong link that is blank was lost; it is not thought to be weak.
+    strong = lost & (columns @ truth > limit_db + 10)
+    assert residual_db(told, found)[strong].min() > -0.5 and residual_db(given, found)[strong].max() < -9
+
+
+@pytest.mark.parametrize("share", [0.0, 0.03, 0.6])
+def test_derivatives_are_those_of_the_likelihood_also_where_links_are_lost(share):
+    """Slope and curvature against differences in the mean, and the term of the scale against those in its logarithm."""
+    rng = np.random.default_rng(5)
+    level_db = rng.uniform(-100, -60, 300)
+    level_db[::2] = np.nan
+    given = replace(problem(level_db, np.ones((300, 1)), -95.0), lost=np.full(300, share))
+    mean, scale, step = rng.uniform(-110, -70, 300), 3.0, 1e-3
+    slope, curvature, spread = _derivatives(given, mean, np.array([scale]))
+    around = [nll_at(given, mean + way * step, np.full(300, scale)) for way in (-1, 0, 1)]
+    np.testing.assert_allclose(slope, (around[0] - around[2]) / (2 * step), atol=1e-5)
+    blank = np.isnan(level_db)
+    exact = (around[0] - 2 * around[1] + around[2]) / step**2
+    np.testing.assert_allclose(curvature[blank], np.maximum(exact[blank], 0), atol=1e-5)
+    assert curvature.min() > 0 > exact[blank].min()  # far from the limit the likelihood is not concave
+    wider, narrower = (nll_at(given, mean, np.full(300, scale * np.exp(way * step))) for way in (1, -1))
+    np.testing.assert_allclose(spread, (narrower - wider) / (2 * step), atol=1e-5)
+
+
+def test_the_likelihood_of_a_link_that_may_be_lost_is_that_of_either():
+    given = replace(problem(np.array([-80.0, np.nan, np.nan]), np.ones((3, 1)), -90.0), lost=np.array([0.1, 0.1, 0.0]))
+    found = nll_at(given, np.full(3, -84.0), np.full(3, 4.0))
+    below = student.cdf(-6 / 4, 5)
+    np.testing.assert_allclose(found, -np.log([0.9 * student.pdf(1, 5) / 4, 0.1 + 0.9 * below, below]))
 
 
 def test_what_paths_add_and_receivers_compress_is_undone():

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from radiotwin.effects.noise_floor import _floored
-from radiotwin.effects.receiver_saturation import _compress
+from radiotwin.effects.noise_floor import NoiseFloor, floored
+from radiotwin.effects.receiver_saturation import ReceiverSaturation, _compress
 from radiotwin.effects.sector_antenna import NO_VERTICAL, sector_pattern_db
 from radiotwin.effects.tilted_dipole import dipole_gain_db
 
@@ -57,7 +57,19 @@ def test_compression_follows_rapp_and_knows_its_slope():
 
 def test_the_floor_adds_as_power_and_knows_its_slope():
     level_db = np.linspace(-130, -60, 500)
-    read_db, slope = _floored(level_db, -100.0)
+    read_db, slope = floored(level_db, -100.0)
     np.testing.assert_allclose(10 ** (read_db / 10), 10 ** (level_db / 10) + 1e-10, rtol=1e-9)
     np.testing.assert_allclose(slope, np.gradient(read_db, level_db), atol=2e-3)
     assert read_db[0] == pytest.approx(-100, abs=0.01)
+
+
+@pytest.mark.parametrize("effect, setting, expected_db", [
+    (NoiseFloor(), {"receivers": {"1": -80.0}}, 10 * np.log10(1e-8 + 1e-8)),
+    (ReceiverSaturation(), {"receivers": {"1": [-80.0, 1.0]}}, -80 - 10 * np.log10(2)),
+])
+def test_a_receivers_fault_is_in_its_own_readings(links, effect, setting, expected_db):
+    """At the floor the reading is twice the power, at the level of saturation with smoothness 1 half of it."""
+    records = links([[0.0, 0, 1.5]], np.ones((4, 3)), receiver=np.array([0, 1, 0, 1]))
+    read_db, slope = effect.bend(np.full(4, -80.0), records, setting, None)
+    np.testing.assert_allclose(read_db, [-80, expected_db, -80, expected_db])
+    np.testing.assert_allclose(slope, [1, 0.5, 1, 0.5])

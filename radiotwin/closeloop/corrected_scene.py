@@ -1,0 +1,184 @@
+"""The declared scene with what the loop found put right: traced boxes stand in it, buildings that are gone do not, and
+anchors are where they were found."""
+
+import shutil
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from radiotwin.closeloop.run import Loop
+from radiotwin.effects.boxes import Box
+from radiotwin.effects.missing_obstacle import MissingObstacle
+from radiotwin.effects.position_errors import DevicePositionError
+from radiotwin.effects.removed_obstacle import RemovedObstacle, buildings
+from radiotwin.errors import BadInput
+from radiotwin.files import atomic_folder, require_writable
+from radiotwin.scene import Scene
+from radiotwin.scene.build import check_target
+from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.config import SceneConfig, write_config
+from radiotwin.scene.material_mapping import unique_name
+from radiotwin.scene.materials import itu_material, traceable
+from radiotwin.scene.ply import read_ply, write_ply
+from radiotwin.scene.preview import draw_preview
+from radiotwin.scene.writer import CityShape, write_city
+
+BOX_MATERIAL = "concrete"  # what a building that nobody has seen is most likely made of
+CLEARANCE_M = 0.5  # between walls and what is known to stand outside them
+FARTHEST_M = 60.0  # that a device is moved out of a building
+
+
+def check_corrected_target(folder: Path, scene: Scene | None, report_folder: Path) -> None:
+    """Raise BadInput, before the long work, where no corrected scene can be written to a folder."""
+    if scene is None:
+        raise BadInput("--write-scene corrects a declared scene, and none was given; give it with --scene, or leave "
+                       "--write-scene out")
+    for other, what in ((scene.folder, "the declared scene"), (report_folder, "the report (--out)")):
+        if other.resolve().is_relative_to(folder.resolve()):
+            raise BadInput(f"--write-scene {folder}: {what} is in {other}, which the corrected scene would replace; "
+                           "choose another folder")
+    check_target(folder)
+    require_writable(folder / "scene.toml")
+
+
+def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
+    """Write a copy of the scene with the traced boxes added, the buildings that are gone taken out, and the anchors
+    that stand elsewhere moved; everything else as it is.
+
+    Args:
+        loop: what was found.
+        scene: that it was found in.
+        folder: to write; a scene that is already in it is replaced.
+
+    Returns:
+        what was changed, a sentence each; where that is nothing, nothing is written
+
+    Raises:
+        BadInput: the folder cannot be written or holds something else, or what was found makes no scene.
+    """
+    parts = loop.after.whole.parts
+    label, centres_m = buildings(scene.city)
+    gone = [part.setting["building"] for part in parts if isinstance(part.effect, RemovedObstacle)]
+    keep = ~np.isin(label, gone)
+    config, moves = _moved(loop, scene, CityMap(scene.city.vertices, scene.city.faces[keep]) if keep.any() else None)
+    free_m = np.array([*((d.x_m, d.y_m, d.z_m) for d in config.devices),
+                       *((x_m, y_m, uav.altitude_m) for uav in config.uavs
+                         for x_m, y_m in ((uav.start_x_m, uav.start_y_m), (uav.terminal_x_m, uav.terminal_y_m)))])
+    boxes = [_pulled_back(Box(*part.setting["box"]), free_m.reshape(-1, 3)) for part in parts
+             if isinstance(part.effect, MissingObstacle)]
+    changes = [f"a box of {box.length_m:.0f} x {box.width_m:.0f} m, {box.height_m:.0f} m high, stands at "
+               f"({box.x_m:.0f}, {box.y_m:.0f}) m" for box in boxes]
+    changes += ["the building at ({:.0f}, {:.0f}) m, {:.0f} m high, is taken out".format(*centres_m[building])
+                for building in gone]
+    changes += moves
+    if not changes:
+        return []
+    check_target(folder)
+    earlier = config.provenance.get("corrected")
+    provenance = config.provenance | {"corrected": "; ".join(([earlier] if earlier else []) + changes)}
+    with atomic_folder(folder) as temporary:
+        _write_city(scene, temporary, keep, boxes)
+        write_config(config.model_copy(update={"provenance": provenance}), temporary / "scene.toml")
+        draw_preview(Scene.load(temporary), temporary / "preview.png")
+    return changes
+
+
+def _moved(loop: Loop, scene: Scene, city: CityMap | None) -> tuple[SceneConfig, list[str]]:
+    """The configuration with anchors where they were found, as near as `city` leaves room, and what was moved."""
+    records = loop.after.whole.records
+    found_m: dict[str, np.ndarray] = {}
+    for part in loop.after.whole.parts:
+        if isinstance(part.effect, DevicePositionError):
+            name = records.device_names[part.setting["device"]]
+            before_m = found_m.get(name, records.device_m[part.setting["device"], :2])
+            found_m[name] = before_m + part.setting["move_m"]
+    devices, changes = [], []
+    for device in scene.config.devices:
+        if device.device in found_m:
+            x_m, y_m = _free_place(found_m[device.device], device.z_m, scene, city)
+            changes.append(f"{device.device} is moved from ({device.x_m:.0f}, {device.y_m:.0f}) to ({x_m:.0f}, "
+                           f"{y_m:.0f}) m")
+            device = device.model_copy(update={"x_m": x_m, "y_m": y_m})
+        devices.append(device)
+    return scene.config.model_copy(update={"devices": devices}), changes
+
+
+def _free_place(place_m: np.ndarray, z_m: float, scene: Scene, city: CityMap | None) -> tuple[float, float]:
+    """The place next to one (2,) that is within the extent and outside buildings [m]."""
+    x_min, x_max, y_min, y_max = scene.config.extent.bounds
+    low_m, high_m = (x_min, y_min), (x_max, y_max)
+    radius_m, angle = (axis.ravel() for axis in np.meshgrid(np.arange(0, FARTHEST_M), np.radians(np.arange(0, 360, 10)),
+                                                            indexing="ij"))
+    around_m = radius_m[:, None] * np.column_stack([np.sin(angle), np.cos(angle)])
+    tried_m = np.round(np.clip(np.clip(place_m, low_m, high_m) + around_m, low_m, high_m), 2)
+    free = np.ones(len(tried_m), dtype=bool)
+    if city is not None:
+        for aside_m in CLEARANCE_M * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]):
+            free &= ~city.inside(np.column_stack([tried_m + aside_m, np.full(len(tried_m), z_m)]))
+    x_m, y_m = tried_m[free.argmax()]  # the first, which is the nearest
+    return float(x_m), float(y_m)
+
+
+def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
+    """The box without points (n, 3) that are known to be free: of each, it gives way on the side that costs least."""
+    turn = np.radians(box.turn_deg)
+    axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+    high = np.array([0.5 * box.length_m, 0.5 * box.width_m, box.height_m])
+    low = np.array([-high[0], -high[1], 0.0])
+    for point in np.column_stack([(points_m[:, :2] - (box.x_m, box.y_m)) @ axes.T, points_m[:, 2]]):
+        if (point <= low - CLEARANCE_M).any() or (point >= high + CLEARANCE_M).any():
+            continue
+        choices = []
+        for axis, side in ((0, low), (0, high), (1, low), (1, high), (2, high)):  # the ground stays
+            pulled = side.copy()
+            pulled[axis] = point[axis] + (CLEARANCE_M if side is low else -CLEARANCE_M)
+            choices.append((pulled, high) if side is low else (low, pulled))
+        low, high = max(choices, key=lambda choice: np.prod(np.maximum(choice[1] - choice[0], 0.0)))
+    x_m, y_m = 0.5 * (low + high)[:2] @ axes + (box.x_m, box.y_m)
+    return Box(x_m, y_m, *(high - low)[:2], high[2], box.turn_deg)
+
+
+def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box]) -> None:
+    """Write `city.xml` and `meshes/`: the faces (f,) of the scene's map that are kept, its materials, and boxes."""
+    root = ElementTree.parse(scene.xml_path).getroot()
+    taken = {element.get("id", "").lower().removeprefix("mesh-").removeprefix("mat-") for element in root}
+    write_city(folder, _box_shapes(scene, boxes, taken))
+    added = ElementTree.parse(folder / "city.xml").getroot()
+    at = 0
+    for shape in root.findall("shape"):
+        name = shape.find("string[@name='filename']")
+        if name is None:
+            continue
+        source = scene.folder / name.get("value", "")
+        vertices_m, polygons = read_ply(source)
+        faces = np.concatenate(polygons)
+        mine = keep[at:at + len(faces)]
+        at += len(faces)
+        if not mine.any():
+            root.remove(shape)
+            continue
+        name.set("value", f"meshes/{source.name}")
+        if mine.all():
+            shutil.copyfile(source, folder / "meshes" / source.name)
+        else:
+            used, left = np.unique(faces[mine], return_inverse=True)
+            write_ply(folder / "meshes" / source.name, vertices_m[used], left.reshape(-1, 3))
+    root.extend(added)
+    ElementTree.indent(root)
+    ElementTree.ElementTree(root).write(folder / "city.xml", encoding="utf-8", xml_declaration=True)
+
+
+def _box_shapes(scene: Scene, boxes: list[Box], taken: set[str]) -> list[CityShape]:
+    """Boxes from the lowest point of the map up; names that are not yet `taken`."""
+    material = traceable(itu_material(BOX_MATERIAL, name=unique_name(f"found_{BOX_MATERIAL}", taken)),
+                         scene.config.radio.frequency_hz)
+    bottom_m = min(float(scene.city.vertices[:, 2].min()), 0.0)
+    shapes = []
+    for box in boxes:
+        turned = trimesh.transformations.rotation_matrix(np.radians(box.turn_deg), (0, 0, 1))
+        turned[:3, 3] = box.x_m, box.y_m, 0.5 * (bottom_m + box.height_m)
+        mesh = trimesh.creation.box((box.length_m, box.width_m, box.height_m - bottom_m), turned)
+        shapes.append(CityShape(unique_name("found_box", taken), mesh, material))
+    return shapes

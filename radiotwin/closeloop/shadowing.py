@@ -1,0 +1,71 @@
+"""`correlated_shadowing`, the last resort: what no named effect explains is interpolated over the ground.
+
+A Gaussian process over the place of the end that moves, one field for each of the ends that do not (the exponential
+model of shadowing, Gudmundson 1991, Electronics Letters 27). It explains nothing: it says that the rest of the error
+has a place. It is no candidate among the effects, because it would fit part of whatever they stand for.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from radiotwin.channel.residual_field import ResidualField
+from radiotwin.closeloop.model import Side
+from radiotwin.closeloop.records import Records
+from radiotwin.closeloop.regression import Solution, residual_db
+
+NAME = "correlated_shadowing"
+MOST_Z = 4.0  # an outlier counts as this many scales
+
+
+@dataclass(frozen=True, eq=False)
+class Shadowing:
+    """A field for each end that does not move.
+
+    Attributes:
+        field: of the residual in units of its own standard deviation.
+        sigma: that standard deviation, in units of the error scale.
+        receivers_move: whether devices stand still and receivers move, or the other way round.
+    """
+
+    field: ResidualField
+    sigma: float
+    receivers_move: bool
+
+    @classmethod
+    def fit(cls, side: Side, solution: Solution, seed: int) -> "Shadowing":
+        """Learn from the training links of a side what its base and effects leave over."""
+        problem = side.problem(side.train)
+        z = np.clip(residual_db(problem, solution) / solution.scale_db[problem.group], -MOST_Z, MOST_Z)
+        sigma = max(float(z.std()), 1e-6)
+        shadowing = cls(ResidualField(), sigma, receivers_move(side.records))
+        shadowing.field.fit(*shadowing._points(side.records.select(side.train)), (z - z.mean()) / sigma, seed)
+        return shadowing
+
+    def at(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
+        """What it adds (n,) [error scales], and the factor (n,) that is left of the error scale."""
+        mean, spread = self.field.predict(*self._points(records))
+        return self.sigma * mean, spread
+
+    def state(self) -> dict:
+        """What JSON can hold and `from_state` reads; positions to the decimetre."""
+        arrays, settings = self.field.state()
+        return {"sigma": self.sigma, "receivers_move": self.receivers_move, "settings": settings,
+                "arrays": {name: array.round(1 if name.startswith("position") else 4).tolist()
+                           for name, array in arrays.items()}}
+
+    @classmethod
+    def from_state(cls, state: dict) -> "Shadowing":
+        """What `state` gave."""
+        arrays = {name: np.array(array, dtype=float) for name, array in state["arrays"].items()}
+        return cls(ResidualField.from_state(arrays, state["settings"]), state["sigma"], state["receivers_move"])
+
+    def _points(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
+        if self.receivers_move:
+            return records.device, records.receiver_m
+        return records.receiver, records.device_m[records.device]
+
+
+def receivers_move(records: Records) -> bool:
+    """Whether receivers have been in more places than devices are in."""
+    return len(np.unique(records.receiver_m[:, :2].round(), axis=0)) >= len(records.device_names)

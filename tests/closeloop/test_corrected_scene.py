@@ -1,0 +1,165 @@
+"""The scene that `--write-scene` writes: read back by the loader, and traced."""
+
+import shutil
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+
+from radiotwin.closeloop.corrected_scene import check_corrected_target, write_corrected_scene
+from radiotwin.effects.missing_obstacle import MissingObstacle
+from radiotwin.effects.position_errors import DevicePositionError
+from radiotwin.effects.receiver_drift import ReceiverDrift
+from radiotwin.effects.removed_obstacle import RemovedObstacle, buildings
+from radiotwin.errors import BadInput
+from radiotwin.scene import Scene
+from radiotwin.scene.materials import itu_material
+from radiotwin.scene.writer import CityShape, write_city
+from radiotwin.trace import SolverSettings, trace_gains
+
+BOX = [130.0, 45.0, 24.0, 14.0, 70.0, 30.0]  # on a street of the small scene
+
+
+def loop_of(scene, *found):
+    """What `write_corrected_scene` looks at of a loop that found these: (effect, setting)."""
+    records = SimpleNamespace(device_names=[d.device for d in scene.config.devices], device_m=scene.device_m)
+    parts = [SimpleNamespace(effect=effect(), setting=setting) for effect, setting in found]
+    return SimpleNamespace(after=SimpleNamespace(whole=SimpleNamespace(parts=parts, records=records)))
+
+
+def ends(x_m, y_m, turn_deg, reach_m, z_m):
+    """Two points on both sides of a place, along a direction."""
+    turn = np.radians(turn_deg)
+    step = reach_m * np.array([np.cos(turn), np.sin(turn)])
+    return (np.array([[x_m + sign * step[0], y_m + sign * step[1], z_m]]) for sign in (-1, 1))
+
+
+def tallest(scene):
+    """Index, x, y [m] and height [m] of the highest building."""
+    centres_m = buildings(scene.city)[1]
+    return int(centres_m[:, 2].argmax()), *centres_m[centres_m[:, 2].argmax()]
+
+
+def test_a_traced_box_stands_in_the_way_as_long_wide_and_turned_as_it_was_found(small_scene, tmp_path):
+    loop = loop_of(small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0}))
+    changes = write_corrected_scene(loop, small_scene, tmp_path / "new")
+    assert changes == ["a box of 24 x 14 m, 70 m high, stands at (130, 45) m"]
+    city = Scene.load(tmp_path / "new").city
+    for turn_deg, half_m in ((30.0, 12.0), (120.0, 7.0)):  # along it and across
+        a_m, b_m = ends(*BOX[:2], turn_deg, 40.0, 60.0)
+        assert small_scene.city.line_of_sight(a_m, b_m)[0] and not city.line_of_sight(a_m, b_m)[0]
+        assert city.metres_inside(a_m, b_m)[0] == pytest.approx(2 * half_m, abs=0.01)
+    a_m, b_m = ends(*BOX[:2], 30.0, 40.0, 71.0)
+    assert city.line_of_sight(a_m, b_m)[0]
+    again = Scene.load(tmp_path / "new").config
+    assert again.provenance.pop("corrected") == changes[0]
+    assert again == small_scene.config
+
+
+def test_a_building_that_is_gone_lets_links_through_and_others_do_not(small_scene, tmp_path):
+    building, x_m, y_m, height_m = tallest(small_scene)
+    loop = loop_of(small_scene, (RemovedObstacle, {"building": building, "centre_m": [x_m, y_m, height_m]}))
+    changes = write_corrected_scene(loop, small_scene, tmp_path / "new")
+    assert len(changes) == 1 and "is taken out" in changes[0]
+    city = Scene.load(tmp_path / "new").city
+    above, below = np.array([[x_m, y_m, height_m + 1]]), np.array([[x_m, y_m, 0.5]])
+    assert not small_scene.city.line_of_sight(above, below)[0] and city.line_of_sight(above, below)[0]
+    assert len(buildings(city)[1]) == len(buildings(small_scene.city)[1]) - 1
+    assert len(list((tmp_path / "new" / "meshes").iterdir())) == len(list(small_scene.folder.glob("meshes/*"))) - 1
+    for mesh in (tmp_path / "new" / "meshes").iterdir():
+        assert mesh.read_bytes() == (small_scene.folder / "meshes" / mesh.name).read_bytes()
+
+
+def test_one_building_of_a_mesh_that_holds_several(small_scene, tmp_path):
+    """A city whose buildings are one mesh: the others stay."""
+    shutil.copytree(small_scene.folder, tmp_path / "one")
+    shutil.rmtree(tmp_path / "one" / "meshes")
+    mesh = trimesh.Trimesh(small_scene.city.vertices, small_scene.city.faces, process=False)
+    write_city(tmp_path / "one", [CityShape("all", mesh, itu_material("concrete"))])
+    scene = Scene.load(tmp_path / "one")
+    building, x_m, y_m, height_m = tallest(scene)
+    write_corrected_scene(loop_of(scene, (RemovedObstacle, {"building": building})), scene, tmp_path / "new")
+    new = buildings(Scene.load(tmp_path / "new").city)[1]
+    old = np.delete(buildings(scene.city)[1], building, axis=0)
+    assert np.sort(new, axis=0) == pytest.approx(np.sort(old, axis=0))
+
+
+def test_an_anchor_stands_where_it_was_found(small_scene, tmp_path):
+    loop = loop_of(small_scene, (DevicePositionError, {"device": 0, "move_m": [0.0, 20.0]}),
+                   (DevicePositionError, {"device": 0, "move_m": [5.0, 0.0]}),
+                   (ReceiverDrift, {"receiver": 0}))
+    assert write_corrected_scene(loop, small_scene, tmp_path / "new") == ["d0 is moved from (80, 40) to (85, 60) m"]
+    new = Scene.load(tmp_path / "new")
+    assert new.device_m[0] == pytest.approx(small_scene.device_m[0] + (5, 20, 0))
+    assert (new.device_m[1:] == small_scene.device_m[1:]).all()
+    assert new.xml_path.read_bytes() == small_scene.xml_path.read_bytes()
+
+
+def test_what_cannot_be_gives_way_to_what_is_known(small_scene, tmp_path):
+    """An anchor found within a building or off the map, and a box over a device: each as near as it can be."""
+    building, x_m, y_m, _ = tallest(small_scene)
+    box = [*small_scene.device_m[1, :2] + (8.0, 0.0), 30.0, 20.0, 40.0, 0.0]
+    loop = loop_of(
+        small_scene, (DevicePositionError, {"device": 0, "move_m": [x_m - 80.0, y_m - 40.0]}),
+        (DevicePositionError, {"device": 6, "move_m": [0.0, 100.0]}),
+        (MissingObstacle, {"box": box, "scattered_db": 0.0}))
+    write_corrected_scene(loop, small_scene, tmp_path / "new")
+    new = Scene.load(tmp_path / "new")  # refuses devices inside buildings and outside the extent
+    assert new.device_m[6] == pytest.approx((80.0, 300.0, 1.5))
+    assert np.hypot(*(new.device_m[0, :2] - (x_m, y_m))) < 60
+    assert new.city.height_at(*(small_scene.device_m[1, :2] + (12.0, 0.0))) == pytest.approx(40.0)
+
+
+def test_what_was_corrected_can_be_corrected_again(small_scene, tmp_path):
+    write_corrected_scene(loop_of(small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0})),
+                          small_scene, tmp_path / "a")
+    scene = Scene.load(tmp_path / "a")
+    other = [110.0, 100.0, 10.0, 10.0, 50.0, 0.0]
+    write_corrected_scene(loop_of(scene, (MissingObstacle, {"box": other, "scattered_db": 0.0})), scene, tmp_path / "b")
+    again = Scene.load(tmp_path / "b")
+    assert again.city.height_at([110.0, 130.0], [100.0, 45.0]) == pytest.approx([50.0, 70.0])
+    assert again.config.provenance["corrected"].count("a box of") == 2
+
+
+def test_where_nothing_is_to_be_corrected_nothing_is_written(small_scene, tmp_path):
+    loop = loop_of(small_scene, (ReceiverDrift, {"receiver": 0}))
+    assert write_corrected_scene(loop, small_scene, tmp_path / "new") == []
+    assert not (tmp_path / "new").exists()
+
+
+def test_folders_that_cannot_be_written_are_refused_before_the_work(small_scene, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("")
+    (tmp_path / "file").write_text("")
+    out = tmp_path / "out"
+    for folder, scene, message in (
+            (tmp_path / "new", None, "give it with --scene"), (tmp_path / "mine", small_scene, "holds thesis.txt"),
+            (tmp_path / "file", small_scene, "cannot write"), (out, small_scene, "the report"),
+            (small_scene.folder, small_scene, "the declared scene"),
+            (small_scene.folder.parent, small_scene, "the declared scene")):
+        with pytest.raises(BadInput, match=message):
+            check_corrected_target(folder, scene, out)
+    check_corrected_target(out / "scene", small_scene, out)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "mine"]
+
+
+@pytest.mark.llvm
+def test_sionna_rt_traces_it(small_scene, tmp_path):
+    """Rationale: the map that Sionna RT loads is `city.xml`, not ours.
+
+    Expected: a link loses more than 6 dB where the box is put in its way, and gains more than 6 dB where the building
+    that blocked it is taken out.
+    """
+    building, x_m, y_m, height_m = tallest(small_scene)
+    loop = loop_of(small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0}),
+                   (RemovedObstacle, {"building": building}))
+    write_corrected_scene(loop, small_scene, tmp_path / "new")
+    new = Scene.load(tmp_path / "new")
+    links = [*zip(*ends(*BOX[:2], 30.0, 40.0, 60.0)), *zip(*ends(x_m, y_m, 0.0, 60.0, 0.5 * height_m))]
+    change_db = []
+    for a_m, b_m in links:
+        before_db, after_db = (float(trace_gains(scene, a_m[None], b_m[None], SolverSettings.of_quality("fast"))[0, 0])
+                               for scene in (small_scene, new))
+        change_db.append(np.nan_to_num(after_db, nan=-200.0) - np.nan_to_num(before_db, nan=-200.0))
+    assert change_db[0] < -6 and change_db[1] > 6

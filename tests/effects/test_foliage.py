@@ -1,0 +1,37 @@
+"""Loss through vegetation: in proportion to its depth at first, and no more than a greatest loss (ITU-R P.833)."""
+
+import numpy as np
+import pytest
+
+from radiotwin.effects.foliage import Foliage
+
+
+@pytest.fixture
+def lost_db(links):
+    """Loss of level links at 5 m through a grove that is `depth_m` long, 20 m wide and 12 m high."""
+    def make(depth_m, law, device_m=(-200.0, 0, 5), receiver_m=(200.0, 0, 5)):
+        setting = {"box": [0.0, 0.0, depth_m, 20.0, 12.0, 0.0], "law": law}
+        return -Foliage().term(links([device_m], [receiver_m]), setting, None).offset_db[0]
+    return make
+
+
+@pytest.mark.parametrize("depth_m", [1.0, 10.0, 40.0, 300.0])
+def test_the_loss_is_that_of_the_recommendation(lost_db, depth_m):
+    assert lost_db(depth_m, [0.8, 18.0]) == pytest.approx(18 * (1 - np.exp(-depth_m * 0.8 / 18)))
+
+
+def test_it_is_in_proportion_at_first_and_saturates(lost_db):
+    assert lost_db(0.1, [0.8, 18.0]) == pytest.approx(0.08, rel=0.01)
+    assert lost_db(390.0, [0.8, 18.0]) == pytest.approx(18, rel=0.001)
+
+
+def test_what_passes_beside_or_above_loses_nothing(lost_db):
+    assert lost_db(30.0, [0.8, 18.0], (-200, 15, 5), (200, 15, 5)) == 0
+    assert lost_db(30.0, [0.8, 18.0], (-200, 0, 13), (200, 0, 13)) == 0
+
+
+def test_what_dips_into_the_crowns_loses_by_the_metres_inside(lost_db):
+    """From 22 m down to 2 m over 400 m: 12 m high above the middle, within the grove's last 15 m only."""
+    inside_m = 15 * np.hypot(400, 20) / 400
+    assert lost_db(30.0, [0.8, 18.0], (-200, 0, 22), (200, 0, 2)) == pytest.approx(
+        18 * (1 - np.exp(-inside_m * 0.8 / 18)))

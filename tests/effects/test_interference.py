@@ -1,0 +1,51 @@
+"""An emitter that nobody declared, against powers that are added by hand, and in worlds that have one or none."""
+
+import numpy as np
+import pytest
+
+from radiotwin.effects.interference import Interference
+
+
+def watts(level_db):
+    return 10 ** (np.asarray(level_db) / 10)
+
+
+def heard(receiver_m, place_m, level_db):
+    """Power of an emitter, one receiver at a time: `level_db` at 100 m, less by the square of the distance."""
+    return np.array([watts(level_db) * 100.0**2 / np.sum((receiver - place_m) ** 2) for receiver in receiver_m])
+
+
+def test_powers_add_and_the_slope_is_known(links):
+    rng = np.random.default_rng(0)
+    records = links([[0.0, 0, 1.5], [90, 40, 1.5]], np.column_stack([rng.uniform(0, 300, (50, 2)), np.full(50, 60.0)]))
+    setting = {"place_m": [120.0, 80.0], "level_db": -90.0, "within_m": [0, 0, 300, 300]}
+    level_db = rng.uniform(-120, -60, len(records))
+    extra = Interference().term(records, setting, None).extra
+    read_db, slope = Interference().bend(level_db, records, setting, extra)
+    power = heard(records.receiver_m, np.array([120.0, 80.0, 1.5]), -90.0)
+    np.testing.assert_allclose(watts(read_db), watts(level_db) + power, rtol=1e-9)
+    more_db, less_db = (Interference().bend(level_db + step, records, setting, extra)[0] for step in (1e-4, -1e-4))
+    np.testing.assert_allclose(slope, (more_db - less_db) / 2e-4, atol=1e-6)
+
+
+def test_receivers_that_stand_still_cannot_tell(links):
+    places_m = np.column_stack([np.arange(12) * 30.0, np.zeros(12), np.full(12, 20.0)])
+    assert "12 places" in Interference().lacks(links([[0.0, 0, 1.5]], np.repeat(places_m, 40, axis=0)))
+    assert Interference().lacks(links([[0.0, 0, 1.5]], np.vstack([places_m, places_m + (0, 50, 0)]))) is None
+
+
+def test_an_emitter_is_found_where_it_stands(open_ground, loop):
+    world = open_ground.fly(21)
+    power = heard(world.receiver_m, np.array([330.0, 140.0, 3.0]), -99.0)
+    world.gain_db = 10 * np.log10(watts(world.gain_db) + power)
+    found = loop(open_ground.measured(world))
+    assert found.names == ["interference"]
+    off_m = np.hypot(found.first["x_m"].value - 330, found.first["y_m"].value - 140)
+    assert off_m < 20 and found.first["level_at_100_m"].value == pytest.approx(-99, abs=1)
+    assert found.report["error"]["after"]["nll"] < found.report["error"]["before"]["nll"] - 0.1
+
+
+def test_a_floor_that_is_the_same_everywhere_is_no_emitter(open_ground, loop):
+    world = open_ground.fly(22)
+    world.gain_db = 10 * np.log10(watts(world.gain_db) + watts(-97.0))
+    assert loop(open_ground.measured(world)).names == ["noise_floor_censoring"]

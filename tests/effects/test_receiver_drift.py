@@ -1,0 +1,55 @@
+"""The shapes of a receiver's drift in time, and which of them is proposed."""
+
+import numpy as np
+import pytest
+
+from radiotwin.effects.receiver_drift import ReceiverDrift
+
+SLOTS, FLIGHT_S = 200, 300.0
+
+
+@pytest.fixture
+def flown(links):
+    """Two receivers on four flights of 50 slots each, which start 300 s apart at 1000 s."""
+    def make():
+        flight = np.arange(SLOTS) // 50
+        time_s = 1000 + FLIGHT_S * flight + 2.0 * (np.arange(SLOTS) % 50)
+        # All over the place: where it flies past slowly, a drift looks like errors that are alike in places.
+        receiver_m = np.column_stack([np.random.default_rng(0).uniform(0, 900, (SLOTS, 2)), np.full(SLOTS, 50.0)])
+        return links([[0.0, 0, 1.5]], np.repeat(receiver_m, 2, axis=0), receiver=np.tile([0, 1], SLOTS),
+                     flight=np.repeat(flight, 2), time_s=np.repeat(time_s, 2))
+    return make
+
+
+SHAPES = {
+    "warm_up": (80.0, lambda t, flight: np.exp(-(t - 1000) / 80)),
+    "warm_up_each_flight": (20.0, lambda t, flight: np.exp(-(t - 1000 - FLIGHT_S * flight) / 20)),
+    "step": (1351.0, lambda t, flight: np.where(t >= 1351, 1.0, 0.0)),
+    "ageing": (1500.0, lambda t, flight: (t - 1500) / 998),  # from 1000 to 1998 s
+}
+
+
+@pytest.mark.parametrize("form", SHAPES)
+def test_a_form_has_its_shape_on_its_receivers_links_only(flown, form):
+    records, (number, shape) = flown(), SHAPES[form]
+    term = ReceiverDrift().term(records, {"receivers": {"1": [form, number]}}, None)
+    mine = records.receiver == 1
+    np.testing.assert_allclose(term.columns[mine, 0], shape(records.time_s, records.flight)[mine], atol=1e-9)
+    np.testing.assert_array_equal(term.columns[:, 1], mine)
+    assert np.abs(term.columns[~mine]).max() == 0 and np.abs(term.offset_db).max() == 0
+
+
+@pytest.mark.parametrize("form", SHAPES)
+def test_the_form_that_is_there_is_proposed_for_the_receiver_that_has_it(flown, view, form):
+    records, (number, shape) = flown(), SHAPES[form]
+    rng = np.random.default_rng(0)
+    records.level_db[:] = rng.normal(0, 0.5, len(records)) \
+        + np.where(records.receiver == 1, 6 * shape(records.time_s, records.flight), 0.0)
+    (setting,) = ReceiverDrift().propose(view(records, np.zeros(len(records)), 1.0))
+    assert list(setting["receivers"]) == ["1"]
+    found, value = setting["receivers"]["1"]
+    assert found == form and value == pytest.approx(number, rel=0.5 if "warm" in form else 0.01)
+
+
+def test_without_times_there_is_no_drift(links):
+    assert "time_s" in ReceiverDrift().lacks(links([[0.0, 0, 1.5]], np.ones((80, 3))))
