@@ -154,8 +154,7 @@ class Twin:
             BadInput: the folder exists and is not a twin's.
         """
         folder = Path(folder)
-        if folder.is_dir() and any(folder.iterdir()) and not (folder / "twin.json").is_file():
-            raise BadInput(f"{folder} is not empty and not a twin's folder; choose another output folder")
+        check_twin_target(folder)
         record = {"schema": SCHEMA, "channel": {"model": self.channel.name, "file": CHANNEL_FILE},
                   "level": self.level, "limit_db": self.limit_db,
                   "devices": [_without_nan(asdict(device)) for device in self.devices],
@@ -185,6 +184,12 @@ class Twin:
             raise BadInput(f"{folder} is not a twin's folder (no twin.json); `radiotwin fit` makes one") from None
         except (OSError, KeyError, TypeError, ValueError) as error:
             raise BadInput(f"{path} is damaged ({type(error).__name__}: {error}); run `radiotwin fit` again") from None
+
+
+def check_twin_target(folder: Path) -> None:
+    """Raise BadInput when the folder holds anything but a twin, so that nothing else is overwritten."""
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "twin.json").is_file():
+        raise BadInput(f"{folder} is not empty and not a twin's folder; choose another output folder")
 
 
 def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmented_nn", seed: int,

@@ -39,11 +39,13 @@ def close_loop(
     from radiotwin.measurements import read_measurements
     from radiotwin.progress import progress
     from radiotwin.scene import Scene
+    from radiotwin.twin import check_twin_target
 
     show_warnings_plainly()
     data = read_measurements(measurements, devices)
     world = Scene.load(scene) if scene else None
     require_writable(out / "closeloop.json")
+    check_twin_target(out / "twin")
     if write_scene is not None:
         check_corrected_target(write_scene, world, out)
     with progress("closing the loop", total=None) as advance:

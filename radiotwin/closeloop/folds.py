@@ -91,6 +91,9 @@ def evidence_blocks(records: Records) -> np.ndarray:
 def _flights_are_alike(records: Records) -> bool:
     if len(np.unique(records.flight)) < FEWEST_FLIGHTS:
         return False
+    seen = np.bincount(records.flight[np.isfinite(records.level_db)])
+    if seen.max() > 0.5 * seen.sum():  # what is left without that flight would not tell much
+        return False
     for end in (records.device, records.receiver):
         pairs = np.unique(np.column_stack([end, records.flight]), axis=0)
         ends, place = np.unique(end, return_inverse=True)

@@ -11,6 +11,7 @@ LEAST_ROWS = 60
 FEW_ROWS = 5
 CLOSE_M, LEAST_PLACES = 0.1, 3  # so many places so close to each other are hardly in metres
 MOST_NAMED = 5
+MOST_OUTSIDE = 0.5  # share of the links
 
 
 def refuse_empty_levels(level_db: np.ndarray, column: str) -> None:
@@ -63,9 +64,18 @@ def _beside_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
     inside[known] = scene.city.inside(receiver_m[known])
     low, high = scene.city.vertices.min(axis=0)[:2], scene.city.vertices.max(axis=0)[:2]
     outside = ((receiver_m[:, :2] < low) | (receiver_m[:, :2] > high)).any(axis=1)
+    if outside.mean() > MOST_OUTSIDE:
+        raise BadInput(
+            f"{outside.sum():,} of {len(outside):,} links have their receiver outside the 3D map, which goes from "
+            f"{_place(low)} to {_place(high)} m: give measurements and scene in one frame, in metres; feet and degrees "
+            "are not converted")
     return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}: do measurements and scene share one "
             "frame and unit?" for odd, where in ((inside, "inside a building"), (outside, "outside the 3D map"))
             if odd.any()]
+
+
+def _place(corner_m: np.ndarray) -> str:
+    return f"({corner_m[0]:.0f}, {corner_m[1]:.0f})"
 
 
 def useless_receivers(table: pd.DataFrame, level_db: np.ndarray, keep: np.ndarray) -> list[tuple[np.ndarray, str]]:

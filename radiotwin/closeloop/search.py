@@ -1,5 +1,6 @@
 """Which effects the data supports: fitted on training folds, judged on held-out ones, kept one after the other."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -123,7 +124,9 @@ def make_model(records: Records, base: Base, folds: Folds) -> Model:
     sides = []
     for number in range(folds.count):
         train = folds.index != number
-        sides.append(Side.make(records, train, base.fit(records.select(train)), dof))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of the data: the fit to all links has said it
+            sides.append(Side.make(records, train, base.fit(records.select(train)), dof))
     model = Model(Side.make(records, everything, whole, dof), sides, [], folds.index)
     model.fits = [side.fit() for side in model.sides]
     return model

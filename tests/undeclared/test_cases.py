@@ -55,7 +55,7 @@ def test_has_all_its_links(family, seed):
 def test_blanks_and_noise_are_as_meant(family, seed):
     one = case(family, seed)
     level_db, limit_db = one.measurements.level_db, one.scene.config.gain_limit_db
-    assert 0.02 < np.isnan(level_db).mean() < 0.25
+    assert 0.02 < np.isnan(level_db).mean() < 0.4
     assert np.nanmin(level_db) >= limit_db and np.nanmax(level_db) < 0
     assert np.all(level_db[np.isfinite(level_db)] % 0.25 == 0)
     noise_db = (level_db - one.clean_gain_db)[np.isfinite(level_db) & (one.clean_gain_db > limit_db + 12)]
