@@ -6,10 +6,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.optimize import minimize
 
-from radiotwin.closeloop.bases import FittedBase
+from radiotwin.closeloop.bases import ANY_LEVEL_DB, FittedBase
 from radiotwin.closeloop.records import Records
 from radiotwin.closeloop.regression import Problem, Solution, covariance, mean_db, residual_db, solve
-from radiotwin.effects.base import Effect, Found, Setting, Term, View, some
+from radiotwin.effects.base import Effect, Found, Setting, Term, Variation, View, some
 
 TRIALS = 25  # for each number of a setting, while it is refined
 REFINED_ON = 5000  # links at most
@@ -183,6 +183,8 @@ def _refine(side: Side, fitted: Solution) -> tuple[Side, Solution]:
     variation = part.effect.vary(part.setting)
     if variation is None or not len(variation.values):
         return side, fitted
+    if variation.members is not None:
+        return _refine_members(side, fitted, part, variation)
     rows = some(np.flatnonzero(side.train), REFINED_ON)
     part_records = side.records.select(rows)
     small = replace(
@@ -196,11 +198,50 @@ def _refine(side: Side, fitted: Solution) -> tuple[Side, Solution]:
         outside = np.abs((numbers - inside) / variation.steps).sum()
         return tried.fit(fitted).objective + 10.0 * outside
 
-    simplex = np.vstack([variation.values, variation.values + np.diag(variation.steps)])
-    found = minimize(objective, variation.values, method="Nelder-Mead",
-                     options={"initial_simplex": simplex, "maxfev": TRIALS * len(simplex), "xatol": 1e-2,
-                              "fatol": 0.1})
-    setting = variation.setting(np.clip(found.x, variation.low, variation.high))
+    return _better(side, fitted, part, variation, _descend(objective, variation.values, variation.steps))
+
+
+def _refine_members(side: Side, fitted: Solution, part: Part, variation: Variation) -> tuple[Side, Solution]:
+    """Vary the numbers of each member by themselves, on links of its own; a level of its own is all that is fitted
+    beside them."""
+    numbers, mean_db = variation.values.copy(), side.mean_db(fitted)
+    rest_db = mean_db - part.term.offset_db
+
+    def offset_db(rows: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        setting = variation.setting(np.clip(numbers, variation.low, variation.high))
+        return part.effect.term(side.records.select(rows), setting, side.base.shifted_db).offset_db
+
+    for member in variation.members:
+        moved = numbers.copy()
+        moved[member] += variation.steps[member]
+        rows = np.flatnonzero(side.train)
+        rows = rows[offset_db(rows, moved) != offset_db(rows, numbers)]
+        rows = some(rows, REFINED_ON)
+        if not len(rows):
+            continue
+        alone = replace(side.with_parts([]).problem(rows), law_columns=np.ones((len(rows), 1)),
+                        spread_db=np.full(1, ANY_LEVEL_DB))
+
+        def objective(values: np.ndarray) -> float:
+            tried, inside = numbers.copy(), np.clip(values, variation.low[member], variation.high[member])
+            tried[member] = inside
+            outside = np.abs((values - inside) / variation.steps[member]).sum()
+            return solve(replace(alone, law_db=rest_db[rows] + offset_db(rows, tried))).objective + 10.0 * outside
+
+        numbers[member] = _descend(objective, numbers[member], variation.steps[member])
+    return _better(side, fitted, part, variation, numbers)
+
+
+def _descend(objective: Callable[[np.ndarray], float], values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    simplex = np.vstack([values, values + np.diag(steps)])
+    options = {"initial_simplex": simplex, "maxfev": TRIALS * len(simplex), "xatol": 1e-2, "fatol": 0.1}
+    return minimize(objective, values, method="Nelder-Mead", options=options).x
+
+
+def _better(side: Side, fitted: Solution, part: Part, variation: Variation,
+            numbers: np.ndarray) -> tuple[Side, Solution]:
+    """The side with the last effect's numbers changed, where that is better."""
+    setting = variation.setting(np.clip(numbers, variation.low, variation.high))
     better = side.with_parts([*side.parts[:-1], side.part(part.effect, setting)])
     solution = better.fit(fitted)
     return (better, solution) if solution.objective < fitted.objective else (side, fitted)

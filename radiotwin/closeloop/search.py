@@ -27,6 +27,7 @@ SUPPORTED = 0.1
 CLEARLY_NATS = np.log(100.0)  # how much likelier the data must be than with another effect, to tell it from that one
 FLIPS = 20_000
 MOST_EFFECTS = 6
+MOST_OF_A_KIND = 4  # in one step
 WORTH_A_LOOK_NATS = 10.0
 
 
@@ -164,31 +165,62 @@ def search_effects(model: Model, catalogue: list[Effect], seed: int,
             result.log.append(Judged(effect.name, False, f"not looked for: {why}", np.nan, np.nan, np.nan, 0))
         else:
             available.append(effect)
-    for step in range(MOST_EFFECTS):
-        best = None
+    while len(result.model.whole.parts) < MOST_EFFECTS:
+        step, passed = len(result.model.whole.parts), []
         for effect in available:
             tell(f"step {step + 1}: {effect.name}")
             if not effect.repeatable and any(part.effect is effect for part in result.model.whole.parts):
                 continue
             judged, extended = _judge(result.model, effect, block, len(available), step, seed)
             result.log.append(judged)
-            if extended is not None and (best is None or judged.nll_gain > best[0].nll_gain):
-                best = judged, extended
-        if best is None:
+            if extended is not None:
+                passed.append((effect, judged, extended))
+        if not passed:
             break
-        judged, result.model = best
-        passed = [i for i, entry in enumerate(result.log) if entry.step == step and entry.reason == ""]
-        rivals = [result.log[i].name for i in passed if result.log[i].name != judged.name
-                  and judged.gain_by_fold.sum() - result.log[i].gain_by_fold.sum() < CLEARLY_NATS]
-        for i in passed:
-            mine = result.log[i] is judged
-            result.log[i] = replace(result.log[i], kept=mine, reason="" if mine else f"{judged.name} gains more")
-        result.rivals.append(rivals)
+        passed.sort(key=lambda each: -each[1].nll_gain)
+        # Of those that the data cannot tell apart the one with the least error.
+        alike = [each for each in passed if _alike(passed[0][1], each[1])]
+        passed.sort(key=lambda each: each[1].rmse_db if each in alike else np.inf)
+        steps = [passed[0][1:]]
+        rival = next((each for each in passed[1:] if each[0].repeatable), None)
+        if rival is not None and not passed[0][0].repeatable:
+            tell(f"step {step + 1}: more of {rival[1].name}")
+            several = _several(*rival, block, len(available), seed, passed[0][1].nll_gain)
+            steps = several or steps
+        best = steps[0][0]
+        rivals = [judged.name for _, judged, _ in passed if judged.name != best.name and _alike(best, judged)]
+        for i, entry in enumerate(result.log):
+            if entry.step == step and entry.reason == "":
+                result.log[i] = replace(entry, kept=entry is best,
+                                        reason="" if entry is best else f"{best.name} gains more")
+        result.log += [replace(judged, kept=True) for judged, _ in steps[1:]]
+        result.rivals += [rivals, *([] for _ in steps[1:])]
+        result.model = steps[-1][1]
     # A rival that gains beside the effect is another effect; one that does not is another name for it.
     last = max((entry.step for entry in result.log), default=0)
     alive = {entry.name for entry in result.log if entry.kept or (entry.step == last and entry.reason == "")}
     result.rivals = [sorted(set(rivals) - alive) for rivals in result.rivals]
     return result
+
+
+def _alike(best: Judged, other: Judged) -> bool:
+    return best.gain_by_fold.sum() - other.gain_by_fold.sum() < CLEARLY_NATS
+
+
+def _several(effect: Effect, judged: Judged, extended: Model, block: np.ndarray, tried: int, seed: int,
+             least_gain: float) -> list[tuple[Judged, Model]] | None:
+    """An effect of which a step finds one, again and again, until it gains more than one that finds all of its kind at
+    once: groves or towers, each seen from few devices, against an antenna or an offset for each device. None where
+    it does not."""
+    steps = [(judged, extended)]
+    while len(extended.whole.parts) < MOST_EFFECTS and len(steps) < MOST_OF_A_KIND:
+        judged, extended = _judge(extended, effect, block, tried, judged.step + 1, seed)
+        if extended is None:
+            return None
+        steps.append((judged, extended))
+        if sum(judged.nll_gain for judged, _ in steps) > least_gain:
+            return steps
+    return None
 
 
 def add_shadowing(search: Search, seed: int) -> None:

@@ -101,6 +101,13 @@ class View:
         z = self.residual_db / self.scale_db
         return 5.0 / (4.0 + z * z) / self.scale_db**2 / self.design_effect
 
+    def nats(self, rows: np.ndarray, change_db: np.ndarray) -> np.ndarray:
+        """(r,) how much likelier links `rows` become if their mean changes by (r,) [dB]. With heavy tails on both sides:
+        `weight` knows the old outliers only, and a change makes others."""
+        scale_db = self.scale_db[rows]
+        before, after = (self.residual_db[rows] / scale_db) ** 2, ((self.residual_db[rows] - change_db) / scale_db) ** 2
+        return 2.5 * (np.log1p(before / 4.0) - np.log1p(after / 4.0)) / self.design_effect
+
     def score(self, term: Term) -> float:
         """How much a term would help: half of the drop of the weighted squares, after its coefficients and a level for
         each class of line of sight are fitted [nats]."""
@@ -209,6 +216,8 @@ class Variation:
         steps: (q,) typical uncertainty of each.
         low, high: (q,) bounds.
         setting: numbers -> setting.
+        members: indices of numbers that belong together and act on links of their own, such as those of one device;
+            each is refined by itself. None: all numbers act on the same links.
     """
 
     values: np.ndarray
@@ -216,6 +225,7 @@ class Variation:
     low: np.ndarray
     high: np.ndarray
     setting: Callable[[np.ndarray], Setting]
+    members: list[np.ndarray] | None = None
 
 
 def some(rows: np.ndarray, most: int) -> np.ndarray:

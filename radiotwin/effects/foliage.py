@@ -16,6 +16,7 @@ LOWEST, HIGHEST = 3.0, 26.0  # tops of trees [m]
 LOSSES_DB = (3.0, 6.0, 9.0, 12.0, 16.0, 20.0)
 STARTS = 3
 SIDES_M = (25.0, 55.0)
+MOST_DB = 25.0  # what loses more is no vegetation
 FIRST_LAW = (0.6, 15.0)  # specific attenuation [dB/m], greatest loss [dB]
 
 
@@ -46,7 +47,7 @@ class Foliage(Effect):
             np.array([*setting["box"], *np.log(setting["law"])]),
             np.array([CELL_M, CELL_M, 12.0, 12.0, 3.0, 20.0, 0.4, 0.3]),
             np.array([x_m - 80, y_m - 80, 5.0, 5.0, LOWEST, -90.0, np.log(0.05), np.log(3.0)]),
-            np.array([x_m + 80, y_m + 80, 200.0, 200.0, 30.0, 90.0, np.log(5.0), np.log(35.0)]),
+            np.array([x_m + 80, y_m + 80, 200.0, 200.0, 30.0, 90.0, np.log(5.0), np.log(MOST_DB)]),
             lambda numbers: {"box": [float(v) for v in numbers[:6]], "law": [float(v) for v in np.exp(numbers[6:])]})
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:

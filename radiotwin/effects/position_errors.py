@@ -40,10 +40,9 @@ class DevicePositionError(Effect):
             rows = some(np.flatnonzero(records.device == device), ENOUGH_LINKS)
             mine, share = records.select(rows), (records.device == device).sum() / len(rows)
             before_db = view.at(mine)
-            squares = view.weight[rows] @ view.residual_db[rows] ** 2
             for east, north in moves:
                 moved_db = view.at(_with_moved(mine, device, (east, north))) - before_db
-                nats = 0.5 * share * (squares - view.weight[rows] @ (view.residual_db[rows] - moved_db) ** 2)
+                nats = share * view.nats(rows, moved_db).sum()
                 if nats > best[0]:
                     best = nats, {"device": device, "move_m": [float(east), float(north)]}
         return [best[1]] if best[1] else []
@@ -88,11 +87,9 @@ class ReceiverPositionError(Effect):
             rows = some(np.flatnonzero(records.receiver == receiver), ENOUGH_LINKS)
             mine, share = records.select(rows), (records.receiver == receiver).sum() / len(rows)
             before_db = view.at(mine)
-            weight, residual_db = view.weight[rows], view.residual_db[rows]
-            squares = weight @ residual_db**2
             for move in moves:
                 moved_db = view.at(mine.with_receivers(mine.receiver_m + move)) - before_db
-                nats = 0.5 * share * (squares - weight @ (residual_db - moved_db) ** 2)
+                nats = share * view.nats(rows, moved_db).sum()
                 if nats > best[0]:
                     best = nats, {"receiver": receiver, "move_m": [float(v) for v in move]}
         return [best[1]] if best[1] else []

@@ -36,9 +36,7 @@ class RemovedObstacle(Effect):
             return []
         mine = records.select(rows)
         rise_db = view.at(mine.with_los(np.ones(len(rows), bool))) - view.at(mine)
-        weight, residual_db = view.weight[rows], view.residual_db[rows]
-        nats = 0.5 * weight * (residual_db**2 - (residual_db - rise_db) ** 2)
-        total = np.bincount(blocker[rows], weights=nats)
+        total = np.bincount(blocker[rows], weights=view.nats(rows, rise_db))
         counts = np.bincount(blocker[rows])
         best = int(np.where(counts >= LEAST_LINKS, total, -np.inf).argmax())
         if total[best] < LEAST_NATS or counts[best] < LEAST_LINKS:

@@ -1,7 +1,9 @@
 """A device with a sector antenna: gain depends on the direction in which a link leaves the device.
 
 Pattern of 3GPP TR 38.901 V17, Table 7.3-1: horizontally −min(12 (φ / φ_3dB)², A_max), vertically −min(12 ((θ − tilt) /
-θ_3dB)², A_max), together no less than −A_max. The maximum gain is the device's level and is fitted with it.
+θ_3dB)², A_max), together no less than −A_max. The maximum gain is the device's level and is fitted with it. What
+reaches a place without line of sight leaves the device in many directions: a share of it, fitted too, has the mean of
+the pattern.
 """
 
 import numpy as np
@@ -18,9 +20,13 @@ ATTENUATIONS_DB = (10.0, 15.0, 20.0, 30.0)
 NO_VERTICAL = (0.0, 360.0)  # tilt and vertical beamwidth of an antenna that is flat in elevation
 VERTICALS = (NO_VERTICAL, (0.0, 15.0), (-6.0, 15.0), (-12.0, 15.0), (0.0, 40.0), (-10.0, 40.0), (15.0, 40.0),
              (40.0, 65.0))
-FIELDS = ("azimuth_deg", "beamwidth_deg", "front_to_back_db", "tilt_deg", "vertical_beamwidth_deg")
-STEPS = np.array([8.0, 10.0, 3.0, 4.0, 5.0])
-LOW, HIGH = np.array([-720.0, 20.0, 3.0, -60.0, 6.0]), np.array([1080.0, 180.0, 45.0, 80.0, 120.0])
+FIELDS = ("azimuth_deg", "beamwidth_deg", "front_to_back_db", "tilt_deg", "vertical_beamwidth_deg",
+          "scattered_share")
+UNITS = ("deg", "deg", "dB", "deg", "deg", "of the power without line of sight")
+STEPS = np.array([8.0, 10.0, 3.0, 4.0, 5.0, 0.2])
+LOW, HIGH = np.array([-720.0, 20.0, 3.0, -60.0, 6.0, 0.0]), np.array([1080.0, 180.0, 45.0, 80.0, 360.0, 0.95])
+SCATTERED = 0.2
+AROUND_DEG = np.arange(0.0, 360.0, 5.0)
 
 
 def sector_pattern_db(azimuth_deg: np.ndarray, elevation_deg: np.ndarray, pattern: np.ndarray) -> np.ndarray:
@@ -60,15 +66,15 @@ class SectorAntenna(Effect):
                                           view.residual_db[rows], view.weight[rows])
             sure |= nats > LEAST_NATS
             if nats > LEAST_TOO_NATS:
-                found[str(device)] = pattern
+                found[str(device)] = [*pattern, SCATTERED]
         return [{"devices": found}] if sure else []
 
     def term(self, records, setting, at) -> Term:
         offset_db = np.zeros(len(records))
         for device, pattern in setting["devices"].items():
             mine = records.device == int(device)
-            offset_db[mine] = sector_pattern_db(records.azimuth_deg[mine], records.elevation_deg[mine],
-                                                np.array(pattern))
+            offset_db[mine] = _offset_db(records.azimuth_deg[mine], records.elevation_deg[mine], records.los[mine],
+                                         np.array(pattern))
         members = [int(device) for device in setting["devices"]]
         names = [f"gain_db[{records.device_names[member]}]" for member in members]
         return Term(offset_db, one_hot(records.device, members), np.full(len(members), LEVEL_SPREAD_DB), names)
@@ -79,20 +85,30 @@ class SectorAntenna(Effect):
 
         def again(numbers: np.ndarray) -> dict:
             return {"devices": {device: [float(v) for v in part]
-                                for device, part in zip(devices, np.reshape(numbers, (-1, 5)))}}
+                                for device, part in zip(devices, np.reshape(numbers, (-1, len(FIELDS))))}}
         times = len(devices)
-        return Variation(values, np.tile(STEPS, times), np.tile(LOW, times), np.tile(HIGH, times), again)
+        return Variation(values, np.tile(STEPS, times), np.tile(LOW, times), np.tile(HIGH, times), again,
+                         list(np.arange(len(values)).reshape(times, -1)))
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
         result = {}
         spreads = np.reshape(found.setting_deviations, (-1, len(FIELDS)))
         for number, (device, pattern) in enumerate(setting["devices"].items()):
             name = records.device_names[int(device)]
-            for field, value, spread in zip(FIELDS, pattern, spreads[number]):
+            known = len(FIELDS) - bool(records.los.all())  # nothing tells the last one then
+            for field, unit, value, spread in list(zip(FIELDS, UNITS, pattern, spreads[number]))[:known]:
                 value = value % 360 if field == "azimuth_deg" else value
-                result[f"{field}[{name}]"] = Parameter.normal(value, spread, "dB" if field.endswith("db") else "deg")
+                result[f"{field}[{name}]"] = Parameter.normal(value, spread, unit)
             result[f"gain_db[{name}]"] = Parameter.normal(found.coefficients[number], found.deviations[number], "dB")
         return result
+
+
+def _offset_db(azimuth_deg: np.ndarray, elevation_deg: np.ndarray, los: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+    """(n,) what the pattern (6,), as in `FIELDS`, takes from each link [dB]."""
+    direct_db = sector_pattern_db(azimuth_deg, elevation_deg, pattern[:5])
+    mean = np.mean(10 ** (sector_pattern_db(AROUND_DEG, np.full(len(AROUND_DEG), pattern[3]), pattern[:5]) / 10))
+    share = pattern[5]
+    return np.where(los, direct_db, 10 * np.log10((1 - share) * 10 ** (direct_db / 10) + share * mean))
 
 
 def _best_pattern(azimuth_deg, elevation_deg, residual_db, weight) -> tuple[list[float], float]:

@@ -94,7 +94,7 @@ class TiltedDipole(Effect):
                                   for receiver, pair in zip(receivers, np.reshape(numbers, (-1, 2)))}}
         times = len(receivers)
         return Variation(values, np.tile([4.0, 10.0], times), np.tile([0.0, -720.0], times),
-                         np.tile([85.0, 1080.0], times), again)
+                         np.tile([85.0, 1080.0], times), again, list(np.arange(2 * times).reshape(times, 2)))
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
         result = {}
