@@ -102,10 +102,13 @@ class View:
         return 5.0 / (4.0 + z * z) / self.scale_db**2 / self.design_effect
 
     def nats(self, rows: np.ndarray, change_db: np.ndarray) -> np.ndarray:
-        """(r,) how much likelier links `rows` become if their mean changes by (r,) [dB]. With heavy tails on both sides:
-        `weight` knows the old outliers only, and a change makes others."""
+        """(r,) how much likelier links `rows` become if their mean changes by (r,) [dB].
+
+        With heavy tails before and after: `weight` knows the old outliers only, and a change makes others.
+        """
         scale_db = self.scale_db[rows]
-        before, after = (self.residual_db[rows] / scale_db) ** 2, ((self.residual_db[rows] - change_db) / scale_db) ** 2
+        before = (self.residual_db[rows] / scale_db) ** 2
+        after = ((self.residual_db[rows] - change_db) / scale_db) ** 2
         return 2.5 * (np.log1p(before / 4.0) - np.log1p(after / 4.0)) / self.design_effect
 
     def score(self, term: Term) -> float:
