@@ -1,6 +1,7 @@
 """How well the loop names what is hidden, and how near its error comes to that of who knows.
 
     python benchmarks/closeloop_undeclared.py -o docs/results/closeloop_undeclared.json [--only FAMILY[:SEED] …]
+    python benchmarks/closeloop_undeclared.py --write FOLDER --only FAMILY:SEED   # measurements, to try it on
 
 Runs `close-loop` on the cases of `tests/undeclared` that are traced. A case that is in the file already is left out, so
 that a run that was stopped goes on. The oracle is the same base, fitted to the same links with the effect taken out of
@@ -34,15 +35,23 @@ GEOMETRY = ("missing_obstacle", "removed_obstacle")
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--out", type=Path, required=True)
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("-o", "--out", type=Path)
+    what.add_argument("--write", type=Path, metavar="FOLDER")
     parser.add_argument("--base", default="auto")
     parser.add_argument("--hold-out", default="auto")
     parser.add_argument("--only", nargs="*", default=[*FAMILIES, *OUTSIDE], help="FAMILY or FAMILY:SEED")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
-    results = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
     wanted = [(family, seed) for seed in SEEDS for family in (*FAMILIES, *OUTSIDE)
               if {family, f"{family}:{seed}"} & set(arguments.only)]
+    if arguments.write:
+        for family, seed in wanted:
+            hidden = case(family, seed)
+            hidden.measurements.write(arguments.write / f"{family}-{seed}" / "measurements.csv")
+            print(f"wrote {arguments.write / f'{family}-{seed}'}; its scene is {hidden.scene.folder}")
+        return
+    results = json.loads(arguments.out.read_text()) if arguments.out.exists() else {}
     for family, seed in wanted:
         name = f"{family}:{seed}"
         if name in results or not stored(family, seed):
