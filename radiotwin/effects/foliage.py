@@ -25,7 +25,7 @@ class Foliage(Effect):
 
     name = "foliage"
     repeatable = True
-    confused_with = ("missing_obstacle", "excess_attenuation", "device_gain_offset")
+    confused_with = ("missing_obstacle", "excess_attenuation", "device_gain_offset", "antenna_pattern")
 
     def propose(self, view: View) -> list[dict]:
         records = view.records

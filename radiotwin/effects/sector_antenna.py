@@ -48,7 +48,7 @@ class SectorAntenna(Effect):
 
     name = "antenna_pattern"
     variant = "sector antenna of a device"
-    confused_with = ("device_gain_offset", "device_position_error", "missing_obstacle")
+    confused_with = ("device_gain_offset", "device_position_error", "missing_obstacle", "foliage")
 
     def lacks(self, records) -> str | None:
         if not measured(records.device, LEAST_LINKS):
