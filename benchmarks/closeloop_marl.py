@@ -123,8 +123,8 @@ def train(scene: Scene, truth, twin: Twin | None, seed: int, algorithm: str, epi
         with progress("training", total=episodes) as advance:
             strategy.prepare(mission, advance)
         policy = strategy.policy(stream(seed, "decisions", 0))
-        ratios = [evaluate(where, policy, 16, stream(seed, "evaluation")).ratio(where).mean()
-                  for where in (mission, reality.mission(known))]
+        ratios = [evaluate(where, policy, 16, stream(seed, purpose)).ratio(where).mean() for where, purpose in
+                  ((mission, "twin evaluation"), (reality.mission(known), "truth evaluation"))]
     finally:
         strategy.close()
     error_db = np.nan if twin is None else _error_db(twin, scene, truth)

@@ -2,6 +2,7 @@
 
     python benchmarks/closeloop_undeclared.py -o docs/results/closeloop_undeclared.json [--only FAMILY[:SEED] …]
     python benchmarks/closeloop_undeclared.py --write FOLDER --only FAMILY:SEED   # measurements, to try it on
+    python benchmarks/closeloop_undeclared.py --table docs/results/closeloop_undeclared.json
 
 Runs `close-loop` on the cases of `tests/undeclared` that are traced. A case that is in the file already is left out, so
 that a run that was stopped goes on. The oracle is the same base, fitted to the same links with the effect taken out of
@@ -13,6 +14,7 @@ import copy
 import json
 import time
 import warnings
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +32,7 @@ from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
 from tests.undeclared.cases import FAMILIES, OUTSIDE, SEEDS, Case, case, stored
 
+UNITS = {"db": "dB", "m": "m", "deg": "°"}
 GEOMETRY = ("missing_obstacle", "removed_obstacle")
 
 
@@ -38,11 +41,15 @@ def main() -> None:
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("-o", "--out", type=Path)
     what.add_argument("--write", type=Path, metavar="FOLDER")
+    what.add_argument("--table", type=Path, metavar="RESULTS")
     parser.add_argument("--base", default="auto")
     parser.add_argument("--hold-out", default="auto")
     parser.add_argument("--only", nargs="*", default=[*FAMILIES, *OUTSIDE], help="FAMILY or FAMILY:SEED")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
+    if arguments.table:
+        print(table(json.loads(arguments.table.read_text())))
+        return
     wanted = [(family, seed) for seed in SEEDS for family in (*FAMILIES, *OUTSIDE)
               if {family, f"{family}:{seed}"} & set(arguments.only)]
     if arguments.write:
@@ -82,6 +89,42 @@ def study(hidden: Case, base: str, hold_out: str) -> dict:
         **errors, "nlos_rmse_db": nlos, "baselines": baselines,
         "oracle_rmse_db": round(oracle_rmse_db(hidden, report["base"], hold_out), 3),
         "drivers": [driver["variable"] for driver in report["remaining"]["drivers"]], "cpu_s": round(cpu_s)}
+
+
+def table(results: dict) -> str:
+    """Results as Markdown, a line for each family; mean errors over its cases."""
+    lines = ["| hidden | named first | also named | errors of what was recovered | before [dB] | after | oracle "
+             "| log-distance | kriging |", "|---|---|---|---|---|---|---|---|---|"]
+    for family in (*FAMILIES, *OUTSIDE):
+        cases = [results[f"{family}:{seed}"] for seed in SEEDS if f"{family}:{seed}" in results]
+        if not cases:
+            continue
+        hidden = [{effect["name"] for effect in each["hidden"]} for each in cases]
+        named = [[name for name in each["named"] if name != "correlated_shadowing"] for each in cases]
+        first = sum(bool(names) and names[0] in truth for names, truth in zip(named, hidden))
+        if not hidden[0] or family in OUTSIDE:
+            right = f"no name in {sum(not names for names in named)} of {len(cases)}"
+        elif family == "pairs":
+            both = sum(truth <= set(names) for names, truth in zip(named, hidden))
+            right = f"{first} of {len(cases)}; both in {both}"
+        else:
+            right = f"{first} of {len(cases)}"
+        others = Counter(name for names, truth in zip(named, hidden) for name in set(names) - truth)
+        errors: dict[str, list[str]] = {}
+        for each in cases:
+            for found in each["recovered"]:
+                for name, value in found.items():
+                    if name.split("_")[-1] in UNITS and value is not None:
+                        errors.setdefault(name, []).append(f"{value:+.1f}")
+        told = "; ".join(f"{name.rsplit('_error_', 1)[0]} {', '.join(values)} {UNITS[name.split('_')[-1]]}"
+                         for name, values in errors.items())
+        scores = [np.mean([each[when]["rmse_db"] for each in cases]) for when in ("before", "after")]
+        scores.append(np.mean([each["oracle_rmse_db"] for each in cases]))
+        scores += [np.mean([each["baselines"][name] for each in cases]) for name in ("log_distance",
+                                                                                   "regression_kriging")]
+        also = ", ".join(f"`{name}` {count}" for name, count in others.most_common())
+        lines.append(f"| `{family}` | {right} | {also} | {told} | " + " | ".join(f"{s:.2f}" for s in scores) + " |")
+    return "\n".join(lines)
 
 
 def oracle_rmse_db(hidden: Case, base: str, hold_out: str) -> float:

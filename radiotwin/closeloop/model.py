@@ -8,10 +8,11 @@ from scipy.optimize import minimize
 
 from radiotwin.closeloop.bases import ANY_LEVEL_DB, FittedBase
 from radiotwin.closeloop.records import Records
-from radiotwin.closeloop.regression import Problem, Solution, covariance, mean_db, residual_db, solve
+from radiotwin.closeloop.regression import Problem, Solution, covariance, mean_db, nll, residual_db, solve
 from radiotwin.effects.base import Effect, Found, Setting, Term, Variation, View, some
 
 TRIALS = 25  # for each number of a setting, while it is refined
+DESCENTS = 2  # a simplex that has collapsed too early starts anew
 REFINED_ON = 5000  # links at most
 MOST_FITS = 2  # of proposals of one effect
 WORTH_REFINING_NATS = 5.0
@@ -118,6 +119,10 @@ class Side:
         variation = part.effect.vary(part.setting)
         if variation is None:
             return np.zeros(0)
+        design_effect = self.view(solution).design_effect
+
+        def cost(side: Side, fitted: Solution) -> float:
+            return fitted.objective + design_effect * part.effect.improbable(side.parts[number].setting)
         deviations = np.empty(len(variation.values))
         for i, step in enumerate(variation.steps):
             rises = []
@@ -126,7 +131,8 @@ class Side:
                 numbers[i] = np.clip(numbers[i] + sign * step, variation.low[i], variation.high[i])
                 parts = list(self.parts)
                 parts[number] = self.part(part.effect, variation.setting(numbers))
-                rises.append(self.with_parts(parts).fit(solution).objective - solution.objective)
+                varied = self.with_parts(parts)
+                rises.append(cost(varied, varied.fit(solution)) - cost(self, solution))
             deviations[i] = step / np.sqrt(2 * max(float(np.mean(rises)), 1e-3))
         return deviations
 
@@ -186,19 +192,29 @@ def _refine(side: Side, fitted: Solution) -> tuple[Side, Solution]:
     if variation.members is not None:
         return _refine_members(side, fitted, part, variation)
     rows = some(np.flatnonzero(side.train), REFINED_ON)
+    design_effect = side.view(fitted).design_effect * len(rows) / max(side.train.sum(), 1)
     part_records = side.records.select(rows)
     small = replace(
         side, records=part_records, train=np.ones(len(rows), bool), usable=np.ones(len(rows), bool),
         base_db=side.base_db[rows], base_columns=side.base_columns[rows], group=side.group[rows],
         parts=[replace(p, term=p.term.select(rows)) for p in side.parts[:-1]])
+    rest = small.problem(slice(None))
+    # What has no coefficients of its own moves those of the others little: they stay while it is refined.
+    alone = part.effect.stage == "gain" and not len(part.term.spread_db)
 
     def objective(numbers: np.ndarray) -> float:
         inside = np.clip(numbers, variation.low, variation.high)
-        tried = small.with_parts([*small.parts, small.part(part.effect, variation.setting(inside))])
+        setting = variation.setting(inside)
+        tried = small.part(part.effect, setting)
+        misfit = nll(replace(rest, gain_db=rest.gain_db + tried.term.offset_db), fitted).sum() if alone \
+            else small.with_parts([*small.parts, tried]).fit(fitted).objective
         outside = np.abs((numbers - inside) / variation.steps).sum()
-        return tried.fit(fitted).objective + 10.0 * outside
+        return float(misfit + design_effect * part.effect.improbable(setting) + 10.0 * outside)
 
-    return _better(side, fitted, part, variation, _descend(objective, variation.values, variation.steps))
+    numbers = variation.values
+    for _ in range(DESCENTS):
+        numbers = _descend(objective, numbers, variation.steps)
+    return _better(side, fitted, part, variation, numbers)
 
 
 def _refine_members(side: Side, fitted: Solution, part: Part, variation: Variation) -> tuple[Side, Solution]:
@@ -244,4 +260,6 @@ def _better(side: Side, fitted: Solution, part: Part, variation: Variation,
     setting = variation.setting(np.clip(numbers, variation.low, variation.high))
     better = side.with_parts([*side.parts[:-1], side.part(part.effect, setting)])
     solution = better.fit(fitted)
-    return (better, solution) if solution.objective < fitted.objective else (side, fitted)
+    gain = fitted.objective - solution.objective + side.view(fitted).design_effect * (
+        part.effect.improbable(part.setting) - part.effect.improbable(setting))
+    return (better, solution) if gain > 0 else (side, fitted)

@@ -1,48 +1,87 @@
-"""Powers of the paths of links, each followed once."""
+"""Powers and directions of the paths of links, each followed once."""
 
 from collections import OrderedDict
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 
 from radiotwin.closeloop.records import Records
 from radiotwin.paths import path_powers
-from radiotwin.paths.powers import COMPONENTS
+from radiotwin.paths.powers import COMPONENTS, SECTORS
 from radiotwin.scene.citymap import CityMap
 
-GRID_M = 0.25  # positions of devices that differ by less share their paths
-KEPT = 400  # devices' paths that are remembered
+GRID_M = 1.0  # estimated positions of devices, which no estimate tells better, are rounded to it and share their paths
+KEPT = 300_000  # links that are remembered: 200 MB
+FEWEST_KEPT = 2  # devices, however many links they have
 
 
 def paths_of(records: Records, kinds: tuple[str, ...]) -> np.ndarray:
     """(n,) power gain of some kinds of paths, followed once for each pair of positions."""
     power = np.zeros(len(records))
-    for device in np.unique(records.device):
-        rows = np.flatnonzero(records.device == device)
-        x_m, y_m = np.round(records.device_m[device, :2] / GRID_M) * GRID_M
-        place_m = (float(x_m), float(y_m), float(records.device_m[device, 2]))
-        found = _followed(records.city, place_m, records.receiver_m[rows], records.frequency_hz)
-        power[rows] = sum(found[:, COMPONENTS.index(kind)] for kind in kinds)
+    for rows, followed, place in _by_device(records):
+        power[rows] = sum(followed.powers[place, COMPONENTS.index(kind)] for kind in kinds)
     return power
 
 
-_remembered: OrderedDict[tuple, tuple[np.ndarray, np.ndarray]] = OrderedDict()
+def rays_of(records: Records, end: str) -> np.ndarray:
+    """(n, sectors, 3) power times direction of the paths of links at an end, `departures` or `arrivals`; see
+    `radiotwin.paths.PathPowers`."""
+    rays = np.zeros((len(records), SECTORS, 3), dtype=np.float32)
+    for rows, followed, place in _by_device(records):
+        rays[rows] = getattr(followed, end)[place]
+    return rays
 
 
-def _followed(city: CityMap, place_m: tuple[float, float, float], ends_m: np.ndarray,
-              frequency_hz: float) -> np.ndarray:
-    """(n, kinds) powers of the paths from one place to ends (n, 3); what was followed before is remembered."""
+class _Followed(NamedTuple):
+    """Paths from one place to ends.
+
+    Attributes:
+        ends: (n,) keys of the ends, sorted.
+        powers: (n, kinds)
+        departures, arrivals: (n, sectors, 3)
+    """
+
+    ends: np.ndarray
+    powers: np.ndarray
+    departures: np.ndarray
+    arrivals: np.ndarray
+
+
+_remembered: OrderedDict[tuple, _Followed] = OrderedDict()
+
+
+def _by_device(records: Records) -> Iterator[tuple[np.ndarray, _Followed, np.ndarray]]:
+    """Of each device: its links, what was followed, and the rows of that."""
+    for device in np.unique(records.device):
+        rows = np.flatnonzero(records.device == device)
+        place_m = records.device_m[device]
+        if device not in records.anchors:
+            rounded_m = np.append(np.round(place_m[:2] / GRID_M) * GRID_M, place_m[2])
+            place_m = place_m if records.city.inside(rounded_m[None])[0] else rounded_m
+        followed, place = _follow(records.city, tuple(map(float, place_m)), records.receiver_m[rows],
+                                  records.frequency_hz)
+        yield rows, followed, place
+
+
+def _follow(city: CityMap, place_m: tuple[float, float, float], ends_m: np.ndarray,
+            frequency_hz: float) -> tuple[_Followed, np.ndarray]:
+    """The paths from one place to ends (n, 3), and the row of each; what was followed before is remembered."""
     key = (id(city), place_m, frequency_hz)
     wanted = np.ascontiguousarray(np.round(ends_m * 100).astype(np.int64)).view([("", np.int64)] * 3).ravel()
-    known, powers = _remembered.pop(key, (wanted[:0], np.zeros((0, len(COMPONENTS)))))
-    new, first = np.unique(wanted[~np.isin(wanted, known)], return_index=True)
+    nothing = _Followed(wanted[:0], np.zeros((0, len(COMPONENTS))), *np.zeros((2, 0, SECTORS, 3), dtype=np.float32))
+    known = _remembered.pop(key, nothing)
+    unknown = ~np.isin(wanted, known.ends)
+    new, first = np.unique(wanted[unknown], return_index=True)
     if len(new):
-        new_m = ends_m[~np.isin(wanted, known)][first]
+        new_m = ends_m[unknown][first]
         found = path_powers(city, np.array([place_m]), new_m, np.zeros(len(new_m), int), frequency_hz, "vertical")
-        known = np.concatenate([known, new])
-        powers = np.vstack([powers, np.column_stack([getattr(found, name) for name in COMPONENTS])])
-        order = np.argsort(known)
-        known, powers = known[order], powers[order]
-    _remembered[key] = known, powers
-    if len(_remembered) > KEPT:
+        ends = np.concatenate([known.ends, new])
+        order = np.argsort(ends)
+        powers = np.column_stack([getattr(found, name) for name in COMPONENTS])
+        known = _Followed(*(np.concatenate([old, more.astype(old.dtype)])[order] for old, more in zip(
+            known, (new, powers, found.departures, found.arrivals))))
+    _remembered[key] = known
+    while len(_remembered) > FEWEST_KEPT and sum(len(each.ends) for each in _remembered.values()) > KEPT:
         _remembered.popitem(last=False)
-    return powers[np.searchsorted(known, wanted)]
+    return known, np.searchsorted(known.ends, wanted)

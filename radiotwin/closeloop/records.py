@@ -22,6 +22,8 @@ from radiotwin.scene.citymap import CityMap
 
 FAR_M = 100_000.0
 MISSING_HEIGHT_M = 1.5
+ROOF_SAMPLES = 60  # along a link
+ROWS_AT_ONCE = 5000  # bounds memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,8 @@ class Records:
         is_gain: whether the level is a gain rather than a power.
         anchors: indices of the devices whose positions are declared.
         remarks: what was found odd in the file and what was done about it, a sentence each.
+        pitch_deg, roll_deg: (n,) nose up, and right side down, are positive; None or NaN where unknown.
+        quality: (n,) as the receiver told it; None or NaN where it did not.
     """
 
     level_db: np.ndarray
@@ -61,6 +65,9 @@ class Records:
     is_gain: bool
     anchors: frozenset[int]
     remarks: list[str] = field(default_factory=list)
+    pitch_deg: np.ndarray | None = None
+    roll_deg: np.ndarray | None = None
+    quality: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.level_db)
@@ -114,10 +121,50 @@ class Records:
             return np.ones(len(self), dtype=bool)
         return self.city.line_of_sight(self.device_m[self.device], self.receiver_m)
 
+    @cached_property
+    def receiver_axes(self) -> np.ndarray:
+        """(n, 3, 3) unit vectors of the receiver's right, nose and top in the world; NaN without a heading"""
+        heading, pitch, roll = (np.radians(angle) for angle in (
+            self.heading_deg, *(np.zeros(len(self)) if angle is None else np.nan_to_num(angle)
+                                for angle in (self.pitch_deg, self.roll_deg))))
+        level, zero = np.cos(pitch), np.zeros(len(self))
+        nose = np.column_stack([np.sin(heading) * level, np.cos(heading) * level, np.sin(pitch)])
+        right = np.column_stack([np.cos(heading), -np.sin(heading), zero])
+        top = np.cross(right, nose)
+        lean, upright = np.sin(roll)[:, None], np.cos(roll)[:, None]
+        return np.stack([upright * right - lean * top, nose, upright * top + lean * right], axis=1)
+
+    @cached_property
+    def metres_inside(self) -> np.ndarray:
+        """(n,) length of the link within buildings [m]; 0 without a map"""
+        if self.city is None:
+            return np.zeros(len(self))
+        return self.city.metres_inside(self.device_m[self.device], self.receiver_m)
+
+    @cached_property
+    def diffraction_parameter(self) -> np.ndarray:
+        """(n,) the greatest ν of ITU-R P.526-15, Eq. 26, over the roofs below and above the link; NaN without a map"""
+        greatest = np.full(len(self), np.nan)
+        if self.city is None or np.isnan(self.frequency_hz):
+            return greatest
+        wavelength_m = 299_792_458.0 / self.frequency_hz
+        for start in range(0, len(self), ROWS_AT_ONCE):
+            rows = slice(start, start + ROWS_AT_ONCE)
+            a_m, b_m = self.device_m[self.device[rows], None], self.receiver_m[rows, None]
+            share = (np.arange(ROOF_SAMPLES) + 0.5)[:, None] / ROOF_SAMPLES
+            on_link_m = a_m + share * (b_m - a_m)
+            over_m = self.city.height_at(on_link_m[..., 0], on_link_m[..., 1]) - on_link_m[..., 2]
+            length_m = self.distance_m[rows, None]
+            near_m, far_m = length_m * share[:, 0], length_m * (1 - share[:, 0])
+            greatest[rows] = (over_m * np.sqrt(2 * length_m / (wavelength_m * near_m * far_m))).max(axis=1)
+        return greatest
+
     def select(self, rows: np.ndarray) -> "Records":
         """The links of a mask or index array."""
-        names = ("level_db", "receiver_m", "device", "receiver", "flight", "time_s", "heading_deg")
-        part = replace(self, **{name: getattr(self, name)[rows] for name in names})
+        names = ("level_db", "receiver_m", "device", "receiver", "flight", "time_s", "heading_deg", "pitch_deg",
+                 "roll_deg", "quality")
+        values = {name: getattr(self, name) for name in names}
+        part = replace(self, **{name: value[rows] for name, value in values.items() if value is not None})
         for name in ("los", "time_in_flight_s"):  # costly, or not to be had from a part
             part.__dict__[name] = getattr(self, name)[rows]
         part.__dict__["first_s"] = self.first_s
@@ -205,7 +252,8 @@ def make_records(measurements: Measurements, scene: Scene | None) -> Records:
         _column(table, "time_s"), heading_deg % 360, list(measurements.devices["device"][placed]),
         list(receiver_names), list(flight_names), _frequency(measurements, scene),
         scene.city if scene else None, is_gain,
-        frozenset(np.flatnonzero(measurements.is_anchor[placed]).tolist()), remarks)
+        frozenset(np.flatnonzero(measurements.is_anchor[placed]).tolist()), remarks, _column(table, "pitch_deg"),
+        _column(table, "roll_deg"), _column(table, "quality"))
 
 
 def _limit(level_db: np.ndarray, scene: Scene | None, is_gain: bool) -> float | None:

@@ -84,6 +84,8 @@ def variables(records: Records, mean_db: np.ndarray) -> dict[str, np.ndarray]:
         "time_in_flight_s": records.time_in_flight_s, "time_s": records.time_s, "flight": records.flight,
         "altitude_m": records.receiver_m[:, 2], "receiver": records.receiver, "device": records.device,
         "los": records.los.astype(int), "predicted_level_db": mean_db,
+        "metres_inside_m": records.metres_inside, "diffraction_parameter": records.diffraction_parameter,
+        "quality": np.full(len(records), np.nan) if records.quality is None else records.quality,
         "place_of_ray": cells[0], "place_of_receiver": cells[1],
     }
 

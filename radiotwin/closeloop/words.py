@@ -8,6 +8,8 @@ VARIABLES = {
     "time_in_flight_s": ("time in the flight", "s"), "time_s": ("time", "s"), "flight": ("flight", ""),
     "altitude_m": ("altitude of the receiver", "m"), "receiver": ("receiver", ""), "device": ("device", ""),
     "los": ("line of sight", ""), "predicted_level_db": ("predicted level", "dB"),
+    "metres_inside_m": ("way through buildings", "m"), "diffraction_parameter": ("diffraction parameter", ""),
+    "quality": ("quality", ""),
     "place_of_ray": ("the place that a link passes over", ""), "place_of_receiver": ("the receiver's place", ""),
 }
 PARAMETERS = {
@@ -20,6 +22,7 @@ PARAMETERS = {
     "floor": "noise floor", "saturation_level": "saturation level", "strength_db": "strength, against theory",
     "specific_attenuation_db_km": "specific attenuation", "specific_attenuation_db_m": "specific attenuation",
     "greatest_loss_db": "greatest loss", "true_minus_given_x_m": "true minus given place, east",
+    "scale_height_m": "falls to 1/e at a height of", "scattered_db": "scattered, against free space",
     "strength": "strength", "roughness_m": "roughness of the ground", "ground_m": "height of the ground",
     "lost_share": "links lost", "level_at_100_m": "level at 100 m", "length_m": "length", "width_m": "width",
     "height_m": "height", "share": "share of it", "sigma_db": "standard deviation",

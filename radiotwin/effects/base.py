@@ -181,6 +181,10 @@ class Effect(ABC):
         """How the setting may be refined; None where it is fixed."""
         return None
 
+    def improbable(self, setting: Setting) -> float:
+        """How much less likely a setting is than the likeliest, before anything is measured [nats]."""
+        return 0.0
+
     def unphysical(self, setting: Setting, coefficients: np.ndarray) -> str | None:
         """Why what was fitted cannot be this effect, None where it can."""
         return None

@@ -28,17 +28,21 @@ class Crossing(NamedTuple):
 
     Attributes:
         inside_m: length of the link within the box; 0 where it passes above.
-        over_m: height of the roof above the link in the middle of the crossing; negative where the link passes above.
+        enter_over_m, leave_over_m: height of the roof above the link where it enters and where it leaves; negative
+            where the link passes above.
         left_m, right_m: how far the box reaches across the link's track to each side.
-        first_m, second_m: distance along the ground from each end to the middle of the crossing.
+        before_m, between_m, behind_m: distance along the ground from the first end to where the link enters, from there
+            to where it leaves, and on to the second end.
     """
 
     inside_m: np.ndarray
-    over_m: np.ndarray
+    enter_over_m: np.ndarray
+    leave_over_m: np.ndarray
     left_m: np.ndarray
     right_m: np.ndarray
-    first_m: np.ndarray
-    second_m: np.ndarray
+    before_m: np.ndarray
+    between_m: np.ndarray
+    behind_m: np.ndarray
 
 
 def cross(box: Box, a_m: np.ndarray, b_m: np.ndarray) -> Crossing:
@@ -69,14 +73,13 @@ def cross(box: Box, a_m: np.ndarray, b_m: np.ndarray) -> Crossing:
     below = (np.where(rise > 0, np.minimum(leave, under), leave)
              - np.where(rise < 0, np.maximum(enter, under), enter))
     below = np.where((np.abs(rise) < 1e-9) & (a_m[:, 2] >= box.height_m), 0.0, below)
-    middle = 0.5 * (enter + leave)
     track = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
     unit = step / track[:, None]
     corners = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * half
     across = unit[:, 0, None] * (corners[None, :, 1] - start[:, 1, None]) \
         - unit[:, 1, None] * (corners[None, :, 0] - start[:, 0, None])
-    values = (np.maximum(below, 0) * length, box.height_m - (a_m[:, 2] + middle * rise), across.max(axis=1),
-              -across.min(axis=1), middle * track, (1 - middle) * track)
+    values = (np.maximum(below, 0) * length, *(box.height_m - (a_m[:, 2] + at * rise) for at in (enter, leave)),
+              across.max(axis=1), -across.min(axis=1), enter * track, (leave - enter) * track, (1 - leave) * track)
     return Crossing(np.where(crosses, values[0], 0.0), *(np.where(crosses, value, np.nan) for value in values[1:]))
 
 
@@ -146,3 +149,30 @@ def knife_edge_db(height_m: np.ndarray, first_m: np.ndarray, second_m: np.ndarra
     nu = height_m * np.sqrt(2 * (near + far) / (wavelength_m * near * far))
     shifted = np.maximum(nu, -0.78) - 0.1
     return np.where(nu > -0.78, 6.9 + 20 * np.log10(np.sqrt(shifted**2 + 1) + shifted), 0.0)
+
+
+def two_edges_db(first_over_m: np.ndarray, second_over_m: np.ndarray, before_m: np.ndarray, between_m: np.ndarray,
+                 behind_m: np.ndarray, wavelength_m: float) -> np.ndarray:
+    """Loss over two edges one behind the other, of which either may be the higher (ITU-R P.526-15, Sec. 4.4.1, second
+    method, Eq. 37-42) [dB].
+
+    Args:
+        first_over_m, second_over_m: (n,) how far they reach above the straight line [m].
+        before_m, between_m, behind_m: (n,) the three sections of the way [m].
+    """
+    a, b, c = np.maximum(before_m, 1.0), np.maximum(between_m, 0.1), np.maximum(behind_m, 1.0)
+    whole = a + b + c
+    first, second = (h * np.sqrt(2 * whole / (wavelength_m * near * (whole - near)))
+                     for h, near in ((first_over_m, a), (second_over_m, a + b)))
+    leads = first > second
+    main_over_m, main_near = np.where(leads, first_over_m, second_over_m), np.where(leads, a, a + b)
+    # The other edge, above the line from the main one to the end behind it.
+    own, beyond = np.where(leads, second_over_m, first_over_m), np.where(leads, c, a)
+    other_over_m = own - main_over_m * beyond / (b + beyond)
+    loss_db = knife_edge_db(main_over_m, main_near, whole - main_near, wavelength_m)
+    other_db = knife_edge_db(other_over_m, b, beyond, wavelength_m)
+    p, q = np.maximum(first, second), np.minimum(first, second)
+    alpha = np.arctan(np.sqrt(b * whole / (a * c)))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        too_much_db = (12 - 20 * np.log10(2 / (1 - alpha / np.pi))) * np.maximum(q / p, 0.0) ** (2 * p)
+    return loss_db + np.maximum(other_db - np.where((p > 0) & (q > 0), too_much_db, 0.0), 0.0)

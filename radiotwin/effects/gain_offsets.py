@@ -11,6 +11,7 @@ from radiotwin.effects.base import Effect, Parameter, Term, View, measured, one_
 SPREAD_DB = 10.0
 LEAST_LINKS = 30
 MOST_MEMBERS = 200
+LEAST_OFFSET_DB = 0.5
 
 
 class _GainOffset(Effect):
@@ -38,6 +39,12 @@ class _GainOffset(Effect):
         names = self._names(records)
         return Term.of_columns(one_hot(self._index(records), setting["members"]), SPREAD_DB,
                                [names[member] for member in setting["members"]])
+
+    def unphysical(self, setting, coefficients) -> str | None:
+        most_db = np.abs(coefficients - np.median(coefficients)).max()
+        if most_db < LEAST_OFFSET_DB:
+            return f"none of them is off by more than {most_db:.1f} dB, which is within any instrument's tolerance"
+        return None
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
         names = self._names(records)

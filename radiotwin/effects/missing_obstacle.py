@@ -1,14 +1,24 @@
 """A building that no map shows.
 
-Found by back-projecting the loss along the links' rays; then a box is fitted. Loss behind it: what comes over the roof
-and round both sides (knife edges of ITU-R P.526), and what reaches any shadow by reflections (the base's own level
-without line of sight, give or take what is fitted), added as powers.
+Found by back-projecting the loss along the links' rays; then a box is fitted. Loss behind it: what comes over the two
+edges of the roof and round both sides (knife edges of ITU-R P.526), and what reaches any shadow by reflections (the
+base's own level without line of sight, give or take what is fitted), added as powers.
 """
 
 import numpy as np
 
 from radiotwin.effects.base import Effect, Parameter, Term, Variation, View
-from radiotwin.effects.boxes import CELL_M, HEIGHTS_M, Box, back_project, best_cells, cross, knife_edge_db, lacks_nats
+from radiotwin.effects.boxes import (
+    CELL_M,
+    HEIGHTS_M,
+    Box,
+    back_project,
+    best_cells,
+    cross,
+    knife_edge_db,
+    lacks_nats,
+    two_edges_db,
+)
 
 LIGHT_M_S = 299_792_458.0
 LEAST_NATS = 6.0
@@ -17,6 +27,7 @@ STARTS = 4
 NAMES = ("x_m", "y_m", "length_m", "width_m", "height_m", "turn_deg", "scattered_db")
 UNITS = {"turn_deg": "deg", "scattered_db": "dB"}
 MOST_BLANK_DB = 25.0
+TYPICAL_HEIGHT_M = 20.0  # dense urban: Table 1 there
 
 
 class MissingObstacle(Effect):
@@ -45,16 +56,19 @@ class MissingObstacle(Effect):
         offset_db = np.zeros(len(records))
         rows = np.flatnonzero(records.los)
         crossing = cross(box, records.device_m[records.device[rows]], records.receiver_m[rows])
-        hit = np.isfinite(crossing.over_m)
+        hit = np.isfinite(crossing.left_m)
         if not hit.any():
             return Term.of_offset(offset_db)
         rows = rows[hit]
-        over_m, left_m, right_m, first_m, second_m = (value[hit] for value in crossing[1:])
+        enter_over_m, leave_over_m, left_m, right_m, before_m, between_m, behind_m = (
+            value[hit] for value in crossing[1:])
+        over_m, first_m, second_m = np.maximum(enter_over_m, leave_over_m), before_m + between_m / 2, \
+            behind_m + between_m / 2
         wavelength_m = LIGHT_M_S / records.frequency_hz
         mine = records.select(rows)
         scattered_db = at(mine.with_los(np.zeros(len(rows), bool))) - at(mine)
         power = 10 ** (np.minimum(scattered_db + setting["scattered_db"], 0) / 10) if records.city is not None else 0.0
-        over_db = knife_edge_db(over_m, first_m, second_m, wavelength_m)
+        over_db = two_edges_db(enter_over_m, leave_over_m, before_m, between_m, behind_m, wavelength_m)
         for side_m in (left_m, right_m):
             power = power + 10 ** (-knife_edge_db(side_m, first_m, second_m, wavelength_m) / 10)
         # A link that passes above the roof has its own strength, and what comes round the sides does not add to it.
@@ -69,6 +83,10 @@ class MissingObstacle(Effect):
                          np.array([x_m - 60, y_m - 60, 4.0, 4.0, 3.0, -90.0, -20.0]),
                          np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0, 10.0]),
                          lambda numbers: {"box": [float(v) for v in numbers[:-1]], "scattered_db": float(numbers[-1])})
+
+    def improbable(self, setting) -> float:
+        # Links that pass below the roof only tell "at least". Buildings' heights are Rayleigh distributed (P.1410-6).
+        return 0.5 * (setting["box"][4] / TYPICAL_HEIGHT_M) ** 2
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
         values = zip(NAMES, (*setting["box"], setting["scattered_db"]), found.setting_deviations)

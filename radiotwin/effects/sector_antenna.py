@@ -1,18 +1,20 @@
 """A device with a sector antenna: gain depends on the direction in which a link leaves the device.
 
 Pattern of 3GPP TR 38.901 V17, Table 7.3-1: horizontally −min(12 (φ / φ_3dB)², A_max), vertically −min(12 ((θ − tilt) /
-θ_3dB)², A_max), together no less than −A_max. The maximum gain is the device's level and is fitted with it. What
-reaches a place without line of sight leaves the device in many directions: a share of it, fitted too, has the mean of
-the pattern.
+θ_3dB)², A_max), together no less than −A_max. The maximum gain is the device's level and is fitted with it. With a 3D
+map each path has the gain of the direction in which it leaves the device; what is on ways that are not followed, whose
+power is fitted too, has the mean of the pattern.
 """
 
 import numpy as np
 
+from radiotwin.closeloop.paths import rays_of
+from radiotwin.closeloop.records import Records
 from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured, one_hot
 
+LIGHT_M_S = 299_792_458.0
 LEAST_LINKS = 100
 LEAST_NATS = 4.0
-LEAST_TOO_NATS = 1.5  # where another device surely has one
 LEVEL_SPREAD_DB = 15.0
 AZIMUTHS_DEG = np.arange(0.0, 360.0, 15.0)
 BEAMWIDTHS_DEG = (50.0, 65.0, 90.0, 120.0)
@@ -21,11 +23,11 @@ NO_VERTICAL = (0.0, 360.0)  # tilt and vertical beamwidth of an antenna that is 
 VERTICALS = (NO_VERTICAL, (0.0, 15.0), (-6.0, 15.0), (-12.0, 15.0), (0.0, 40.0), (-10.0, 40.0), (15.0, 40.0),
              (40.0, 65.0))
 FIELDS = ("azimuth_deg", "beamwidth_deg", "front_to_back_db", "tilt_deg", "vertical_beamwidth_deg",
-          "scattered_share")
-UNITS = ("deg", "deg", "dB", "deg", "deg", "of the power without line of sight")
-STEPS = np.array([8.0, 10.0, 3.0, 4.0, 5.0, 0.2])
-LOW, HIGH = np.array([-720.0, 20.0, 3.0, -60.0, 6.0, 0.0]), np.array([1080.0, 180.0, 45.0, 80.0, 360.0, 0.95])
-SCATTERED = 0.2
+          "scattered_db")
+UNITS = ("deg", "deg", "dB", "deg", "deg", "dB under free space")
+STEPS = np.array([8.0, 10.0, 3.0, 4.0, 5.0, 6.0])
+LOW, HIGH = np.array([-720.0, 20.0, 3.0, -60.0, 6.0, -80.0]), np.array([1080.0, 180.0, 45.0, 80.0, 360.0, 0.0])
+SCATTERED_DB = -35.0
 AROUND_DEG = np.arange(0.0, 360.0, 5.0)
 
 
@@ -57,24 +59,19 @@ class SectorAntenna(Effect):
 
     def propose(self, view: View) -> list[dict]:
         records, found = view.records, {}
-        sure = False
         for device in measured(records.device, LEAST_LINKS):
-            rows = np.flatnonzero((records.device == device) & (records.los if records.los.any() else True))
-            if len(rows) < LEAST_LINKS:
-                rows = np.flatnonzero(records.device == device)
-            pattern, nats = _best_pattern(records.azimuth_deg[rows], records.elevation_deg[rows],
-                                          view.residual_db[rows], view.weight[rows])
-            sure |= nats > LEAST_NATS
-            if nats > LEAST_TOO_NATS:
-                found[str(device)] = [*pattern, SCATTERED]
-        return [{"devices": found}] if sure else []
+            rows = np.flatnonzero(records.device == device)
+            azimuth_deg, elevation_deg = _strongest_ray(records.select(rows))
+            pattern, nats = _best_pattern(azimuth_deg, elevation_deg, view.residual_db[rows], view.weight[rows])
+            if nats > LEAST_NATS:
+                found[str(device)] = [*pattern, SCATTERED_DB]
+        return [{"devices": found}] if found else []
 
     def term(self, records, setting, at) -> Term:
         offset_db = np.zeros(len(records))
         for device, pattern in setting["devices"].items():
             mine = records.device == int(device)
-            offset_db[mine] = _offset_db(records.azimuth_deg[mine], records.elevation_deg[mine], records.los[mine],
-                                         np.array(pattern))
+            offset_db[mine] = _offset_db(records.select(mine), np.array(pattern))
         members = [int(device) for device in setting["devices"]]
         names = [f"gain_db[{records.device_names[member]}]" for member in members]
         return Term(offset_db, one_hot(records.device, members), np.full(len(members), LEVEL_SPREAD_DB), names)
@@ -95,7 +92,7 @@ class SectorAntenna(Effect):
         spreads = np.reshape(found.setting_deviations, (-1, len(FIELDS)))
         for number, (device, pattern) in enumerate(setting["devices"].items()):
             name = records.device_names[int(device)]
-            known = len(FIELDS) - bool(records.los.all())  # nothing tells the last one then
+            known = len(FIELDS) - (records.city is None)
             for field, unit, value, spread in list(zip(FIELDS, UNITS, pattern, spreads[number]))[:known]:
                 value = value % 360 if field == "azimuth_deg" else value
                 result[f"{field}[{name}]"] = Parameter.normal(value, spread, unit)
@@ -103,12 +100,35 @@ class SectorAntenna(Effect):
         return result
 
 
-def _offset_db(azimuth_deg: np.ndarray, elevation_deg: np.ndarray, los: np.ndarray, pattern: np.ndarray) -> np.ndarray:
+def _offset_db(records: Records, pattern: np.ndarray) -> np.ndarray:
     """(n,) what the pattern (6,), as in `FIELDS`, takes from each link [dB]."""
-    direct_db = sector_pattern_db(azimuth_deg, elevation_deg, pattern[:5])
+    if records.city is None:
+        return sector_pattern_db(records.azimuth_deg, records.elevation_deg, pattern[:5])
+    power, azimuth_deg, elevation_deg = _rays(records)
+    gain = 10 ** (sector_pattern_db(azimuth_deg, elevation_deg, pattern[:5]) / 10)
     mean = np.mean(10 ** (sector_pattern_db(AROUND_DEG, np.full(len(AROUND_DEG), pattern[3]), pattern[:5]) / 10))
-    share = pattern[5]
-    return np.where(los, direct_db, 10 * np.log10((1 - share) * 10 ** (direct_db / 10) + share * mean))
+    free = (LIGHT_M_S / records.frequency_hz / (4 * np.pi * records.distance_m)) ** 2
+    scattered = free * 10 ** (pattern[5] / 10)
+    return 10 * np.log10(((power * gain).sum(axis=1) + scattered * mean) / (power.sum(axis=1) + scattered))
+
+
+def _rays(records: Records) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(n, sectors) power of the paths that leave the device in each sector, and azimuth and elevation [deg] of it."""
+    ray = rays_of(records, "departures")
+    power = np.linalg.norm(ray, axis=2)
+    sine = ray[..., 2] / np.maximum(power, 1e-30)
+    return power, np.degrees(np.arctan2(ray[..., 0], ray[..., 1])), np.degrees(np.arcsin(np.clip(sine, -1, 1)))
+
+
+def _strongest_ray(records: Records) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) azimuth and elevation [deg] in which most of a link's power leaves the device."""
+    if records.city is None:
+        return records.azimuth_deg, records.elevation_deg
+    power, azimuth_deg, elevation_deg = _rays(records)
+    strongest, every = power.argmax(axis=1), np.arange(len(records))
+    none = power.max(axis=1) == 0
+    return (np.where(none, records.azimuth_deg, azimuth_deg[every, strongest]),
+            np.where(none, records.elevation_deg, elevation_deg[every, strongest]))
 
 
 def _best_pattern(azimuth_deg, elevation_deg, residual_db, weight) -> tuple[list[float], float]:

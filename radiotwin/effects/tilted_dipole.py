@@ -1,48 +1,49 @@
-"""A receiver with a half-wave dipole that is not upright: gain depends on the direction in its body frame.
+"""A receiver with a half-wave dipole that nobody declared, upright or not: gain depends on the direction in its body
+frame.
 
 Far field of a half-wave dipole, cos(π/2 cos θ) / sin θ along its own polar direction (Balanis, Antenna Theory, Sec.
-4.6), times the share of it that is polarised as the wave of an upright transmitting antenna is.
+4.6), directivity 1.64, times the share of it that is polarised as the wave of an upright transmitting antenna is. With
+a 3D map each path has the gain of the direction from which it comes; what is on ways that are not followed, whose
+power is fitted too, has the mean of the pattern.
 """
 
 import numpy as np
 
+from radiotwin.closeloop.paths import rays_of
+from radiotwin.closeloop.records import Records
 from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured
 
+LIGHT_M_S = 299_792_458.0
 LEAST_LINKS = 100
 LEAST_NATS = 4.0
-DEEPEST_DB = -25.0
+DIRECTIVITY = 1.64
+LEAST_GAIN = 10**-2.5
+MEAN_GAIN = 0.5  # over all directions and both polarisations
 STEADY = 0.05  # standard deviation of the heading's sine and cosine
-TILTS_DEG = np.arange(5.0, 60.1, 5.0)
+TILTS_DEG = np.arange(0.0, 60.1, 5.0)
 AZIMUTHS_DEG = np.arange(0.0, 360.0, 15.0)
+FIELDS = ("tilt_deg", "lean_azimuth_deg", "scattered_db")
+UNITS = ("deg", "deg", "dB")
+SCATTERED_DB = -35.0
 
 
-def dipole_gain_db(body_azimuth_deg: np.ndarray, elevation_deg: np.ndarray, tilt_deg: float,
-                   azimuth_deg: float) -> np.ndarray:
-    """Gain of a tilted dipole over that of an upright one [dB], for vertically polarised waves.
+def dipole_gain(ray: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """(…,) gain of a half-wave dipole for vertically polarised waves, linear, over an isotropic antenna.
 
     Args:
-        body_azimuth_deg, elevation_deg: (n,) direction to the device, clockwise from the heading, and up.
-        tilt_deg: of the dipole from the vertical.
-        azimuth_deg: direction in the body frame towards which its upper end leans.
+        ray: (…, 3) unit vectors towards where the wave comes from; up is z.
+        axis: (…, 3) unit vectors along the dipole.
     """
-    return _field_db(body_azimuth_deg, elevation_deg, tilt_deg, azimuth_deg) \
-        - _field_db(body_azimuth_deg, elevation_deg, 0.0, 0.0)
-
-
-def _field_db(body_azimuth_deg, elevation_deg, tilt_deg, azimuth_deg):
-    psi, up = np.radians(body_azimuth_deg), np.radians(elevation_deg)
-    tilt, lean = np.radians(tilt_deg), np.radians(azimuth_deg)
-    # Right, forward, up.
-    cosine = np.sin(tilt) * np.cos(up) * np.cos(psi - lean) + np.cos(tilt) * np.sin(up)
-    # Along the wave's electric field, which lies in the vertical plane through the link.
-    along = -np.sin(tilt) * np.sin(up) * np.cos(psi - lean) + np.cos(tilt) * np.cos(up)
-    sine2 = np.maximum(1 - cosine**2, 1e-6)
-    field = np.cos(np.pi / 2 * cosine) / sine2 * along
-    return np.maximum(20 * np.log10(np.maximum(np.abs(field), 1e-6)), DEEPEST_DB)
+    cosine = (ray * axis).sum(axis=-1)
+    # The wave's electric field lies in the vertical plane through the ray.
+    flat = np.sqrt(np.maximum(1 - ray[..., 2] ** 2, 1e-9))
+    along = (axis[..., 2] - ray[..., 2] * cosine) / flat
+    field = np.cos(np.pi / 2 * cosine) / np.maximum(1 - cosine**2, 1e-6) * along
+    return DIRECTIVITY * np.maximum(field**2, LEAST_GAIN)
 
 
 class TiltedDipole(Effect):
-    """A receiver's dipole leans; the same for each receiver that it helps."""
+    """A receiver's dipole; for each receiver that it helps."""
 
     name = "antenna_pattern"
     of_receiver = True
@@ -63,26 +64,25 @@ class TiltedDipole(Effect):
             rows = np.flatnonzero((records.receiver == receiver) & records.los & np.isfinite(records.heading_deg))
             if len(rows) < LEAST_LINKS:
                 continue
-            psi, up = records.body_azimuth_deg[rows], -records.elevation_deg[rows]
-            residual_db, weight = view.residual_db[rows], view.weight[rows]
+            mine = records.select(rows)
+            ray, residual_db, weight = -_unit(mine.offset_m), view.residual_db[rows], view.weight[rows]
 
             def squares(tilt, azimuth):
-                rest = residual_db - dipole_gain_db(psi, up, tilt, azimuth)
+                rest = residual_db - 10 * np.log10(dipole_gain(ray, _axis(mine, tilt, azimuth)))
                 return weight @ (rest - weight @ rest / weight.sum()) ** 2
 
-            before = squares(0.0, 0.0)
+            before = weight @ (residual_db - weight @ residual_db / weight.sum()) ** 2
             after, tilt, azimuth = min((squares(tilt, azimuth), tilt, azimuth) for tilt in TILTS_DEG
                                        for azimuth in AZIMUTHS_DEG)
             if 0.5 * (before - after) > LEAST_NATS:
-                found[str(receiver)] = [float(tilt), float(azimuth)]
+                found[str(receiver)] = [float(tilt), float(azimuth), SCATTERED_DB]
         return [{"receivers": found}] if found else []
 
     def term(self, records, setting, at) -> Term:
         offset_db = np.zeros(len(records))
-        for receiver, (tilt, azimuth) in setting["receivers"].items():
-            mine = (records.receiver == int(receiver)) & np.isfinite(records.heading_deg)
-            offset_db[mine] = dipole_gain_db(records.body_azimuth_deg[mine], -records.elevation_deg[mine], tilt,
-                                             azimuth)
+        for receiver, numbers in setting["receivers"].items():
+            mine = np.flatnonzero((records.receiver == int(receiver)) & np.isfinite(records.heading_deg))
+            offset_db[mine] = _offset_db(records.select(mine), *numbers)
         return Term.of_offset(offset_db)
 
     def vary(self, setting) -> Variation:
@@ -90,17 +90,43 @@ class TiltedDipole(Effect):
         values = np.concatenate([setting["receivers"][receiver] for receiver in receivers])
 
         def again(numbers: np.ndarray) -> dict:
-            return {"receivers": {receiver: [float(v) for v in pair]
-                                  for receiver, pair in zip(receivers, np.reshape(numbers, (-1, 2)))}}
+            return {"receivers": {receiver: [float(v) for v in part] for receiver, part in
+                                  zip(receivers, np.reshape(numbers, (-1, len(FIELDS))))}}
         times = len(receivers)
-        return Variation(values, np.tile([4.0, 10.0], times), np.tile([0.0, -720.0], times),
-                         np.tile([85.0, 1080.0], times), again, list(np.arange(2 * times).reshape(times, 2)))
+        return Variation(values, np.tile([4.0, 10.0, 6.0], times), np.tile([0.0, -720.0, -80.0], times),
+                         np.tile([85.0, 1080.0, 0.0], times), again,
+                         list(np.arange(len(FIELDS) * times).reshape(times, -1)))
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
         result = {}
-        spreads = np.reshape(found.setting_deviations, (-1, 2))
-        for (receiver, (tilt, azimuth)), spread in zip(setting["receivers"].items(), spreads):
-            name = records.receiver_names[int(receiver)]
-            result[f"tilt_deg[{name}]"] = Parameter.normal(tilt, spread[0], "deg")
-            result[f"lean_azimuth_deg[{name}]"] = Parameter.normal(azimuth % 360, spread[1], "deg")
+        spreads = np.reshape(found.setting_deviations, (-1, len(FIELDS)))
+        known = len(FIELDS) - (records.city is None)  # nothing tells the last one then
+        for (receiver, numbers), spread in zip(setting["receivers"].items(), spreads):
+            for field, unit, value, deviation in list(zip(FIELDS, UNITS, numbers, spread))[:known]:
+                value = value % 360 if field == "lean_azimuth_deg" else value
+                result[f"{field}[{records.receiver_names[int(receiver)]}]"] = Parameter.normal(value, deviation, unit)
         return result
+
+
+def _offset_db(records: Records, tilt_deg: float, azimuth_deg: float, scattered_db: float) -> np.ndarray:
+    """(n,) what the dipole adds to each link [dB]."""
+    axis = _axis(records, tilt_deg, azimuth_deg)
+    if records.city is None:
+        return 10 * np.log10(dipole_gain(-_unit(records.offset_m), axis))
+    ray = rays_of(records, "arrivals").astype(float)
+    power = np.linalg.norm(ray, axis=2)
+    gain = dipole_gain(ray / np.maximum(power, 1e-30)[..., None], axis[:, None])
+    free = (LIGHT_M_S / records.frequency_hz / (4 * np.pi * records.distance_m)) ** 2
+    scattered = free * 10 ** (scattered_db / 10)
+    return 10 * np.log10(((power * gain).sum(axis=1) + scattered * MEAN_GAIN) / (power.sum(axis=1) + scattered))
+
+
+def _axis(records: Records, tilt_deg: float, azimuth_deg: float) -> np.ndarray:
+    """(n, 3) direction of the dipole in the world; it leans towards an azimuth clockwise from the nose."""
+    tilt, lean = np.radians(tilt_deg), np.radians(azimuth_deg)
+    in_body = np.array([np.sin(tilt) * np.sin(lean), np.sin(tilt) * np.cos(lean), np.cos(tilt)])
+    return np.einsum("i,nij->nj", in_body, records.receiver_axes)
+
+
+def _unit(offset_m: np.ndarray) -> np.ndarray:
+    return offset_m / np.maximum(np.linalg.norm(offset_m, axis=1, keepdims=True), 1e-9)

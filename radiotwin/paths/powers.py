@@ -19,6 +19,7 @@ POLARISATIONS = {"average": AVERAGE, "vertical": VERTICAL}
 # 2, 3, 4 and 5 turns, and each turn more takes about a third more time.
 DEPTH = 4
 CHUNK = 50_000  # paths at once: about 30 MB
+SECTORS = 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +35,9 @@ class PathPowers:
         diffracted: over one edge, on either side of its shadow boundary.
         reflected_diffracted: over one edge and by mirrors, before it or behind it.
         ground: by the ground z = 0 alone.
+        departures, arrivals: (n, SECTORS, 3) power times the unit vector from the device (the receiver) along the path,
+            summed over all paths that leave the device (reach the receiver) within each sector of azimuth; the first
+            begins at east, they go on counter-clockwise.
     """
 
     direct: np.ndarray
@@ -43,6 +47,8 @@ class PathPowers:
     diffracted: np.ndarray
     reflected_diffracted: np.ndarray
     ground: np.ndarray
+    departures: np.ndarray
+    arrivals: np.ndarray
 
     @property
     def total(self) -> np.ndarray:
@@ -50,7 +56,7 @@ class PathPowers:
         return sum(getattr(self, name) for name in COMPONENTS)
 
 
-COMPONENTS = tuple(field.name for field in fields(PathPowers))
+COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-2]
 
 
 def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray, frequency_hz: float,
@@ -79,6 +85,10 @@ def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, dev
     wave_number = 2 * np.pi * frequency_hz / SPEED_OF_LIGHT_M_S
     powers = np.zeros((len(COMPONENTS), len(receiver_m)))
     powers[0] = _direct(city, device_m[device], receiver_m, wave_number)
+    departures, arrivals = np.zeros((2, len(receiver_m), SECTORS, 3))
+    straight_m = receiver_m - device_m[device]
+    _add_rays(departures, np.arange(len(receiver_m)), straight_m, powers[0])
+    _add_rays(arrivals, np.arange(len(receiver_m)), -straight_m, powers[0])
     search = CandidateSearch(city, depth)
     buffer = Buffer.of(chunk)
     permittivity = concrete_permittivity(frequency_hz)
@@ -95,9 +105,21 @@ def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, dev
                 gain = np.empty(len(clear))
                 path_gains(search.surfaces, candidates, wave_number, permittivity, POLARISATIONS[polarisation],
                            buffer, clear, gain)
-                np.add.at(powers, (kind[buffer.candidate[clear]], links[buffer.receiver[clear]]), gain)
+                mine, points_m = links[buffer.receiver[clear]], buffer.points_m[clear]
+                last = buffer.count[clear] - 1
+                every = np.arange(len(clear))
+                np.add.at(powers, (kind[buffer.candidate[clear]], mine), gain)
+                _add_rays(departures, mine, points_m[:, 1] - points_m[:, 0], gain)
+                _add_rays(arrivals, mine, points_m[every, last - 1] - points_m[every, last], gain)
             advance(1)
-    return PathPowers(*powers)
+    return PathPowers(*powers, departures, arrivals)
+
+
+def _add_rays(sums: np.ndarray, link: np.ndarray, ray_m: np.ndarray, power: np.ndarray) -> None:
+    """Add power times direction of rays (p, 3) of some links (p,) to sums (n, SECTORS, 3)."""
+    sector = (np.arctan2(ray_m[:, 1], ray_m[:, 0]) % (2 * np.pi) * (SECTORS / (2 * np.pi))).astype(int) % SECTORS
+    length_m = np.maximum(np.linalg.norm(ray_m, axis=1, keepdims=True), 1e-9)
+    np.add.at(sums, (link, sector), ray_m / length_m * power[:, None])
 
 
 def _direct(city: CityMap, from_m: np.ndarray, to_m: np.ndarray, wave_number: float) -> np.ndarray:

@@ -188,11 +188,13 @@ def test_pictures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_
 
 
 @pytest.mark.parametrize("effect, setting", [
-    (DeviceGainOffset, {"members": [0, 1, 2]}), (ExcessAttenuation, {}), (BodyShadowing, {"members": [0, 1]}),
+    (DeviceGainOffset, {"members": [0, 1, 2]}), (ExcessAttenuation, {"scale_height_m": 100.0}),
+    (BodyShadowing, {"members": [0, 1]}),
     (ReceiverDrift, {"receivers": {"0": ["warm_up_each_flight", 8.0], "1": ["step", 150.0]}}),
     (ReceiverSaturation, {"receivers": {"0": [-85.0, 1.0]}}), (NoiseFloor, {"receivers": {"1": -95.0}}),
-    (SectorAntenna, {"devices": {"1": [30.0, 65.0, 15.0, 0.0, 360.0, 0.2]}}),
-    (TiltedDipole, {"receivers": {"0": [20.0, 90.0]}}), (DevicePositionError, {"device": 1, "move_m": [30.0, -20.0]}),
+    (SectorAntenna, {"devices": {"1": [30.0, 65.0, 15.0, 0.0, 360.0, -35.0]}}),
+    (TiltedDipole, {"receivers": {"0": [20.0, 90.0, -35.0]}}),
+    (DevicePositionError, {"device": 1, "move_m": [30.0, -20.0]}),
     (ReceiverPositionError, {"receiver": 0, "move_m": [0.0, 0.0, 30.0]}),
     (MissingObstacle, {"box": [250.0, 120.0, 30.0, 20.0, 60.0, 20.0], "scattered_db": 0.0}),
     (MissingObstacle, {"box": [-900.0, 0.0, 30.0, 20.0, 60.0, 20.0], "scattered_db": 0.0}),  # in no link's way

@@ -1,11 +1,15 @@
 """What is left out of a file, and that it is told."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import trimesh
 
 from radiotwin.closeloop.folds import evidence_blocks, make_folds
 from radiotwin.closeloop.records import make_records
 from radiotwin.errors import BadInput
+from radiotwin.scene.citymap import CityMap
 
 
 def test_what_cannot_be_used_is_left_out_and_told(open_ground):
@@ -79,3 +83,18 @@ def test_too_little_is_refused(open_ground):
     measurements = open_ground.measured(open_ground.fly(5))
     with pytest.raises(BadInput, match="at least 60 are needed"):
         make_records(measurements.select(np.arange(len(measurements.table)) < 40), None)
+
+
+def test_what_stands_in_the_way_is_measured_along_the_link(open_ground):
+    """A wall 10 m thick and 30 m high, in the middle of links of 100 m that pass 20 m below its top and 10 m above."""
+    city = trimesh.creation.box(extents=[10, 400, 30])
+    city.apply_translation([0, 0, 15])
+    records = make_records(open_ground.measured(open_ground.fly(0)), None).select(np.arange(2))
+    records = replace(records, device_m=np.array([[-50.0, 0, 10], [-50, 0, 40]]), device=np.array([0, 1]),
+                      receiver_m=np.array([[50.0, 0, 10], [50, 0, 40]]), frequency_hz=2.4e9,
+                      city=CityMap(city.vertices, city.faces))
+    np.testing.assert_allclose(records.metres_inside, [10, 0], atol=0.01)
+    wavelength_m = 299_792_458 / 2.4e9
+    assert records.diffraction_parameter[0] == pytest.approx(20 * np.sqrt(2 / wavelength_m * 2 / 50), rel=0.01)
+    # Beside the wall the ground is 40 m below, near an end, where the zones are narrow: the roof is what counts.
+    assert records.diffraction_parameter[1] == pytest.approx(-10 * np.sqrt(2 / wavelength_m * 2 / 50), rel=0.01)

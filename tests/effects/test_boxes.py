@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from radiotwin.effects.boxes import CELL_M, HEIGHTS_M, Box, back_project, cross, knife_edge_db
+from radiotwin.effects.boxes import CELL_M, HEIGHTS_M, Box, back_project, cross, knife_edge_db, two_edges_db
 
 
 def inside(box, points_m):
@@ -36,10 +36,11 @@ def test_a_link_through_the_middle_sees_the_box_as_drawn():
     box = Box(0.0, 0.0, 20.0, 10.0, 30.0, 0.0)
     a_m, b_m = np.array([[-50.0, 1.0, 2.0], [-50.0, 40.0, 2.0]]), np.array([[50.0, 1.0, 42.0], [50.0, 40.0, 42.0]])
     crossing = cross(box, a_m, b_m)
-    # Along x at y = 1: half the track, 22 m high there, 4 m to the wall on the left and 6 m on the right.
-    assert crossing.over_m[0] == pytest.approx(8.0) and crossing.first_m[0] == pytest.approx(50.0)
+    # Along x at y = 1: 18 m high where it enters, 26 m where it leaves, 4 m to the wall on the left, 6 m on the right.
+    assert (crossing.enter_over_m[0], crossing.leave_over_m[0]) == pytest.approx((12.0, 4.0))
+    assert [value[0] for value in crossing[5:]] == pytest.approx([40.0, 20.0, 40.0])
     assert (crossing.left_m[0], crossing.right_m[0]) == pytest.approx((4.0, 6.0))
-    assert np.isnan(crossing.over_m[1]) and crossing.inside_m[1] == 0
+    assert np.isnan(crossing.left_m[1]) and crossing.inside_m[1] == 0
 
 
 def test_level_and_upright_links_are_no_exception():
@@ -55,6 +56,16 @@ def test_a_knife_edge_loses_what_the_fresnel_integral_says(nu, loss_db):
     wavelength_m, near_m, far_m = 0.125, 100.0, 200.0
     height_m = nu / np.sqrt(2 * (near_m + far_m) / (wavelength_m * near_m * far_m))
     assert knife_edge_db(np.array([height_m]), near_m, far_m, wavelength_m)[0] == pytest.approx(loss_db, abs=0.3)
+
+
+def test_two_edges_lose_what_one_does_where_the_other_is_out_of_the_way_and_more_where_both_are_not():
+    one_db = knife_edge_db(np.array([8.0]), 100.0, 200.0, 0.125)
+    two_db = [two_edges_db(np.array([8.0]), np.array([second_m]), 100.0, 20.0, 180.0, 0.125)[0]
+              for second_m in (-40.0, 0.0, 7.5, 8.0)]
+    assert two_db[0] == pytest.approx(one_db[0])
+    assert np.all(np.diff(two_db) >= 0) and one_db[0] + 2 < two_db[-1] < 2 * one_db[0]
+    turned_db = two_edges_db(np.array([7.5]), np.array([8.0]), 180.0, 20.0, 100.0, 0.125)
+    assert turned_db[0] == pytest.approx(two_db[2])
 
 
 def test_back_projection_finds_the_cell_and_how_high_it_must_be():

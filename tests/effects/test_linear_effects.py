@@ -42,11 +42,20 @@ def test_one_member_cannot_be_off(links):
 
 
 def test_a_loss_per_kilometre_is_in_proportion_to_distance(records):
-    term = ExcessAttenuation().term(records, {}, None)
+    term = ExcessAttenuation().term(records, {"scale_height_m": 1e7}, None)
     distance_km = np.sqrt(((records.receiver_m - DEVICES_M[records.device]) ** 2).sum(axis=1)) / 1000
-    np.testing.assert_allclose(term.columns @ [12.0], -12 * distance_km)
+    np.testing.assert_allclose(term.columns @ [12.0], -12 * distance_km, rtol=1e-4)
     assert ExcessAttenuation().unphysical({}, np.array([12.0])) is None
     assert "amplify" in ExcessAttenuation().unphysical({}, np.array([-12.0]))
+
+
+def test_haze_that_thins_out_with_height_loses_what_the_integral_along_the_link_says(records):
+    term = ExcessAttenuation().term(records, {"scale_height_m": 30.0}, None)
+    share = (np.arange(2000) + 0.5)[:, None] / 2000
+    start_m, end_m = DEVICES_M[records.device], records.receiver_m
+    density = np.exp(-(start_m[:, 2] + share * (end_m - start_m)[:, 2]) / 30).mean(axis=0)
+    expected_db = -12 * np.linalg.norm(end_m - start_m, axis=1) / 1000 * density
+    np.testing.assert_allclose(term.columns @ [12.0], expected_db, rtol=1e-4)
 
 
 def test_the_body_shadows_one_side(records):

@@ -1,12 +1,16 @@
 """Antennas and receivers against closed forms."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import trimesh
 
 from radiotwin.effects.noise_floor import NoiseFloor, floored
 from radiotwin.effects.receiver_saturation import ReceiverSaturation, _compress
-from radiotwin.effects.sector_antenna import NO_VERTICAL, sector_pattern_db
-from radiotwin.effects.tilted_dipole import dipole_gain_db
+from radiotwin.effects.sector_antenna import NO_VERTICAL, SectorAntenna, sector_pattern_db
+from radiotwin.effects.tilted_dipole import dipole_gain
+from radiotwin.scene.citymap import CityMap
 
 
 def test_the_sector_loses_3_db_at_half_its_beamwidth_and_no_more_than_its_front_to_back_ratio():
@@ -21,29 +25,53 @@ def test_the_sector_looks_up_or_down_by_its_tilt():
     np.testing.assert_allclose(sector_pattern_db(np.zeros(4), elevation_deg, pattern), [0, -3, -3, -30], atol=1e-9)
 
 
-def upright_db(elevation_rad):
-    """A half-wave dipole, as textbooks write it over the angle from its axis."""
-    theta = np.pi / 2 - elevation_rad
-    return 20 * np.log10(np.cos(np.pi / 2 * np.cos(theta)) / np.sin(theta))
+@pytest.mark.parametrize("boresight_deg", [90.0, 30.0])
+def test_a_hidden_receiver_hears_the_antenna_in_the_direction_of_the_reflection(links, boresight_deg):
+    """A screen stands northwards between the ends, a long wall in the east: what arrives left towards the wall."""
+    walls = [trimesh.creation.box(extents=extents) for extents in ([30, 2, 60], [2, 400, 60])]
+    for wall, middle in zip(walls, ([0, 20, 30], [30, 0, 30])):
+        wall.apply_translation(middle)
+    mesh = trimesh.util.concatenate(walls)
+    records = links([[0.0, 0, 10]], [[0.0, 40, 10]], city=CityMap(mesh.vertices, mesh.faces))
+    pattern = [boresight_deg, 30.0, 30.0, *NO_VERTICAL, -80.0]
+    added_db = SectorAntenna().term(records, {"devices": {"0": pattern}}, None).offset_db
+    off_deg = abs(boresight_deg - np.degrees(np.arctan2(29, 20)))  # the wall's face is 29 m away
+    assert not records.los[0]
+    assert added_db[0] == pytest.approx(-min(12 * (off_deg / 30) ** 2, 30), abs=1.5)
 
 
+def towards(azimuth_deg, elevation_deg):
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    return np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], -1)
+
+
+def upright_db(elevation_deg):
+    """A half-wave dipole of directivity 2.15 dBi, as textbooks write it over the angle from its axis."""
+    theta = np.pi / 2 - np.radians(elevation_deg)
+    return 2.15 + 20 * np.log10(np.cos(np.pi / 2 * np.cos(theta)) / np.sin(theta))
+
+
+@pytest.mark.parametrize("lean_deg", [0.0, 25.0])
 @pytest.mark.parametrize("elevation_deg", [0.0, 20.0, 45.0])
-def test_a_dipole_that_leans_towards_the_device_has_the_textbooks_pattern_of_the_smaller_angle(elevation_deg):
+def test_a_dipole_that_leans_towards_the_device_has_the_textbooks_pattern_of_the_smaller_angle(elevation_deg, lean_deg):
     """Leaning in the plane of the link turns the pattern and leaves the polarisation in that plane."""
-    gain_db = dipole_gain_db(np.array([90.0]), np.array([elevation_deg]), 25.0, 90.0)[0]
-    expected_db = upright_db(np.radians(elevation_deg + 25)) - upright_db(np.radians(elevation_deg))
-    assert gain_db == pytest.approx(expected_db, abs=1e-6)
+    gain = dipole_gain(towards(90.0, elevation_deg), towards(90.0, 90.0 - lean_deg))
+    assert 10 * np.log10(gain) == pytest.approx(upright_db(elevation_deg + lean_deg), abs=0.01)
 
 
 def test_a_dipole_that_leans_across_loses_the_polarisation_only():
-    gain_db = dipole_gain_db(np.array([0.0, 180.0]), np.zeros(2), 30.0, 90.0)
-    np.testing.assert_allclose(gain_db, 20 * np.log10(np.cos(np.radians(30))), atol=1e-6)
+    gain = dipole_gain(towards(np.array([0.0, 180.0]), np.zeros(2)), towards(90.0, 60.0))
+    np.testing.assert_allclose(10 * np.log10(gain), 2.15 + 20 * np.log10(np.cos(np.radians(30))), atol=0.01)
 
 
-def test_an_upright_dipole_changes_nothing():
-    rng = np.random.default_rng(0)
-    gain_db = dipole_gain_db(rng.uniform(0, 360, 50), rng.uniform(-80, 80, 50), 0.0, 77.0)
-    np.testing.assert_allclose(gain_db, 0, atol=1e-9)
+def test_the_body_turns_with_heading_pitch_and_roll(links):
+    """Flying east, nose 10° up; flying north, right wing 20° down."""
+    records = links([[0.0, 0, 1.5]], np.ones((2, 3)), heading_deg=np.array([90.0, 0.0]))
+    records = replace(records, pitch_deg=np.array([10.0, 0.0]), roll_deg=np.array([0.0, 20.0]))
+    right, nose, top = np.moveaxis(records.receiver_axes, 1, 0)
+    np.testing.assert_allclose(right, [towards(180, 0), towards(90, -20)], atol=1e-9)
+    np.testing.assert_allclose(nose, [towards(90, 10), towards(0, 0)], atol=1e-9)
+    np.testing.assert_allclose(top, [towards(270, 80), towards(90, 70)], atol=1e-9)
 
 
 def test_compression_follows_rapp_and_knows_its_slope():

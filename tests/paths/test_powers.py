@@ -39,6 +39,23 @@ def test_one_wall(city_of):
     assert got["reflected_1"] == pytest.approx(friis(np.hypot(20, 20)) * averaged(np.sqrt(0.5)), rel=1e-9)
 
 
+def test_where_rays_leave_and_arrive(city_of):
+    """The same wall: the direct ray leaves northwards, the reflected one north-eastwards; both with their power."""
+    powers = path_powers(city_of((10, -200, 12, 200, 50)), np.array([[0, 0, 20.0]]), np.array([[0, 20.0, 20]]),
+                         np.array([0]), FREQUENCY_HZ, depth=1)
+    diagonal = np.sqrt(0.5)
+    for rays, north in ((powers.departures[0], 1), (powers.arrivals[0], -1)):
+        level = rays[np.abs(rays[:, 2]) < 1e-3 * np.abs(rays).max(axis=1)]
+        found = sorted(level[np.abs(level).max(axis=1) > 0].tolist(), key=lambda ray: ray[0])
+        expected = diagonal * powers.reflected_1[0] * np.array([1, north, 0])
+        # The ray off the ground leaves in the direct ray's sector, downwards.
+        ground = rays[np.abs(rays[:, 2]).argmax()]
+        assert ground[2] < 0 and np.linalg.norm(ground) <= powers.direct[0] + powers.ground[0]
+        np.testing.assert_allclose(found[-1], expected, rtol=1e-4, atol=1e-12)
+        down = powers.ground[0] / np.hypot(20, 40) * np.array([20, 40])
+        np.testing.assert_allclose(ground[1:], [north * (powers.direct[0] + down[0]), -down[1]], rtol=1e-4)
+
+
 def test_only_the_ground():
     plane = CityMap([[-500, -500, 0], [500, -500, 0], [500, 500, 0], [-500, 500, 0]], [[0, 1, 2], [0, 2, 3]])
     for polarisation in ("average", "vertical"):
@@ -107,6 +124,7 @@ def test_ends_may_be_swapped(town, links, polarisation):
     few = np.arange(8)
     back = path_powers(town(0.3), receiver_m[few], device_m[device[few]], few, FREQUENCY_HZ, polarisation, depth=2)
     assert np.allclose(stacked(there)[:, few], stacked(back), rtol=1e-6, atol=1e-16)
+    assert np.allclose(there.departures[few], back.arrivals, rtol=1e-6, atol=1e-16)
 
 
 def test_chunks_change_nothing(town, links):
