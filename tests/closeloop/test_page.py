@@ -243,5 +243,5 @@ def test_means_of_bins_and_their_errors():
 def test_names_in_words():
     assert parameter("tilt_deg[uav1]") == "tilt (uav1)" and parameter("odd_thing_db") == "odd thing"
     assert variable("time_in_flight_s") == ("time in the flight", "s")
-    assert variable("metres_inside_m") == ("metres inside", "m")
+    assert variable("odd_length_m") == ("odd length", "m")
     assert listed(["a", "b", "a", "c"]) == "a, b and c"
