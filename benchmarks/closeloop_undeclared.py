@@ -114,7 +114,7 @@ def table(results: dict) -> str:
         for each in cases:
             for found in each["recovered"]:
                 for name, value in found.items():
-                    if name.split("_")[-1] in UNITS and value is not None:
+                    if name.rsplit("_", 1)[-1] in UNITS and value is not None:
                         errors.setdefault(name, []).append(f"{value:+.1f}")
         told = "; ".join(f"{name.rsplit('_error_', 1)[0]} {', '.join(values)} {UNITS[name.split('_')[-1]]}"
                          for name, values in errors.items())
@@ -188,10 +188,11 @@ def recovered(effect: dict, report: dict) -> dict:
             place = np.array([box["x_m"]["value"], box["y_m"]["value"]])
             apart = [np.linalg.norm(place - tower["centre_m"]) for tower in effect["obstacles"]]
             tower = effect["obstacles"][int(np.argmin(apart))]
-            errors.append((min(apart), box["height_m"]["value"] - tower["height_m"]))
-        centre_m, height_m = min(errors, key=lambda error: error[0])
-        return {"centre_error_m": _near(centre_m), "height_error_m": _near(height_m), "boxes": len(every),
-                "towers": len(effect["obstacles"])}
+            inside = box["height_m"]["low"] <= tower["height_m"] <= box["height_m"]["high"]
+            errors.append((min(apart), box["height_m"]["value"] - tower["height_m"], inside))
+        centre_m, height_m, inside = min(errors, key=lambda error: error[0])
+        return {"centre_error_m": _near(centre_m), "height_error_m": _near(height_m), "height_in_interval": inside,
+                "boxes": len(every), "towers": len(effect["obstacles"])}
     if name == "removed_obstacle":
         corners = np.array(effect["corners_m"])
         place = np.array([values["x_m"], values["y_m"]])

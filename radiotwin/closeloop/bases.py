@@ -39,9 +39,11 @@ class FittedBase(ABC):
     def mean_db(self, records: Records) -> np.ndarray:
         """(n,) expected level of links between the receivers and `records.device_m`."""
 
-    def shifted_db(self, records: Records) -> np.ndarray:
-        """(n,) what changes of the level are taken from, where ends are moved or lines of sight made up: `mean_db`, or
-        something quicker."""
+    follows_paths: ClassVar[bool] = False
+
+    def shifted_db(self, records: Records, exact: bool = False) -> np.ndarray:
+        """(n,) what changes of the level are taken from, where ends are moved, lines of sight made up, or the map is
+        another: `mean_db`, or, unless it is to be `exact`, something quicker."""
         return self.mean_db(records)
 
     @abstractmethod
@@ -122,14 +124,16 @@ class FittedPaths(FittedBase):
             exponent of its fall with distance.
     """
 
+    follows_paths = True
+
     def __init__(self, law: FittedBase, rest: tuple[float, float]):
         self.law, self.device_m, self.rest = law, law.device_m, rest
 
     def mean_db(self, records: Records) -> np.ndarray:
         return _with_rest_db(paths_of(records, COMPONENTS), records, *self.rest)
 
-    def shifted_db(self, records: Records) -> np.ndarray:
-        return self.law.mean_db(records)
+    def shifted_db(self, records: Records, exact: bool = False) -> np.ndarray:
+        return self.mean_db(records) if exact else self.law.mean_db(records)
 
     def columns(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
         los = records.los

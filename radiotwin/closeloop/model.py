@@ -16,6 +16,7 @@ DESCENTS = 2  # a simplex that has collapsed too early starts anew
 REFINED_ON = 5000  # links at most
 MOST_FITS = 2  # of proposals of one effect
 WORTH_REFINING_NATS = 5.0
+LEAST_RISE_NATS = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,33 +109,31 @@ class Side:
         for number, part in enumerate(self.parts):
             place = slice(at, at + part.term.columns.shape[1])
             result.append(Found(solution.coefficients[place], spread[place, place],
-                                np.sqrt(design_effect) * self._setting_deviations(number, solution)))
+                                np.sqrt(design_effect) * self._setting_sides(number, solution)))
             at = place.stop
         return result
 
-    def _setting_deviations(self, number: int, solution: Solution) -> np.ndarray:
-        """Standard deviation of each number of a setting: where the likelihood, all coefficients fitted again, has
-        fallen by half a nat if it falls as a parabola."""
+    def _setting_sides(self, number: int, solution: Solution) -> np.ndarray:
+        """(2, q) how far below and above each number of a setting the likelihood, all coefficients fitted again, has
+        fallen by half a nat if it falls as a parabola on that side."""
         part = self.parts[number]
         variation = part.effect.vary(part.setting)
         if variation is None:
-            return np.zeros(0)
-        design_effect = self.view(solution).design_effect
+            return np.zeros((2, 0))
+        sides = np.empty((2, len(variation.values)))
 
-        def cost(side: Side, fitted: Solution) -> float:
-            return fitted.objective + design_effect * part.effect.improbable(side.parts[number].setting)
-        deviations = np.empty(len(variation.values))
+        def objective(numbers: np.ndarray) -> float:
+            parts = list(self.parts)
+            parts[number] = self.part(part.effect, variation.setting(numbers))
+            return self.with_parts(parts).fit(solution).objective
+
+        best = objective(variation.values)
         for i, step in enumerate(variation.steps):
-            rises = []
-            for sign in (-1.0, 1.0):
+            for row, sign in enumerate((-1.0, 1.0)):
                 numbers = variation.values.copy()
                 numbers[i] = np.clip(numbers[i] + sign * step, variation.low[i], variation.high[i])
-                parts = list(self.parts)
-                parts[number] = self.part(part.effect, variation.setting(numbers))
-                varied = self.with_parts(parts)
-                rises.append(cost(varied, varied.fit(solution)) - cost(self, solution))
-            deviations[i] = step / np.sqrt(2 * max(float(np.mean(rises)), 1e-3))
-        return deviations
+                sides[row, i] = step / np.sqrt(2 * max(objective(numbers) - best, LEAST_RISE_NATS))
+        return sides
 
 
 def _bend(parts: list[Part], stage: str, records: Records | None, rows: np.ndarray) -> Callable | None:
@@ -181,6 +180,21 @@ def add(side: Side, effect: Effect, solution: Solution) -> tuple[Side, Solution]
     if best is None or solution.objective - best[1].objective < WORTH_REFINING_NATS:
         return best
     return _refine(*best)
+
+
+def exactly(side: Side, fitted: Solution) -> tuple[Side, Solution]:
+    """The same effects, where the base can say exactly what they do, and that is better."""
+    if not side.base.follows_paths:
+        return side, fitted
+    for number, part in enumerate(side.parts):
+        setting = part.effect.exact(part.setting)
+        if setting is None or setting == part.setting:
+            continue
+        other = side.with_parts([*side.parts[:number], side.part(part.effect, setting), *side.parts[number + 1:]])
+        solution = other.fit(fitted)
+        if solution.objective < fitted.objective:
+            side, fitted = other, solution
+    return side, fitted
 
 
 def _refine(side: Side, fitted: Solution) -> tuple[Side, Solution]:

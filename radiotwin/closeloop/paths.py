@@ -37,11 +37,13 @@ class _Followed(NamedTuple):
     """Paths from one place to ends.
 
     Attributes:
+        city: the map; while it is held here, no other has its id.
         ends: (n,) keys of the ends, sorted.
         powers: (n, kinds)
         departures, arrivals: (n, sectors, 3)
     """
 
+    city: CityMap
     ends: np.ndarray
     powers: np.ndarray
     departures: np.ndarray
@@ -69,7 +71,8 @@ def _follow(city: CityMap, place_m: tuple[float, float, float], ends_m: np.ndarr
     """The paths from one place to ends (n, 3), and the row of each; what was followed before is remembered."""
     key = (id(city), place_m, frequency_hz)
     wanted = np.ascontiguousarray(np.round(ends_m * 100).astype(np.int64)).view([("", np.int64)] * 3).ravel()
-    nothing = _Followed(wanted[:0], np.zeros((0, len(COMPONENTS))), *np.zeros((2, 0, SECTORS, 3), dtype=np.float32))
+    no_rays = np.zeros((0, SECTORS, 3), dtype=np.float32)
+    nothing = _Followed(city, wanted[:0], np.zeros((0, len(COMPONENTS))), no_rays, no_rays)
     known = _remembered.pop(key, nothing)
     unknown = ~np.isin(wanted, known.ends)
     new, first = np.unique(wanted[unknown], return_index=True)
@@ -79,8 +82,8 @@ def _follow(city: CityMap, place_m: tuple[float, float, float], ends_m: np.ndarr
         ends = np.concatenate([known.ends, new])
         order = np.argsort(ends)
         powers = np.column_stack([getattr(found, name) for name in COMPONENTS])
-        known = _Followed(*(np.concatenate([old, more.astype(old.dtype)])[order] for old, more in zip(
-            known, (new, powers, found.departures, found.arrivals))))
+        known = _Followed(city, *(np.concatenate([old, more.astype(old.dtype)])[order] for old, more in zip(
+            known[1:], (new, powers, found.departures, found.arrivals))))
     _remembered[key] = known
     while len(_remembered) > FEWEST_KEPT and sum(len(each.ends) for each in _remembered.values()) > KEPT:
         _remembered.popitem(last=False)

@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 
 from radiotwin.closeloop.bases import Base
 from radiotwin.closeloop.folds import Folds, evidence_blocks
-from radiotwin.closeloop.model import Side, add
+from radiotwin.closeloop.model import Side, add, exactly
 from radiotwin.closeloop.records import Records
 from radiotwin.closeloop.regression import Solution, detected_db, nll_at
 from radiotwin.closeloop.shadowing import NAME as SHADOWING
@@ -195,7 +195,8 @@ def search_effects(model: Model, catalogue: list[Effect], seed: int,
                                         reason="" if entry is best else f"{best.name} gains more")
         result.log += [replace(judged, kept=True) for judged, _ in steps[1:]]
         result.rivals += [rivals, *([] for _ in steps[1:])]
-        result.model = steps[-1][1]
+        tell(f"step {step + 1}: {best.name}, exactly")
+        result.model = _exactly(steps[-1][1])
     # A rival that gains beside the effect is another effect; one that does not is another name for it.
     last = max((entry.step for entry in result.log), default=0)
     alive = {entry.name for entry in result.log if entry.kept or (entry.step == last and entry.reason == "")}
@@ -221,6 +222,12 @@ def _several(effect: Effect, judged: Judged, extended: Model, block: np.ndarray,
         if sum(judged.nll_gain for judged, _ in steps) > least_gain:
             return steps
     return None
+
+
+def _exactly(model: Model) -> Model:
+    """The same effects, worked out exactly by each side whose training links are better explained so."""
+    worked_out = [exactly(side, fit) for side, fit in zip(model.sides, model.fits)]
+    return Model(worked_out[0][0], [side for side, _ in worked_out[1:]], [fit for _, fit in worked_out], model.index)
 
 
 def add_shadowing(search: Search, seed: int) -> None:

@@ -82,7 +82,7 @@ class View:
     residual_db: np.ndarray
     scale_db: np.ndarray
     mean_db: np.ndarray
-    at: Callable[[Records], np.ndarray]
+    at: Callable[..., np.ndarray]
 
     @cached_property
     def design_effect(self) -> float:
@@ -163,9 +163,9 @@ class Effect(ABC):
         """Settings worth trying, best first; empty where nothing looks like this effect."""
 
     @abstractmethod
-    def term(self, records: Records, setting: Setting, at: Callable[[Records], np.ndarray]) -> Term:
+    def term(self, records: Records, setting: Setting, at: Callable[..., np.ndarray]) -> Term:
         """What it adds to the mean level of links; `at` asks the base for the mean level of other records, such as with
-        devices elsewhere."""
+        devices elsewhere: `at(records)` quickly, `at(records, True)` exactly."""
 
     def bend(self, level_db: np.ndarray, records: Records, setting: Setting,
              extra: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
@@ -179,6 +179,10 @@ class Effect(ABC):
 
     def vary(self, setting: Setting) -> "Variation | None":
         """How the setting may be refined; None where it is fixed."""
+        return None
+
+    def exact(self, setting: Setting) -> Setting | None:
+        """The same, asking the base for exact levels; None where that makes no difference."""
         return None
 
     def improbable(self, setting: Setting) -> float:
@@ -201,12 +205,18 @@ class Found:
     Attributes:
         coefficients: (q,) of its columns.
         covariance: (q, q) of them.
-        setting_deviations: of the numbers of its `vary`, from the curvature of the likelihood.
+        setting_sides: (2, q) of the numbers of its `vary`: how far below and above them the likelihood has fallen by
+            half a nat, if it falls as a parabola on that side; very far where it does not fall.
     """
 
     coefficients: np.ndarray
     covariance: np.ndarray
-    setting_deviations: np.ndarray
+    setting_sides: np.ndarray
+
+    @property
+    def setting_deviations(self) -> np.ndarray:
+        """(q,) standard deviations of the numbers of its `vary`, from the likelihood's fall to both sides"""
+        return 1 / np.sqrt((1 / self.setting_sides**2).mean(axis=0))
 
     @property
     def deviations(self) -> np.ndarray:

@@ -83,6 +83,12 @@ def cross(box: Box, a_m: np.ndarray, b_m: np.ndarray) -> Crossing:
     return Crossing(np.where(crosses, values[0], 0.0), *(np.where(crosses, value, np.nan) for value in values[1:]))
 
 
+def near_box(box: Box, a_m: np.ndarray, b_m: np.ndarray, within_m: float) -> np.ndarray:
+    """(n,) bool, links whose ground tracks come that near to a box [m]."""
+    larger = box._replace(length_m=box.length_m + 2 * within_m, width_m=box.width_m + 2 * within_m)
+    return np.isfinite(cross(larger, a_m, b_m).left_m)
+
+
 def lacks_nats(residual_db: np.ndarray, scale_db: np.ndarray, losses_db: tuple[float, ...]) -> np.ndarray:
     """(n,) how much likelier a residual is if something may be in the link's way than if nothing is [nats].
 

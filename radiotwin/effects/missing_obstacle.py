@@ -2,12 +2,17 @@
 
 Found by back-projecting the loss along the links' rays; then a box is fitted. Loss behind it: what comes over the two
 edges of the roof and round both sides (knife edges of ITU-R P.526), and what reaches any shadow by reflections (the
-base's own level without line of sight, give or take what is fitted), added as powers.
+base's own level without line of sight, give or take what is fitted), added as powers; or, exactly, the base's level
+over the map with the box in it.
 """
 
-import numpy as np
+from dataclasses import replace
+from functools import lru_cache
 
-from radiotwin.effects.base import Effect, Parameter, Term, Variation, View
+import numpy as np
+import trimesh
+
+from radiotwin.effects.base import QUANTILE_90, Effect, Parameter, Term, Variation, View
 from radiotwin.effects.boxes import (
     CELL_M,
     HEIGHTS_M,
@@ -17,11 +22,14 @@ from radiotwin.effects.boxes import (
     cross,
     knife_edge_db,
     lacks_nats,
+    near_box,
     two_edges_db,
 )
+from radiotwin.scene.citymap import CityMap
 
 LIGHT_M_S = 299_792_458.0
 LEAST_NATS = 6.0
+NEAR_M = 25.0  # links that pass farther from it are not worked out anew
 LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)
 STARTS = 4
 NAMES = ("x_m", "y_m", "length_m", "width_m", "height_m", "turn_deg", "scattered_db")
@@ -54,6 +62,11 @@ class MissingObstacle(Effect):
     def term(self, records, setting, at) -> Term:
         box = Box(*setting["box"])
         offset_db = np.zeros(len(records))
+        if setting.get("exact", False):
+            rows = np.flatnonzero(near_box(box, records.device_m[records.device], records.receiver_m, NEAR_M))
+            mine = records.select(rows)
+            offset_db[rows] = at(replace(mine, city=_with_box(records.city, box)), True) - at(mine, True)
+            return Term.of_offset(offset_db)
         rows = np.flatnonzero(records.los)
         crossing = cross(box, records.device_m[records.device[rows]], records.receiver_m[rows])
         hit = np.isfinite(crossing.left_m)
@@ -76,6 +89,9 @@ class MissingObstacle(Effect):
         offset_db[rows] = np.maximum(10 * np.log10(np.minimum(power, 1.0)), -2 * MOST_BLANK_DB)
         return Term.of_offset(offset_db)
 
+    def exact(self, setting) -> dict:
+        return setting | {"exact": True}
+
     def vary(self, setting) -> Variation:
         x_m, y_m = setting["box"][:2]
         return Variation(np.array([*setting["box"], setting["scattered_db"]]),
@@ -89,5 +105,18 @@ class MissingObstacle(Effect):
         return 0.5 * (setting["box"][4] / TYPICAL_HEIGHT_M) ** 2
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        values = zip(NAMES, (*setting["box"], setting["scattered_db"]), found.setting_deviations)
-        return {name: Parameter.normal(value, spread, UNITS.get(name, "m")) for name, value, spread in values}
+        variation = self.vary(setting)
+        reach = QUANTILE_90 * found.setting_sides
+        low = np.maximum(variation.values - reach[0], variation.low)
+        high = np.minimum(variation.values + reach[1], variation.high)
+        return {name: Parameter(float(value), float(least), float(most), UNITS.get(name, "m"))
+                for name, value, least, most in zip(NAMES, variation.values, low, high)}
+
+
+@lru_cache(maxsize=32)
+def _with_box(city: CityMap, box: Box) -> CityMap:
+    """A map with a box on its ground."""
+    turned = trimesh.transformations.rotation_matrix(np.radians(box.turn_deg), (0, 0, 1))
+    turned[:3, 3] = box.x_m, box.y_m, 0.5 * box.height_m
+    mesh = trimesh.creation.box((box.length_m, box.width_m, box.height_m), turned)
+    return CityMap(np.vstack([city.vertices, mesh.vertices]), np.vstack([city.faces, mesh.faces + len(city.vertices)]))

@@ -51,12 +51,16 @@ class DevicePositionError(Effect):
         offset_db = np.zeros(len(records))
         rows = np.flatnonzero(records.device == setting["device"])
         mine = records.select(rows)
-        offset_db[rows] = at(_with_moved(mine, setting["device"], setting["move_m"])) - at(mine)
+        exact = setting.get("exact", False)
+        offset_db[rows] = at(_with_moved(mine, setting["device"], setting["move_m"]), exact) - at(mine, exact)
         return Term.of_offset(offset_db)
+
+    def exact(self, setting) -> dict:
+        return setting | {"exact": True}
 
     def vary(self, setting) -> Variation:
         return Variation(np.array(setting["move_m"]), np.full(2, 6.0), np.full(2, -FARTHEST_M), np.full(2, FARTHEST_M),
-                         lambda numbers: setting | {"move_m": [float(v) for v in numbers]})
+                         lambda numbers: {"device": setting["device"], "move_m": [float(v) for v in numbers]})
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
         name = records.device_names[setting["device"]]

@@ -1,17 +1,23 @@
 """A mapped building that is not there any more.
 
-No law of its own: links that only this building blocks have the base's level with line of sight.
+No law of its own: links that only this building blocks have the base's level with line of sight; or, exactly, links
+near it have the base's level over the map without it.
 """
+
+from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from radiotwin.effects.base import Effect, Parameter, Term, View
+from radiotwin.effects.boxes import Box, near_box
+from radiotwin.scene.citymap import CityMap
 
 LEAST_NATS = 6.0
 LEAST_LINKS = 8
 WELD_M = 0.05
+NEAR_M = 25.0  # links that pass farther from it are not worked out anew
 
 
 class RemovedObstacle(Effect):
@@ -24,6 +30,7 @@ class RemovedObstacle(Effect):
 
     def __init__(self):
         self._cache = None
+        self._others: dict[int, tuple[CityMap, CityMap]] = {}  # of each building the map, and the map without it
 
     def lacks(self, records) -> str | None:
         return "there is no 3D map" if records.city is None else None
@@ -45,15 +52,33 @@ class RemovedObstacle(Effect):
 
     def term(self, records, setting, at) -> Term:
         offset_db = np.zeros(len(records))
+        if setting.get("exact", False):
+            city, box = self._without(records.city, setting["building"])
+            rows = np.flatnonzero(near_box(box, records.device_m[records.device], records.receiver_m, NEAR_M))
+            mine = records.select(rows)
+            offset_db[rows] = at(replace(mine, city=city), True) - at(mine, True)
+            return Term.of_offset(offset_db)
         rows = np.flatnonzero(self._only_blocker(records) == setting["building"])
         if len(rows):
             mine = records.select(rows)
             offset_db[rows] = at(mine.with_los(np.ones(len(rows), bool))) - at(mine)
         return Term.of_offset(offset_db)
 
+    def exact(self, setting) -> dict:
+        return setting | {"exact": True}
+
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
         return {name: Parameter(value, value, value, "m") for name, value in zip(("x_m", "y_m", "height_m"),
                                                                                 setting["centre_m"])}
+
+    def _without(self, city: CityMap, building: int) -> tuple[CityMap, Box]:
+        """The map without a building, and a box around that."""
+        label = buildings(city)[0]
+        corners_m = city.vertices[city.faces[label == building]].reshape(-1, 3)
+        low_m, high_m = corners_m.min(axis=0), corners_m.max(axis=0)
+        if self._others.get(building, (None,))[0] is not city:
+            self._others[building] = city, CityMap(city.vertices, city.faces[label != building])
+        return self._others[building][1], Box(*(low_m + high_m)[:2] / 2, *(high_m - low_m)[:2], high_m[2], 0.0)
 
     def _only_blocker(self, records) -> np.ndarray:
         """(n,) building that alone stands between the ends of each link; -1 where there is none or more than one."""

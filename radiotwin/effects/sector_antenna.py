@@ -26,7 +26,7 @@ FIELDS = ("azimuth_deg", "beamwidth_deg", "front_to_back_db", "tilt_deg", "verti
           "scattered_db")
 UNITS = ("deg", "deg", "dB", "deg", "deg", "dB under free space")
 STEPS = np.array([8.0, 10.0, 3.0, 4.0, 5.0, 6.0])
-LOW, HIGH = np.array([-720.0, 20.0, 3.0, -60.0, 6.0, -80.0]), np.array([1080.0, 180.0, 45.0, 80.0, 360.0, 0.0])
+LOW, HIGH = np.array([-720.0, 20.0, 8.0, -60.0, 6.0, -80.0]), np.array([1080.0, 150.0, 45.0, 80.0, 360.0, -15.0])
 SCATTERED_DB = -35.0
 AROUND_DEG = np.arange(0.0, 360.0, 5.0)
 

@@ -29,7 +29,7 @@ def test_an_offset_is_added_to_its_own_links(records, view, effect, kind):
 
 def test_offsets_are_told_against_the_median_member_with_the_error_of_the_difference(records):
     spread = np.array([[0.5, 0.1, 0.2], [0.1, 0.4, 0.0], [0.2, 0.0, 0.9]])
-    found = Found(np.array([5.0, -1.0, 2.0]), spread, np.zeros(0))
+    found = Found(np.array([5.0, -1.0, 2.0]), spread, np.zeros((2, 0)))
     offsets = DeviceGainOffset().parameters(records, {"members": [0, 1, 2]}, found)
     assert [offsets[f"offset_db[d{i}]"].value for i in range(3)] == [3.0, -3.0, 0.0]
     half = 1.6449 * np.sqrt(0.5 + 0.9 - 2 * 0.2)

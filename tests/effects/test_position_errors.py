@@ -8,7 +8,7 @@ from radiotwin.effects.position_errors import DevicePositionError, ReceiverPosit
 DEVICES_M = np.array([[0.0, 0, 1.5], [150, 40, 1.5]])
 
 
-def law_db(records):
+def law_db(records, exact=False):
     return -40 - 22 * np.log10(records.distance_m)
 
 
