@@ -99,7 +99,8 @@ class Side:
         """The training links as an effect sees them."""
         problem = self.problem(self.train)
         return View(self.records.select(self.train), residual_db(problem, solution), solution.scale_db[problem.group],
-                    mean_db(problem, solution), self.base.shifted_db)
+                    mean_db(problem, solution), self.base.shifted_db,
+                    tuple((part.effect.name, part.setting) for part in self.parts))
 
     def found(self, solution: Solution) -> list[Found]:
         """Of each part: what was fitted, and how surely, in view of how many links count as one."""
@@ -179,7 +180,8 @@ def add(side: Side, effect: Effect, solution: Solution) -> tuple[Side, Solution]
             best = tried, fitted
     if best is None or solution.objective - best[1].objective < WORTH_REFINING_NATS:
         return best
-    return _refine(*best)
+    refined = _refine(*best)
+    return exactly(*refined) if effect.quickly_exact else refined
 
 
 def exactly(side: Side, fitted: Solution) -> tuple[Side, Solution]:

@@ -26,7 +26,7 @@ CONSISTENT = 0.1
 SUPPORTED = 0.1
 CLEARLY_NATS = np.log(100.0)  # how much likelier the data must be than with another effect, to tell it from that one
 FLIPS = 20_000
-MOST_EFFECTS = 6
+MOST_EFFECTS = 12
 MOST_OF_A_KIND = 4  # in one step
 WORTH_A_LOOK_NATS = 10.0
 

@@ -76,6 +76,7 @@ class View:
         scale_db: (n,) scale of the errors.
         mean_db: (n,) expected level.
         at: expected level [dB] of the base alone for other records, such as devices elsewhere.
+        kept: settings of the effects so far, by name.
     """
 
     records: Records
@@ -83,6 +84,11 @@ class View:
     scale_db: np.ndarray
     mean_db: np.ndarray
     at: Callable[..., np.ndarray]
+    kept: tuple[tuple[str, Setting], ...] = ()
+
+    def done(self, name: str, what: str) -> list:
+        """Values of a field in the settings of the effects of a name that are there already."""
+        return [setting[what] for kept, setting in self.kept if kept == name and what in setting]
 
     @cached_property
     def design_effect(self) -> float:
@@ -141,6 +147,7 @@ class Effect(ABC):
         confused_with: names of effects that may look alike.
         repeatable: whether there may be several, each found in a step of its own.
         of_receiver: whether it belongs to a receiver, so that it is no part of a map.
+        quickly_exact: whether `exact` may be asked of every candidate, not only of what is kept.
         stage: `gain` adds decibels (its `term`); `paths` adds power to that of the base, before any gain; `receiver`
             comes last. The latter two say with `bend` what they do. `detection` leaves levels as they are and says with
             `loses` which links are blank all the same.
@@ -153,6 +160,7 @@ class Effect(ABC):
     repeatable: ClassVar[bool] = False
     stage: ClassVar[str] = "gain"
     of_receiver: ClassVar[bool] = False
+    quickly_exact: ClassVar[bool] = False
 
     def lacks(self, records: Records) -> str | None:
         """Why the data does not allow this effect to be looked for; None where it does."""

@@ -22,6 +22,7 @@ class DevicePositionError(Effect):
 
     name = "device_position_error"
     repeatable = True
+    quickly_exact = True
     confused_with = ("removed_obstacle", "missing_obstacle", "antenna_pattern", "device_gain_offset")
 
     def lacks(self, records) -> str | None:
@@ -36,7 +37,7 @@ class DevicePositionError(Effect):
         records, best = view.records, (LEAST_NATS, None)
         moves = [(radius * np.sin(angle), radius * np.cos(angle)) for radius in RADII_M
                  for angle in np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS]
-        for device in _anchors(records):
+        for device in sorted(set(_anchors(records)) - set(view.done(self.name, "device"))):
             rows = some(np.flatnonzero(records.device == device), ENOUGH_LINKS)
             mine, share = records.select(rows), (records.device == device).sum() / len(rows)
             before_db = view.at(mine)
@@ -87,7 +88,7 @@ class ReceiverPositionError(Effect):
         records, best = view.records, (LEAST_NATS, None)
         axes = [(1, 0, 0), (0, 1, 0), (0.7, 0.7, 0), (0.7, -0.7, 0), (0, 0, 1)]
         moves = [sign * size * np.array(axis) for axis in axes for size in RECEIVER_OFFSETS_M for sign in (-1, 1)]
-        for receiver in measured(records.receiver, LEAST_LINKS):
+        for receiver in sorted(set(measured(records.receiver, LEAST_LINKS)) - set(view.done(self.name, "receiver"))):
             rows = some(np.flatnonzero(records.receiver == receiver), ENOUGH_LINKS)
             mine, share = records.select(rows), (records.receiver == receiver).sum() / len(rows)
             before_db = view.at(mine)

@@ -46,10 +46,11 @@ def sector_pattern_db(azimuth_deg: np.ndarray, elevation_deg: np.ndarray, patter
 
 
 class SectorAntenna(Effect):
-    """A device's sector antenna that nobody declared."""
+    """A device's sector antenna that nobody declared; one step finds one device's."""
 
     name = "antenna_pattern"
     variant = "sector antenna of a device"
+    repeatable = True
     confused_with = ("device_gain_offset", "device_position_error", "missing_obstacle", "foliage")
 
     def lacks(self, records) -> str | None:
@@ -58,14 +59,15 @@ class SectorAntenna(Effect):
         return None
 
     def propose(self, view: View) -> list[dict]:
-        records, found = view.records, {}
-        for device in measured(records.device, LEAST_LINKS):
+        records, best = view.records, (LEAST_NATS, None)
+        known = {int(device) for devices in view.done(self.name, "devices") for device in devices}
+        for device in sorted(set(measured(records.device, LEAST_LINKS)) - known):
             rows = np.flatnonzero(records.device == device)
             azimuth_deg, elevation_deg = _strongest_ray(records.select(rows))
             pattern, nats = _best_pattern(azimuth_deg, elevation_deg, view.residual_db[rows], view.weight[rows])
-            if nats > LEAST_NATS:
-                found[str(device)] = [*pattern, SCATTERED_DB]
-        return [{"devices": found}] if found else []
+            if nats > best[0]:
+                best = nats, {"devices": {str(device): [*pattern, SCATTERED_DB]}}
+        return [best[1]] if best[1] else []
 
     def term(self, records, setting, at) -> Term:
         offset_db = np.zeros(len(records))
