@@ -110,11 +110,13 @@ class View:
     def nats(self, rows: np.ndarray, change_db: np.ndarray) -> np.ndarray:
         """(r,) how much likelier links `rows` become if their mean changes by (r,) [dB].
 
-        With heavy tails before and after: `weight` knows the old outliers only, and a change makes others.
+        With heavy tails before and after: `weight` knows the old outliers only, and a change makes others. A blank is
+        content with any level that is low enough.
         """
-        scale_db = self.scale_db[rows]
+        scale_db, blank = self.scale_db[rows], np.isnan(self.records.level_db[rows])
         before = (self.residual_db[rows] / scale_db) ** 2
-        after = ((self.residual_db[rows] - change_db) / scale_db) ** 2
+        rest_db = self.residual_db[rows] - change_db
+        after = (np.where(blank, np.minimum(rest_db, 0.0), rest_db) / scale_db) ** 2
         return 2.5 * (np.log1p(before / 4.0) - np.log1p(after / 4.0)) / self.design_effect
 
     def score(self, term: Term) -> float:

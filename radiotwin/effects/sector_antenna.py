@@ -6,19 +6,22 @@ map each path has the gain of the direction in which it leaves the device; what 
 power is fitted too, has the mean of the pattern.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from radiotwin.closeloop.paths import rays_of
 from radiotwin.closeloop.records import Records
-from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured, one_hot
+from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured, one_hot, some
 
 LIGHT_M_S = 299_792_458.0
 LEAST_LINKS = 100
 LEAST_NATS = 4.0
 LEVEL_SPREAD_DB = 15.0
 AZIMUTHS_DEG = np.arange(0.0, 360.0, 15.0)
-BEAMWIDTHS_DEG = (50.0, 65.0, 90.0, 120.0)
-ATTENUATIONS_DB = (10.0, 15.0, 20.0, 30.0)
+BEAMWIDTHS_DEG = (65.0, 110.0)
+ATTENUATIONS_DB = (12.0, 25.0)
+ENOUGH_LINKS = 300  # of a device, for a first look
 NO_VERTICAL = (0.0, 360.0)  # tilt and vertical beamwidth of an antenna that is flat in elevation
 VERTICALS = (NO_VERTICAL, (0.0, 15.0), (-6.0, 15.0), (-12.0, 15.0), (0.0, 40.0), (-10.0, 40.0), (15.0, 40.0),
              (40.0, 65.0))
@@ -62,18 +65,19 @@ class SectorAntenna(Effect):
         records, best = view.records, (LEAST_NATS, None)
         known = {int(device) for devices in view.done(self.name, "devices") for device in devices}
         for device in sorted(set(measured(records.device, LEAST_LINKS)) - known):
-            rows = np.flatnonzero(records.device == device)
-            azimuth_deg, elevation_deg = _strongest_ray(records.select(rows))
-            pattern, nats = _best_pattern(azimuth_deg, elevation_deg, view.residual_db[rows], view.weight[rows])
-            if nats > best[0]:
-                best = nats, {"devices": {str(device): [*pattern, SCATTERED_DB]}}
+            every = np.flatnonzero(records.device == device)
+            rows = some(every, ENOUGH_LINKS)
+            pattern, nats = _best_pattern(_Rays.of(records.select(rows)), view, rows)
+            if nats * len(every) / len(rows) > best[0]:
+                best = nats * len(every) / len(rows), {"devices": {str(device): pattern}}
         return [best[1]] if best[1] else []
 
     def term(self, records, setting, at) -> Term:
         offset_db = np.zeros(len(records))
         for device, pattern in setting["devices"].items():
-            mine = records.device == int(device)
-            offset_db[mine] = _offset_db(records.select(mine), np.array(pattern))
+            mine = np.flatnonzero(records.device == int(device))
+            if len(mine):
+                offset_db[mine] = _Rays.of(records.select(mine)).offset_db(np.array(pattern))
         members = [int(device) for device in setting["devices"]]
         names = [f"gain_db[{records.device_names[member]}]" for member in members]
         return Term(offset_db, one_hot(records.device, members), np.full(len(members), LEVEL_SPREAD_DB), names)
@@ -102,55 +106,56 @@ class SectorAntenna(Effect):
         return result
 
 
-def _offset_db(records: Records, pattern: np.ndarray) -> np.ndarray:
-    """(n,) what the pattern (6,), as in `FIELDS`, takes from each link [dB]."""
-    if records.city is None:
-        return sector_pattern_db(records.azimuth_deg, records.elevation_deg, pattern[:5])
-    power, azimuth_deg, elevation_deg = _rays(records)
-    gain = 10 ** (sector_pattern_db(azimuth_deg, elevation_deg, pattern[:5]) / 10)
-    mean = np.mean(10 ** (sector_pattern_db(AROUND_DEG, np.full(len(AROUND_DEG), pattern[3]), pattern[:5]) / 10))
-    free = (LIGHT_M_S / records.frequency_hz / (4 * np.pi * records.distance_m)) ** 2
-    scattered = free * 10 ** (pattern[5] / 10)
-    return 10 * np.log10(((power * gain).sum(axis=1) + scattered * mean) / (power.sum(axis=1) + scattered))
+class _Rays(NamedTuple):
+    """How links leave their device.
+
+    Attributes:
+        power, azimuth_deg, elevation_deg: (n, sectors) what leaves in each sector, and where to.
+        free: (n,) power in free space; 0 where there is no map, and the straight line is all.
+    """
+
+    power: np.ndarray
+    azimuth_deg: np.ndarray
+    elevation_deg: np.ndarray
+    free: np.ndarray
+
+    @classmethod
+    def of(cls, records: Records) -> "_Rays":
+        if records.city is None:
+            return cls(np.ones((len(records), 1)), records.azimuth_deg[:, None], records.elevation_deg[:, None],
+                       np.zeros(len(records)))
+        ray = rays_of(records, "departures")
+        power = np.linalg.norm(ray, axis=2)
+        sine = ray[..., 2] / np.maximum(power, 1e-30)
+        return cls(power, np.degrees(np.arctan2(ray[..., 0], ray[..., 1])),
+                   np.degrees(np.arcsin(np.clip(sine, -1, 1))),
+                   (LIGHT_M_S / records.frequency_hz / (4 * np.pi * records.distance_m)) ** 2)
+
+    def offset_db(self, pattern: np.ndarray) -> np.ndarray:
+        """(n,) what a pattern (6,), as in `FIELDS`, takes from each link [dB]."""
+        gain = 10 ** (sector_pattern_db(self.azimuth_deg, self.elevation_deg, pattern[:5]) / 10)
+        mean = np.mean(10 ** (sector_pattern_db(AROUND_DEG, np.full(len(AROUND_DEG), pattern[3]), pattern[:5]) / 10))
+        scattered = self.free * 10 ** (pattern[5] / 10)
+        return 10 * np.log10(((self.power * gain).sum(axis=1) + scattered * mean)
+                             / (self.power.sum(axis=1) + scattered))
 
 
-def _rays(records: Records) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(n, sectors) power of the paths that leave the device in each sector, and azimuth and elevation [deg] of it."""
-    ray = rays_of(records, "departures")
-    power = np.linalg.norm(ray, axis=2)
-    sine = ray[..., 2] / np.maximum(power, 1e-30)
-    return power, np.degrees(np.arctan2(ray[..., 0], ray[..., 1])), np.degrees(np.arcsin(np.clip(sine, -1, 1)))
+def _best_pattern(rays: _Rays, view: View, rows: np.ndarray) -> tuple[list[float], float]:
+    """The pattern of a grid that explains the links best, and how many nats it gains over a level alone."""
+    residual_db, weight = view.residual_db[rows], view.weight[rows] * np.isfinite(view.records.level_db[rows])
 
+    def nats(offset_db: np.ndarray) -> float:
+        level_db = weight @ (residual_db - offset_db) / max(weight.sum(), 1e-12)
+        return float(view.nats(rows, offset_db + level_db).sum())
 
-def _strongest_ray(records: Records) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) azimuth and elevation [deg] in which most of a link's power leaves the device."""
-    if records.city is None:
-        return records.azimuth_deg, records.elevation_deg
-    power, azimuth_deg, elevation_deg = _rays(records)
-    strongest, every = power.argmax(axis=1), np.arange(len(records))
-    none = power.max(axis=1) == 0
-    return (np.where(none, records.azimuth_deg, azimuth_deg[every, strongest]),
-            np.where(none, records.elevation_deg, elevation_deg[every, strongest]))
-
-
-def _best_pattern(azimuth_deg, elevation_deg, residual_db, weight) -> tuple[list[float], float]:
-    """The pattern of the grid that explains residuals best, with a free level, and by how many nats."""
-    def squares(offset_db):
-        rest = residual_db - offset_db
-        return weight @ (rest - weight @ rest / weight.sum()) ** 2
-
-    before = squares(0.0)
-    best = before, [0.0, 65.0, 3.0, *NO_VERTICAL]
+    before = nats(np.zeros(len(rows)))
+    best = -np.inf, []
     for azimuth in AZIMUTHS_DEG:
         for beamwidth in BEAMWIDTHS_DEG:
             for most_db in ATTENUATIONS_DB:
-                pattern = np.array([azimuth, beamwidth, most_db, *NO_VERTICAL])
-                after = squares(sector_pattern_db(azimuth_deg, elevation_deg, pattern))
-                if after < best[0]:
-                    best = after, list(pattern)
+                pattern = [azimuth, beamwidth, most_db, *NO_VERTICAL, SCATTERED_DB]
+                best = max(best, (nats(rays.offset_db(np.array(pattern))), pattern))
     for vertical in VERTICALS:
-        pattern = np.array([*best[1][:3], *vertical])
-        after = squares(sector_pattern_db(azimuth_deg, elevation_deg, pattern))
-        if after < best[0]:
-            best = after, list(pattern)
-    return [float(v) for v in best[1]], 0.5 * (before - best[0])
+        pattern = [*best[1][:3], *vertical, SCATTERED_DB]
+        best = max(best, (nats(rays.offset_db(np.array(pattern))), pattern))
+    return [float(v) for v in best[1]], best[0] - before

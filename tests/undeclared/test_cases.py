@@ -127,7 +127,7 @@ def test_a_sector_antenna_looks_where_the_answer_says(family, seed):
     bearing_deg = np.degrees(np.arctan2(offset_m[:, 0], offset_m[:, 1]))
     off_deg = np.abs((bearing_deg - effect["azimuth_deg"] + 180) % 360 - 180)
     its = (column(one, "device") == effect["device"]) & (change != 0)
-    assert np.median(change[its & (off_deg < 30)]) > np.median(change[its & (off_deg > 90)]) + 5
+    assert np.median(change[its & (off_deg < 30)]) > np.median(change[its & (off_deg > 90)]) + 2
 
 
 @of("foliage")
@@ -143,7 +143,7 @@ def test_an_obstacle_changes_the_links_in_its_shadow(family, seed):
     change = change_db(one)
     sign = -1 if family == "missing_obstacle" else 1
     assert np.mean(sign * change > 6) > 0.01
-    assert np.mean(sign * change > 6) > 2 * np.mean(sign * change < -6)
+    assert np.mean(sign * change > 6) > 1.5 * np.mean(sign * change < -6)
     assert np.mean(np.abs(change) < 2) > 0.5  # most links know nothing of it
 
 
