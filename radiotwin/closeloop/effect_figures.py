@@ -52,7 +52,7 @@ def _draw(acting: Acting, ground: Ground, path: Path) -> None:
         draw_links(acting.part, acting.without_db, acting.with_db, ground, path)
     elif effect.stage == "paths":
         _draw_histogram(acting, path)
-    elif effect.name.endswith("_gain_offset") or effect.stage == "detection":
+    elif effect.name.endswith("_gain_offset") or effect.stage in ("detection", "limit"):
         _draw_bars(acting, path)
     elif effect.stage == "receiver":
         unit = "dB" if acting.records.is_gain else "dBm"

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.optimize import minimize
@@ -78,14 +79,22 @@ class Side:
         records, parts = self.records, self.parts
         terms = [part.term for part in parts]
         mine = records.select(rows) if any(part.effect.stage != "gain" for part in parts) else None
-        limit_db = -np.inf if records.limit_db is None else records.limit_db
         return Problem(
-            records.level_db[rows], np.full(len(records), limit_db)[rows],
+            records.level_db[rows], self.limit_db[rows],
             self.base_db[rows], self.base_columns[rows], _bend(parts, "paths", mine, rows),
             sum((term.offset_db[rows] for term in terms), np.zeros(len(self.base_db[rows]))),
             np.hstack([np.zeros((len(self.base_db[rows]), 0)), *(term.columns[rows] for term in terms)]),
             np.concatenate([self.base_spread, *(term.spread_db for term in terms)]), self.group[rows],
             _bend(parts, "receiver", mine, rows), self.dof, _lost(parts, mine))
+
+    @cached_property
+    def limit_db(self) -> np.ndarray:
+        """(n,) level below which a link is blank; -inf where none is known"""
+        limit_db = np.full(len(self.records), -np.inf if self.records.limit_db is None else self.records.limit_db)
+        for part in self.parts:
+            if part.effect.stage == "limit":
+                limit_db = np.maximum(limit_db, part.effect.limits_db(self.records, part.setting))
+        return limit_db
 
     def fit(self, start: Solution | None = None) -> Solution:
         """Fit to the training links."""

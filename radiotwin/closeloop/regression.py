@@ -130,17 +130,18 @@ def nll(problem: Problem, solution: Solution) -> np.ndarray:
     return nll_at(problem, problem.mean(solution.coefficients)[0], solution.scale_db[problem.group])
 
 
-def detected_db(mean_db: np.ndarray, scale_db: np.ndarray, limit_db: float | None, dof: float) -> np.ndarray:
+def detected_db(mean_db: np.ndarray, scale_db: np.ndarray, limit_db: np.ndarray, dof: float) -> np.ndarray:
     """(n,) mean level of links of a kind that are detected [dB]: near the limit only the strong ones are.
 
-    The mean of Student's t above a = (limit - mean) / scale is f(a) / F(-a) * (dof + a²) / (dof - 1).
+    The mean of Student's t above a = (limit - mean) / scale is f(a) / F(-a) * (dof + a²) / (dof - 1). Where no limit is
+    known it is -inf.
     """
-    if limit_db is None:
-        return mean_db
-    a = (limit_db - mean_db) / scale_db
+    known = np.isfinite(limit_db)
+    a = np.where(known, np.where(known, limit_db, 0.0) - mean_db, 0.0) / scale_db
     density = np.exp(gammaln(0.5 * (dof + 1)) - gammaln(0.5 * dof) - 0.5 * (dof + 1) * np.log1p(a * a / dof)) \
         / np.sqrt(dof * np.pi)
-    return mean_db + scale_db * density / np.maximum(stdtr(dof, -a), 1e-300) * (dof + a * a) / (dof - 1)
+    above_db = scale_db * density / np.maximum(stdtr(dof, -a), 1e-300) * (dof + a * a) / (dof - 1)
+    return mean_db + np.where(known, above_db, 0.0)
 
 
 def residual_db(problem: Problem, solution: Solution) -> np.ndarray:

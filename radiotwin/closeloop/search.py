@@ -109,7 +109,7 @@ class Model:
         shift, left = self.held_out_shadowing
         return self._once("mean_db", lambda side, fit: np.where(side.usable, detected_db(
             side.mean_db(fit) + shift * fit.scale_db[side.group], fit.scale_db[side.group] * left,
-            side.records.limit_db, side.dof), np.nan))
+            side.limit_db, side.dof), np.nan))
 
     def _once(self, name: str, of: Callable[[Side, Solution], np.ndarray]) -> np.ndarray:
         if name not in self._known:

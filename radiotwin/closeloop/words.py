@@ -19,6 +19,7 @@ PARAMETERS = {
     "time_constant_s": "time constant", "azimuth_deg": "boresight", "front_to_back_db": "front-to-back ratio",
     "tilt_deg": "tilt", "vertical_beamwidth_deg": "vertical beamwidth", "beamwidth_deg": "beamwidth",
     "lean_azimuth_deg": "leans towards, from the heading", "clearest_side_deg": "clearest side, from the heading",
+    "limit": "limit of detection",
     "floor": "noise floor", "saturation_level": "saturation level", "strength_db": "strength, against theory",
     "specific_attenuation_db_km": "specific attenuation", "specific_attenuation_db_m": "specific attenuation",
     "greatest_loss_db": "greatest loss", "true_minus_given_x_m": "true minus given place, east",

@@ -2,6 +2,7 @@
 
 from radiotwin.effects.base import Effect
 from radiotwin.effects.body_shadowing import BodyShadowing
+from radiotwin.effects.detection_limit import DetectionLimit
 from radiotwin.effects.excess_attenuation import ExcessAttenuation
 from radiotwin.effects.foliage import Foliage
 from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
@@ -19,7 +20,7 @@ from radiotwin.effects.sector_antenna import SectorAntenna
 from radiotwin.effects.tilted_dipole import TiltedDipole
 
 CATALOGUE: tuple[type[Effect], ...] = (
-    DeviceGainOffset, ReceiverGainOffset, ReceiverDrift, ReceiverSaturation, NoiseFloor, SectorAntenna, TiltedDipole,
-    BodyShadowing, ExcessAttenuation, DevicePositionError, ReceiverPositionError,
+    DeviceGainOffset, ReceiverGainOffset, ReceiverDrift, ReceiverSaturation, NoiseFloor, DetectionLimit, SectorAntenna,
+    TiltedDipole, BodyShadowing, ExcessAttenuation, DevicePositionError, ReceiverPositionError,
     MissingObstacle, RemovedObstacle, Foliage, WallReflection, Diffraction, GroundReflection, Interference, LockLoss)
 """In no order: candidates compete by what the held-out links say."""

@@ -152,7 +152,7 @@ class Effect(ABC):
         quickly_exact: whether `exact` may be asked of every candidate, not only of what is kept.
         stage: `gain` adds decibels (its `term`); `paths` adds power to that of the base, before any gain; `receiver`
             comes last. The latter two say with `bend` what they do. `detection` leaves levels as they are and says with
-            `loses` which links are blank all the same.
+            `loses` which links are blank all the same; `limit`, with `limits_db`, below which level they are.
     """
 
     name: ClassVar[str]
@@ -185,6 +185,10 @@ class Effect(ABC):
 
     def loses(self, records: Records, setting: Setting) -> np.ndarray:
         """(n,) probability, less than 1, that a link is blank whatever its level; for the stage `detection`."""
+        raise NotImplementedError
+
+    def limits_db(self, records: Records, setting: Setting) -> np.ndarray:
+        """(n,) level below which a link is blank, -inf where the declared one holds; for the stage `limit`."""
         raise NotImplementedError
 
     def vary(self, setting: Setting) -> "Variation | None":

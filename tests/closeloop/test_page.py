@@ -14,6 +14,7 @@ from radiotwin.closeloop.run import Loop, close_loop
 from radiotwin.closeloop.search import Model, Search
 from radiotwin.closeloop.words import listed, parameter, variable
 from radiotwin.effects.body_shadowing import BodyShadowing
+from radiotwin.effects.detection_limit import DetectionLimit
 from radiotwin.effects.excess_attenuation import ExcessAttenuation
 from radiotwin.effects.foliage import Foliage
 from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
@@ -199,6 +200,7 @@ def test_pictures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_
     (MissingObstacle, {"box": [250.0, 120.0, 30.0, 20.0, 60.0, 20.0], "scattered_db": 0.0}),
     (MissingObstacle, {"box": [-900.0, 0.0, 30.0, 20.0, 60.0, 20.0], "scattered_db": 0.0}),  # in no link's way
     (Interference, {"place_m": [150.0, 200.0], "level_db": -80.0, "within_m": [0.0, 0.0, 500.0, 500.0]}),
+    (DetectionLimit, {"receivers": {"0": -95.0}}),
     (LockLoss, {"receivers": {"0": 0.1, "1": 0.02}}),
     (Foliage, {"box": [250.0, 120.0, 30.0, 20.0, 20.0, 20.0], "law": [0.6, 15.0]})])
 def test_an_effect_is_drawn_in_its_own_terms(loop, tmp_path, effect, setting):
