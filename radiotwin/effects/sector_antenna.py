@@ -57,14 +57,12 @@ class SectorAntenna(Effect):
     confused_with = ("device_gain_offset", "device_position_error", "missing_obstacle", "foliage")
 
     def lacks(self, records) -> str | None:
-        if not measured(records.device, LEAST_LINKS):
-            return f"no device has {LEAST_LINKS} links"
-        return None
+        return None if _placed(records) else f"no device of known position has {LEAST_LINKS} links"
 
     def propose(self, view: View) -> list[dict]:
         records, best = view.records, (LEAST_NATS, None)
         known = {int(device) for devices in view.done(self.name, "devices") for device in devices}
-        for device in sorted(set(measured(records.device, LEAST_LINKS)) - known):
+        for device in sorted(set(_placed(records)) - known):
             every = np.flatnonzero(records.device == device)
             rows = some(every, ENOUGH_LINKS)
             pattern, nats = _best_pattern(_Rays.of(records.select(rows)), view, rows)
@@ -104,6 +102,12 @@ class SectorAntenna(Effect):
                 result[f"{field}[{name}]"] = Parameter.normal(value, spread, unit)
             result[f"gain_db[{name}]"] = Parameter.normal(found.coefficients[number], found.deviations[number], "dB")
         return result
+
+
+def _placed(records: Records) -> list[int]:
+    """Devices with enough links whose positions are declared: one that was located from these very measurements, at a
+    wrong place, may look as if it had an antenna."""
+    return [device for device in measured(records.device, LEAST_LINKS) if device in records.anchors]
 
 
 class _Rays(NamedTuple):
