@@ -275,6 +275,8 @@ def _weigh(model: Model, extended: Model, judged: Judged, block: np.ndarray, tri
     def by_fold(rows: np.ndarray) -> np.ndarray:
         return np.bincount(model.index[rows], weights=gain[rows], minlength=len(model.folds)) / design_effect
 
+    if any(part.effect.name == judged.name for part in model.whole.parts):
+        tried = 1  # that there is such a thing here has been shown already
     total, shares = float(gain[usable].sum()), by_fold(usable)
     per_link = max(gain[rows].mean() for rows in (usable, usable & los) if rows.any())
     p_value = min(tried * gain_p(shares), 1.0)
