@@ -227,12 +227,18 @@ def _refine(side: Side, fitted: Solution) -> tuple[Side, Solution]:
     # What has no coefficients of its own moves those of the others little: they stay while it is refined.
     alone = part.effect.stage == "gain" and not len(part.term.spread_db)
 
+    latest = fitted
+
     def objective(numbers: np.ndarray) -> float:
+        nonlocal latest
         inside = np.clip(numbers, variation.low, variation.high)
         setting = variation.setting(inside)
         tried = small.part(part.effect, setting)
-        misfit = nll(replace(rest, gain_db=rest.gain_db + tried.term.offset_db), fitted).sum() if alone \
-            else small.with_parts([*small.parts, tried]).fit(fitted).objective
+        if alone:
+            misfit = nll(replace(rest, gain_db=rest.gain_db + tried.term.offset_db), fitted).sum()
+        else:
+            latest = small.with_parts([*small.parts, tried]).fit(latest)
+            misfit = latest.objective
         outside = np.abs((numbers - inside) / variation.steps).sum()
         return float(misfit + design_effect * part.effect.improbable(setting) + 10.0 * outside)
 
@@ -248,18 +254,19 @@ def _refine_members(side: Side, fitted: Solution, part: Part, variation: Variati
     numbers, mean_db = variation.values.copy(), side.mean_db(fitted)
     rest_db = mean_db - part.term.offset_db
 
-    def offset_db(rows: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    def offset_db(records: Records, numbers: np.ndarray) -> np.ndarray:
         setting = variation.setting(np.clip(numbers, variation.low, variation.high))
-        return part.effect.term(side.records.select(rows), setting, side.base.shifted_db).offset_db
+        return part.effect.term(records, setting, side.base.shifted_db).offset_db
 
     for member in variation.members:
         moved = numbers.copy()
         moved[member] += variation.steps[member]
         rows = np.flatnonzero(side.train)
-        rows = rows[offset_db(rows, moved) != offset_db(rows, numbers)]
-        rows = some(rows, REFINED_ON)
+        trained = side.records.select(rows)
+        rows = some(rows[offset_db(trained, moved) != offset_db(trained, numbers)], REFINED_ON)
         if not len(rows):
             continue
+        mine = side.records.select(rows)
         alone = replace(side.with_parts([]).problem(rows), law_columns=np.ones((len(rows), 1)),
                         spread_db=np.full(1, ANY_LEVEL_DB))
 
@@ -267,7 +274,7 @@ def _refine_members(side: Side, fitted: Solution, part: Part, variation: Variati
             tried, inside = numbers.copy(), np.clip(values, variation.low[member], variation.high[member])
             tried[member] = inside
             outside = np.abs((values - inside) / variation.steps[member]).sum()
-            return solve(replace(alone, law_db=rest_db[rows] + offset_db(rows, tried))).objective + 10.0 * outside
+            return solve(replace(alone, law_db=rest_db[rows] + offset_db(mine, tried))).objective + 10.0 * outside
 
         numbers[member] = _descend(objective, numbers[member], variation.steps[member])
     return _better(side, fitted, part, variation, numbers)

@@ -70,13 +70,14 @@ def _follow(city: CityMap, place_m: tuple[float, float, float], ends_m: np.ndarr
             frequency_hz: float) -> tuple[_Followed, np.ndarray]:
     """The paths from one place to ends (n, 3), and the row of each; what was followed before is remembered."""
     key = (id(city), place_m, frequency_hz)
-    wanted = np.ascontiguousarray(np.round(ends_m * 100).astype(np.int64)).view([("", np.int64)] * 3).ravel()
+    wanted = _keys(ends_m)
     no_rays = np.zeros((0, SECTORS, 3), dtype=np.float32)
     nothing = _Followed(city, wanted[:0], np.zeros((0, len(COMPONENTS))), no_rays, no_rays)
     known = _remembered.pop(key, nothing)
-    unknown = ~np.isin(wanted, known.ends)
-    new, first = np.unique(wanted[unknown], return_index=True)
-    if len(new):
+    place = np.searchsorted(known.ends, wanted)
+    unknown = np.append(known.ends, -1)[place] != wanted
+    if unknown.any():
+        new, first = np.unique(wanted[unknown], return_index=True)
         new_m = ends_m[unknown][first]
         found = path_powers(city, np.array([place_m]), new_m, np.zeros(len(new_m), int), frequency_hz, "vertical")
         ends = np.concatenate([known.ends, new])
@@ -84,7 +85,14 @@ def _follow(city: CityMap, place_m: tuple[float, float, float], ends_m: np.ndarr
         powers = np.column_stack([getattr(found, name) for name in COMPONENTS])
         known = _Followed(city, *(np.concatenate([old, more.astype(old.dtype)])[order] for old, more in zip(
             known[1:], (new, powers, found.departures, found.arrivals))))
+        place = np.searchsorted(known.ends, wanted)
     _remembered[key] = known
     while len(_remembered) > FEWEST_KEPT and sum(len(each.ends) for each in _remembered.values()) > KEPT:
         _remembered.popitem(last=False)
-    return known, np.searchsorted(known.ends, wanted)
+    return known, place
+
+
+def _keys(ends_m: np.ndarray) -> np.ndarray:
+    """(n,) places (n, 3) to the centimetre, as one number each; two alike are 20 km apart at least."""
+    x, y, z = (np.round(ends_m * 100).astype(np.int64) & 0x1FFFFF).T
+    return x << 42 | y << 21 | z

@@ -90,22 +90,23 @@ def solve(problem: Problem, start: Solution | None = None) -> Solution:
     else:
         beta, scale_db = _least_squares(problem), np.full(groups, 5.0)
     precision = 1.0 / np.square(problem.spread_db)
-    objective = _objective(problem, beta, scale_db, precision)
+    mean, columns = problem.mean(beta)
+    objective = _objective(problem, mean, beta, scale_db, precision)
     for _ in range(ITERATIONS):
         before = objective
-        mean, columns = problem.mean(beta)
         slope, curvature, _ = _derivatives(problem, mean, scale_db)
         hessian = (columns.T * curvature) @ columns + np.diag(precision + 1e-9)
         step = np.linalg.solve(hessian, columns.T @ slope - precision * beta)
         size = 1.0
         while size > 1e-3:
-            tried = _objective(problem, beta + size * step, scale_db, precision)
+            there = problem.mean(beta + size * step)
+            tried = _objective(problem, there[0], beta + size * step, scale_db, precision)
             if tried <= objective + 1e-9:
-                beta, objective = beta + size * step, tried
+                beta, objective, (mean, columns) = beta + size * step, tried, there
                 break
             size *= 0.5
-        scale_db = _scales(problem, beta, scale_db)
-        objective = _objective(problem, beta, scale_db, precision)
+        scale_db = _scales(problem, mean, scale_db)
+        objective = _objective(problem, mean, beta, scale_db, precision)
         if abs(before - objective) < TOLERANCE:
             break
     return Solution(beta, scale_db, objective)
@@ -179,8 +180,9 @@ def nll_at(problem: Problem, mean: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return value
 
 
-def _objective(problem: Problem, beta: np.ndarray, scale_db: np.ndarray, precision: np.ndarray) -> float:
-    value = nll_at(problem, problem.mean(beta)[0], scale_db[problem.group]).sum()
+def _objective(problem: Problem, mean: np.ndarray, beta: np.ndarray, scale_db: np.ndarray,
+               precision: np.ndarray) -> float:
+    value = nll_at(problem, mean, scale_db[problem.group]).sum()
     return float(value + 0.5 * np.sum(precision * beta**2))
 
 
@@ -206,9 +208,9 @@ def _derivatives(problem: Problem, mean: np.ndarray, scale_db: np.ndarray):
     return slope, curvature, spread
 
 
-def _scales(problem: Problem, beta: np.ndarray, scale_db: np.ndarray) -> np.ndarray:
+def _scales(problem: Problem, mean: np.ndarray, scale_db: np.ndarray) -> np.ndarray:
     """One step towards the best scales."""
-    _, _, spread = _derivatives(problem, problem.mean(beta)[0], scale_db)
+    _, _, spread = _derivatives(problem, mean, scale_db)
     groups = len(scale_db)
     detected = np.bincount(problem.group[np.isfinite(problem.level_db)], minlength=groups)
     total = np.bincount(problem.group, weights=spread, minlength=groups)

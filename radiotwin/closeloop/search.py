@@ -25,7 +25,7 @@ SIGNIFICANCE = 0.01
 CONSISTENT = 0.1
 SUPPORTED = 0.1
 CLEARLY_NATS = np.log(100.0)  # how much likelier the data must be than with another effect, to tell it from that one
-FLIPS = 20_000
+FLIPS = 4_000
 MOST_EFFECTS = 12
 MOST_OF_A_KIND = 4  # in one step
 WORTH_A_LOOK_NATS = 10.0
@@ -138,6 +138,16 @@ def _best_dof(records: Records, everything: np.ndarray, base) -> float:
     return DOFS[int(np.argmin([side.fit().objective for side in sides]))]
 
 
+@dataclass(frozen=True, eq=False)
+class Look:
+    """A candidate, fitted to all links, and how much likelier they are with it [nats]."""
+
+    effect: Effect
+    whole: Side
+    fit: Solution
+    gain: float
+
+
 @dataclass(eq=False)
 class Search:
     """What was found, and how.
@@ -166,15 +176,28 @@ def search_effects(model: Model, catalogue: list[Effect], seed: int,
         else:
             available.append(effect)
     while len(result.model.whole.parts) < MOST_EFFECTS:
-        step, passed = len(result.model.whole.parts), []
+        step, looks, passed = len(result.model.whole.parts), [], []
         for effect in available:
             tell(f"step {step + 1}: {effect.name}")
             if not effect.repeatable and any(part.effect is effect for part in result.model.whole.parts):
                 continue
-            judged, extended = _judge(result.model, effect, block, len(available), step, seed)
+            look = _look(result.model, effect, step)
+            if isinstance(look, Judged):
+                result.log.append(look)
+            else:
+                looks.append(look)
+        for look in sorted(looks, key=lambda look: -look.gain):
+            better = next((each for each in passed if _beyond(each, look, result.model)), None)
+            if better is None:
+                tell(f"step {step + 1}: {look.effect.name}, held out")
+                judged, extended = _judge(result.model, look, block, len(available), step, seed)
+            else:
+                judged, extended = Judged(look.effect.name, False, (
+                    f"{better[1].name} gains more on held-out links than this on those that it is fitted to "
+                    f"({look.gain:.0f} nats)"), np.nan, np.nan, np.nan, step), None
             result.log.append(judged)
             if extended is not None:
-                passed.append((effect, judged, extended))
+                passed.append((look.effect, judged, extended))
         if not passed:
             break
         passed.sort(key=lambda each: -each[1].nll_gain)
@@ -204,6 +227,14 @@ def search_effects(model: Model, catalogue: list[Effect], seed: int,
     return result
 
 
+def _beyond(passed: tuple[Effect, Judged, Model], look: Look, model: Model) -> bool:
+    """Whether an effect that passed gains so much that another need not be tried on held-out links, where it can hardly
+    gain more than on those that it is fitted to. One of a kind of which there may be several gets its chance."""
+    effect, judged, _ = passed
+    clear = judged.nll_gain - look.gain > CLEARLY_NATS * model.whole.view(model.fits[0]).design_effect
+    return clear and (effect.repeatable or not look.effect.repeatable)
+
+
 def _alike(best: Judged, other: Judged) -> bool:
     return best.gain_by_fold.sum() - other.gain_by_fold.sum() < CLEARLY_NATS
 
@@ -215,7 +246,10 @@ def _several(effect: Effect, judged: Judged, extended: Model, block: np.ndarray,
     it does not."""
     steps = [(judged, extended)]
     while len(extended.whole.parts) < MOST_EFFECTS and len(steps) < MOST_OF_A_KIND:
-        judged, extended = _judge(extended, effect, block, tried, judged.step + 1, seed)
+        look = _look(extended, effect, judged.step + 1)
+        if isinstance(look, Judged):
+            return None
+        judged, extended = _judge(extended, look, block, tried, judged.step + 1, seed)
         if extended is None:
             return None
         steps.append((judged, extended))
@@ -243,25 +277,34 @@ def add_shadowing(search: Search, seed: int) -> None:
     search.log.append(judged)
 
 
-def _judge(model: Model, effect: Effect, block: np.ndarray, tried: int, step: int, seed: int):
-    """Fit a candidate everywhere; returns what is said of it, and the model with it where it passes."""
-    judged = Judged(effect.name, False, "", np.nan, np.nan, np.nan, step)
+def _look(model: Model, effect: Effect, step: int) -> Look | Judged:
+    """Fit a candidate to all links; what is said of it where that is enough to refuse it."""
+    refused = Judged(effect.name, False, "", np.nan, np.nan, np.nan, step)
     whole = add(model.whole, effect, model.fits[0])
     if whole is None:
-        return replace(judged, reason="nothing in the residual looks like it"), None
-    strange = effect.unphysical(whole[0].parts[-1].setting, whole[0].found(whole[1])[-1].coefficients)
+        return replace(refused, reason="nothing in the residual looks like it")
+    last = whole[0].parts[-1]
+    own = whole[1].coefficients[len(whole[1].coefficients) - len(last.term.spread_db):]
+    strange = effect.unphysical(last.setting, own)
     if strange:
-        return replace(judged, reason=strange), None
-    if model.fits[0].objective - whole[1].objective < WORTH_A_LOOK_NATS:
+        return replace(refused, reason=strange)
+    gain = model.fits[0].objective - whole[1].objective
+    if gain < WORTH_A_LOOK_NATS:
         why = f"gains less than {WORTH_A_LOOK_NATS:.0f} nats even on the links that it is fitted to"
-        return replace(judged, reason=why), None
-    sides, fits = [], [whole[1]]
+        return replace(refused, reason=why)
+    return Look(effect, *whole, gain)
+
+
+def _judge(model: Model, look: Look, block: np.ndarray, tried: int, step: int, seed: int):
+    """Fit a candidate to each fold's links; what the others say of it, and the model with it where it passes."""
+    sides, fits = [], [look.fit]
     for side, fit in zip(model.folds, model.fits[1:]):
-        added = add(side, effect, fit) or (side, fit)
+        added = add(side, look.effect, fit) or (side, fit)
         sides.append(added[0])
         fits.append(added[1])
-    extended = Model(whole[0], sides, fits, model.index)
-    judged = _weigh(model, extended, judged, block, tried, seed, nlos_only=effect.nlos_only)
+    extended = Model(look.whole, sides, fits, model.index)
+    judged = Judged(look.effect.name, False, "", np.nan, np.nan, np.nan, step)
+    judged = _weigh(model, extended, judged, block, tried, seed, nlos_only=look.effect.nlos_only)
     return judged, None if judged.reason else extended
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from radiotwin.closeloop.folds import evidence_blocks
 from radiotwin.closeloop.records import Records
 
 QUANTILE_90 = 1.645
+NEPERS = np.log(10) / 10  # of power in a decibel
+LEAST_POWER = 1e-290  # of which a logarithm can be taken
 
 Setting = dict[str, Any]
 """Nonlinear parameters of an effect: what JSON can hold. The linear ones are fitted by the regression."""
@@ -257,6 +260,20 @@ class Variation:
     high: np.ndarray
     setting: Callable[[np.ndarray], Setting]
     members: list[np.ndarray] | None = None
+
+
+class Remembered:
+    """What was worked out of some links, for as long as they are in use."""
+
+    def __init__(self):
+        self._known: WeakKeyDictionary[Records, dict] = WeakKeyDictionary()
+
+    def of(self, records: Records, key, work_out: Callable[[], Any]) -> Any:
+        """What `work_out` gives, asked once for these links and this key."""
+        known = self._known.setdefault(records, {})
+        if key not in known:
+            known[key] = work_out()
+        return known[key]
 
 
 def some(rows: np.ndarray, most: int) -> np.ndarray:

@@ -6,7 +6,7 @@ those of a known reference signal do not (ITU-R SM.1753, 'Methods for measuremen
 
 import numpy as np
 
-from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured
+from radiotwin.effects.base import LEAST_POWER, NEPERS, Effect, Parameter, Term, Variation, View, measured
 
 LEAST_LINKS = 40
 QUANTILES = (0.01, 0.05, 0.1, 0.2, 0.35, 0.5)
@@ -62,5 +62,6 @@ class NoiseFloor(Effect):
 
 def floored(level_db, floor_db):
     """What is read, and the slope of it."""
-    read = np.logaddexp(level_db * np.log(10) / 10, floor_db * np.log(10) / 10) * 10 / np.log(10)
-    return read, 10 ** ((level_db - read) / 10)
+    power = np.maximum(np.exp(level_db * NEPERS), LEAST_POWER)
+    total = power + np.exp(floor_db * NEPERS)
+    return np.log(total) / NEPERS, power / total

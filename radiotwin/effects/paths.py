@@ -8,7 +8,7 @@ explains.
 import numpy as np
 
 from radiotwin.closeloop.paths import paths_of
-from radiotwin.effects.base import Effect, Parameter, Term, Variation, View
+from radiotwin.effects.base import LEAST_POWER, NEPERS, Effect, Parameter, Term, Variation, View
 from radiotwin.effects.missing_obstacle import LIGHT_M_S
 
 STRENGTHS_DB = (0.0, -4.0, -8.0)
@@ -42,9 +42,9 @@ class _Paths(Effect):
         return Term(term.offset_db, term.columns, term.spread_db, [], paths_of(records, self.kinds))
 
     def bend(self, level_db, records, setting, extra):
-        added_db = _decibels(extra) + setting["strength_db"]
-        total_db = np.logaddexp(level_db * np.log(10) / 10, added_db * np.log(10) / 10) * 10 / np.log(10)
-        return total_db, 10 ** ((level_db - total_db) / 10)
+        power = np.maximum(np.exp(level_db * NEPERS), LEAST_POWER)
+        total = power + extra * np.exp(setting["strength_db"] * NEPERS)
+        return np.log(total) / NEPERS, power / total
 
     def vary(self, setting) -> Variation:
         level_db = setting["level_db"]
@@ -70,7 +70,3 @@ class Diffraction(_Paths):
     name = "diffraction"
     kinds = ("diffracted", "reflected_diffracted")
     confused_with = ("wall_reflection",)
-
-
-def _decibels(power: np.ndarray) -> np.ndarray:
-    return 10 * np.log10(np.maximum(power, 1e-30))

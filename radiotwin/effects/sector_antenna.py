@@ -12,7 +12,7 @@ import numpy as np
 
 from radiotwin.closeloop.paths import rays_of
 from radiotwin.closeloop.records import Records
-from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured, one_hot, some
+from radiotwin.effects.base import Effect, Parameter, Remembered, Term, Variation, View, measured, one_hot, some
 
 LIGHT_M_S = 299_792_458.0
 LEAST_LINKS = 100
@@ -56,6 +56,9 @@ class SectorAntenna(Effect):
     repeatable = True
     confused_with = ("device_gain_offset", "device_position_error", "missing_obstacle", "foliage")
 
+    def __init__(self):
+        self._rays = Remembered()
+
     def lacks(self, records) -> str | None:
         return None if _placed(records) else f"no device of known position has {LEAST_LINKS} links"
 
@@ -75,7 +78,8 @@ class SectorAntenna(Effect):
         for device, pattern in setting["devices"].items():
             mine = np.flatnonzero(records.device == int(device))
             if len(mine):
-                offset_db[mine] = _Rays.of(records.select(mine)).offset_db(np.array(pattern))
+                rays = self._rays.of(records, device, lambda: _Rays.of(records.select(mine)))
+                offset_db[mine] = rays.offset_db(np.array(pattern))
         members = [int(device) for device in setting["devices"]]
         names = [f"gain_db[{records.device_names[member]}]" for member in members]
         return Term(offset_db, one_hot(records.device, members), np.full(len(members), LEVEL_SPREAD_DB), names)

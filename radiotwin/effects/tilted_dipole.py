@@ -7,11 +7,13 @@ a 3D map each path has the gain of the direction from which it comes; what is on
 power is fitted too, has the mean of the pattern.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from radiotwin.closeloop.paths import rays_of
 from radiotwin.closeloop.records import Records
-from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured
+from radiotwin.effects.base import Effect, Parameter, Remembered, Term, Variation, View, measured
 
 LIGHT_M_S = 299_792_458.0
 LEAST_LINKS = 100
@@ -50,6 +52,9 @@ class TiltedDipole(Effect):
     variant = "tilted dipole of a receiver"
     confused_with = ("body_shadowing", "receiver_gain_offset")
 
+    def __init__(self):
+        self._arrivals = Remembered()
+
     def lacks(self, records) -> str | None:
         if np.isnan(records.heading_deg).all():
             return "there is no heading_deg, so directions in the receiver's body frame are not known"
@@ -68,7 +73,7 @@ class TiltedDipole(Effect):
             ray, residual_db, weight = -_unit(mine.offset_m), view.residual_db[rows], view.weight[rows]
 
             def squares(tilt, azimuth):
-                rest = residual_db - 10 * np.log10(dipole_gain(ray, _axis(mine, tilt, azimuth)))
+                rest = residual_db - 10 * np.log10(dipole_gain(ray, _axis(mine.receiver_axes, tilt, azimuth)))
                 return weight @ (rest - weight @ rest / weight.sum()) ** 2
 
             before = weight @ (residual_db - weight @ residual_db / weight.sum()) ** 2
@@ -82,7 +87,8 @@ class TiltedDipole(Effect):
         offset_db = np.zeros(len(records))
         for receiver, numbers in setting["receivers"].items():
             mine = np.flatnonzero((records.receiver == int(receiver)) & np.isfinite(records.heading_deg))
-            offset_db[mine] = _offset_db(records.select(mine), *numbers)
+            arrivals = self._arrivals.of(records, receiver, lambda: _Arrivals.of(records.select(mine)))
+            offset_db[mine] = arrivals.offset_db(*numbers)
         return Term.of_offset(offset_db)
 
     def vary(self, setting) -> Variation:
@@ -108,24 +114,45 @@ class TiltedDipole(Effect):
         return result
 
 
-def _offset_db(records: Records, tilt_deg: float, azimuth_deg: float, scattered_db: float) -> np.ndarray:
-    """(n,) what the dipole adds to each link [dB]."""
-    axis = _axis(records, tilt_deg, azimuth_deg)
-    if records.city is None:
-        return 10 * np.log10(dipole_gain(-_unit(records.offset_m), axis))
-    ray = rays_of(records, "arrivals").astype(float)
-    power = np.linalg.norm(ray, axis=2)
-    gain = dipole_gain(ray / np.maximum(power, 1e-30)[..., None], axis[:, None])
-    free = (LIGHT_M_S / records.frequency_hz / (4 * np.pi * records.distance_m)) ** 2
-    scattered = free * 10 ** (scattered_db / 10)
-    return 10 * np.log10(((power * gain).sum(axis=1) + scattered * MEAN_GAIN) / (power.sum(axis=1) + scattered))
+class _Arrivals(NamedTuple):
+    """How links arrive at their receiver.
+
+    Attributes:
+        ray: (n, sectors, 3) unit vectors towards where they come from, in the world.
+        power: (n, sectors)
+        axes: (n, 3, 3) of the receiver, see `Records.receiver_axes`.
+        free: (n,) power in free space; 0 where there is no map, and the straight line is all.
+    """
+
+    ray: np.ndarray
+    power: np.ndarray
+    axes: np.ndarray
+    free: np.ndarray
+
+    @classmethod
+    def of(cls, records: Records) -> "_Arrivals":
+        if records.city is None:
+            return cls(-_unit(records.offset_m)[:, None], np.ones((len(records), 1)), records.receiver_axes,
+                       np.zeros(len(records)))
+        ray = rays_of(records, "arrivals")
+        power = np.linalg.norm(ray, axis=2)
+        return cls(ray / np.maximum(power, 1e-30)[..., None], power, records.receiver_axes,
+                   (LIGHT_M_S / records.frequency_hz / (4 * np.pi * records.distance_m)) ** 2)
+
+    def offset_db(self, tilt_deg: float, azimuth_deg: float, scattered_db: float) -> np.ndarray:
+        """(n,) what the dipole adds to each link [dB]."""
+        gain = dipole_gain(self.ray, _axis(self.axes, tilt_deg, azimuth_deg)[:, None])
+        scattered = self.free * 10 ** (scattered_db / 10)
+        return 10 * np.log10(((self.power * gain).sum(axis=1) + scattered * MEAN_GAIN)
+                             / (self.power.sum(axis=1) + scattered))
 
 
-def _axis(records: Records, tilt_deg: float, azimuth_deg: float) -> np.ndarray:
-    """(n, 3) direction of the dipole in the world; it leans towards an azimuth clockwise from the nose."""
+def _axis(axes: np.ndarray, tilt_deg: float, azimuth_deg: float) -> np.ndarray:
+    """(n, 3) direction of a dipole in the world on receivers with such axes (n, 3, 3); it leans towards an azimuth
+    clockwise from the nose."""
     tilt, lean = np.radians(tilt_deg), np.radians(azimuth_deg)
     in_body = np.array([np.sin(tilt) * np.sin(lean), np.sin(tilt) * np.cos(lean), np.cos(tilt)])
-    return np.einsum("i,nij->nj", in_body, records.receiver_axes)
+    return np.einsum("i,nij->nj", in_body, axes)
 
 
 def _unit(offset_m: np.ndarray) -> np.ndarray:

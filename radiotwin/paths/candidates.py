@@ -1,5 +1,7 @@
 """Sequences of turns that are worth trying from one device."""
 
+from functools import lru_cache
+
 import numpy as np
 
 from radiotwin.paths.edges import extract_edges
@@ -13,6 +15,12 @@ DEVICE_RAYS = 100_000  # half a degree apart
 # What lies behind an edge is seen from many of its points, so fewer rays do. A second mirror behind the edge would
 # double the time for 0.01 dB.
 EDGE_RAYS, EDGE_STEP_M, BEHIND_EDGE = 300, 20.0, 1
+
+
+@lru_cache(maxsize=4)
+def search_of(city: CityMap, depth: int) -> "CandidateSearch":
+    """The search of a city, made once: what lies behind its edges is seen once for all devices."""
+    return CandidateSearch(city, depth)
 
 
 class CandidateSearch:

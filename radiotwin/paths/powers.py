@@ -5,7 +5,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.paths.candidates import CandidateSearch
+from radiotwin.paths.candidates import search_of
 from radiotwin.paths.clearance import clear_paths
 from radiotwin.paths.coefficients import concrete_permittivity
 from radiotwin.paths.fields import AVERAGE, VERTICAL, path_gains
@@ -89,7 +89,7 @@ def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, dev
     straight_m = receiver_m - device_m[device]
     _add_rays(departures, np.arange(len(receiver_m)), straight_m, powers[0])
     _add_rays(arrivals, np.arange(len(receiver_m)), -straight_m, powers[0])
-    search = CandidateSearch(city, depth)
+    search = search_of(city, depth)
     buffer = Buffer.of(chunk)
     permittivity = concrete_permittivity(frequency_hz)
     rows = np.unique(device)
