@@ -28,7 +28,8 @@ def corrected_twin(loop: Loop, scene: Scene) -> Twin:
     records, law = whole.records, whole.base
     split = whole.base_columns.shape[1]
     parts = [{"name": part.effect.name, "variant": part.effect.variant, "setting": part.setting,
-              "coefficients": found.coefficients.tolist()} for part, found in zip(whole.parts, whole.found(fit))]
+              "coefficients": found.coefficients.tolist()}
+             for part, found in zip(whole.parts, whole.found(fit)) if part.effect.explains]
     located = np.isfinite(law.device_m).all(axis=1)
     devices = [TwinDevice(name, *(place_m if sure else (np.nan,) * 3), "anchor" if i in records.anchors else "unknown",
                           bool(sure), 0.0 if i in records.anchors else np.inf, None)

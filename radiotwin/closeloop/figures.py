@@ -21,9 +21,8 @@ from radiotwin.closeloop.effect_figures import draw_effects
 from radiotwin.closeloop.folds import evidence_blocks
 from radiotwin.closeloop.map_figures import Ground, draw_residual_map
 from radiotwin.closeloop.run import Loop, significant
-from radiotwin.closeloop.shadowing import NAME as LAST_RESORT
 from radiotwin.closeloop.structure import variables
-from radiotwin.closeloop.words import plainly
+from radiotwin.closeloop.words import LAST_RESORTS, plainly
 from radiotwin.scene import Scene
 
 BINS = 20
@@ -57,7 +56,7 @@ def draw_waterfall(report: dict, path: Path) -> None:
     _bar(ax, 0, 0.0, before, BEFORE, f"{before:.2f} dB")
     for place, (high, low) in enumerate(zip(levels, levels[1:]), start=1):
         colour = AFTER if low <= high else BEFORE
-        if steps[place - 1] == plainly(LAST_RESORT):
+        if steps[place - 1] in map(plainly, LAST_RESORTS):
             colour = "0.5"
         _bar(ax, place, high, low, colour, f"{low - high:+.2f}".replace("-", "−"), alpha=0.55)
         ax.plot([place - 0.65, place + 0.35], [high, high], color="0.5", linewidth=0.8)

@@ -5,8 +5,7 @@ import html
 from collections import Counter
 from pathlib import Path
 
-from radiotwin.closeloop.shadowing import NAME as LAST_RESORT
-from radiotwin.closeloop.words import listed, parameter, plainly, variable
+from radiotwin.closeloop.words import LAST_RESORTS, listed, parameter, plainly, variable
 from radiotwin.demo_page import STYLE
 from radiotwin.files import atomic_path
 
@@ -57,7 +56,7 @@ def lead(report: dict) -> str:
     before, after = (_number(report["error"][when]["rmse_db"]) for when in ("before", "after"))
     filled = len(explaining) < len(report["effects"])
     explained = [candidate["heldout_rmse_db"] for candidate in report["candidates"]
-                 if candidate["kept"] and candidate["name"] != LAST_RESORT]
+                 if candidate["kept"] and candidate["name"] not in LAST_RESORTS]
     text = VERDICTS[report["verdict"]].format(
         names=listed(names), it="it" if len(explaining) == 1 else "them", before=before,
         after=_number(explained[-1]) if filled and explained else after,
@@ -65,7 +64,7 @@ def lead(report: dict) -> str:
     if report["verdict"] == "effect" and drivers:
         text += f" What is left still depends on {listed(drivers[:MOST_NAMED])}."
     if filled:
-        text += f" Interpolating the rest over the ground, which explains nothing, brings it to {after} dB."
+        text += f" Interpolating the rest, which explains nothing, brings it to {after} dB."
     return text
 
 
@@ -96,11 +95,12 @@ def _cards(report: dict) -> str:
 
 
 def _effects(report: dict, folder: Path) -> str:
-    parts = ["<h2>What was missing</h2>"] if _named(report) else []
+    parts, filled = ["<h2>What was missing</h2>"] if _named(report) else [], False
     for effect in report["effects"]:
         name = plainly(effect["name"])
-        if effect["name"] == LAST_RESORT:
+        if effect["name"] in LAST_RESORTS and not filled:
             parts.append("<h2>What is filled in, not explained</h2>")
+            filled = True
         parts.append(f"<h3>{effect['rank']}. {html.escape(name)} <code>{html.escape(effect['name'])}</code></h3>"
                      f"<p>{html.escape(_evidence(effect))}</p>")
         parts.append(_image(folder / f"effect_{effect['rank']}_{effect['name']}.png", name))
@@ -113,7 +113,7 @@ def _effects(report: dict, folder: Path) -> str:
 
 def _explaining(report: dict) -> list[dict]:
     """The effects that explain something, which an interpolation does not."""
-    return [effect for effect in report["effects"] if effect["name"] != LAST_RESORT]
+    return [effect for effect in report["effects"] if effect["name"] not in LAST_RESORTS]
 
 
 def _named(report: dict) -> list[str]:

@@ -15,6 +15,7 @@ from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.records import Records, make_records
 from radiotwin.closeloop.search import Model, Search, add_shadowing, make_model, rmse_db, search_effects
 from radiotwin.closeloop.structure import Driver, find_drivers
+from radiotwin.closeloop.trends import UnexplainedTrend
 from radiotwin.effects import CATALOGUE
 from radiotwin.effects.base import Parameter
 from radiotwin.errors import BadInput
@@ -63,9 +64,10 @@ class Loop:
     @property
     def verdict(self) -> str:
         """`effect`, `none` or `unexplained`."""
-        if self.after.whole.parts:
+        parts = self.after.whole.parts
+        if any(part.effect.explains for part in parts):
             return "effect"
-        return "unexplained" if self.after.shadowing or significant(self.drivers_before) else "none"
+        return "unexplained" if parts or self.after.shadowing or significant(self.drivers_before) else "none"
 
     def parameters(self) -> list[dict[str, Parameter]]:
         """Of each kept effect."""
@@ -113,10 +115,12 @@ def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed:
     before = models[best]
     tell("looking at the residual")
     drivers_before = _drivers(before, seed)
-    search = search_effects(before, [effect() for effect in CATALOGUE], seed, tell)
+    search = Search(before)
+    search_effects(search, [effect() for effect in CATALOGUE], seed, tell)
     tell("looking at what is left")
     drivers_after = _drivers(search.model, seed) if search.model is not before else drivers_before
     if significant(drivers_after):
+        search_effects(search, [UnexplainedTrend()], seed, tell)
         tell("correlated_shadowing")
         add_shadowing(search, seed)
     tell("other models")

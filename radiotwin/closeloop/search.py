@@ -163,14 +163,12 @@ class Search:
     rivals: list[list[str]] = field(default_factory=list)
 
 
-def search_effects(model: Model, catalogue: list[Effect], seed: int,
-                   tell: Callable[[str], None]) -> Search:
-    """Add the effect that gains most, and again, until none passes."""
-    result = Search(model)
-    block = evidence_blocks(model.whole.records)
+def search_effects(result: Search, catalogue: list[Effect], seed: int, tell: Callable[[str], None]) -> None:
+    """Add to the model the effect that gains most, and again, until none passes."""
+    block = evidence_blocks(result.model.whole.records)
     available = []
     for effect in catalogue:
-        why = effect.lacks(model.whole.records)
+        why = effect.lacks(result.model.whole.records)
         if why:
             result.log.append(Judged(effect.name, False, f"not looked for: {why}", np.nan, np.nan, np.nan, 0))
         else:
@@ -224,7 +222,6 @@ def search_effects(model: Model, catalogue: list[Effect], seed: int,
     last = max((entry.step for entry in result.log), default=0)
     alive = {entry.name for entry in result.log if entry.kept or (entry.step == last and entry.reason == "")}
     result.rivals = [sorted(set(rivals) - alive) for rivals in result.rivals]
-    return result
 
 
 def _beyond(passed: tuple[Effect, Judged, Model], look: Look, model: Model) -> bool:

@@ -25,11 +25,13 @@ PARAMETERS = {
     "greatest_loss_db": "greatest loss", "true_minus_given_x_m": "true minus given place, east",
     "scale_height_m": "falls to 1/e at a height of", "scattered_db": "scattered, against free space",
     "strength": "strength", "roughness_m": "roughness of the ground", "ground_m": "height of the ground",
-    "lost_share": "links lost", "level_at_100_m": "level at 100 m", "length_m": "length", "width_m": "width",
+    "lost_share": "links lost", "rise_and_fall_db": "from the least to the most",
+    "level_at_100_m": "level at 100 m", "length_m": "length", "width_m": "width",
     "height_m": "height", "share": "share of it", "sigma_db": "standard deviation",
     "true_minus_given_y_m": "true minus given place, north", "true_minus_given_z_m": "true minus given height",
 }
 UNITS = {"deg": "°"}
+LAST_RESORTS = ("correlated_shadowing", "unexplained_trend")  # they fill in and explain nothing
 SUFFIXES = {"_db_km": "dB/km", "_db_m": "dB/m", "_deg": "°", "_db": "dB", "_dbm": "dBm", "_m": "m", "_s": "s"}
 
 

@@ -152,6 +152,7 @@ class Effect(ABC):
         confused_with: names of effects that may look alike.
         repeatable: whether there may be several, each found in a step of its own.
         of_receiver: whether it belongs to a receiver, so that it is no part of a map.
+        explains: whether it is a cause, not merely a description of what is left.
         quickly_exact: whether `exact` may be asked of every candidate, not only of what is kept.
         stage: `gain` adds decibels (its `term`); `paths` adds power to that of the base, before any gain; `receiver`
             comes last. The latter two say with `bend` what they do. `detection` leaves levels as they are and says with
@@ -165,6 +166,7 @@ class Effect(ABC):
     repeatable: ClassVar[bool] = False
     stage: ClassVar[str] = "gain"
     of_receiver: ClassVar[bool] = False
+    explains: ClassVar[bool] = True
     quickly_exact: ClassVar[bool] = False
 
     def lacks(self, records: Records) -> str | None:

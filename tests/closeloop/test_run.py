@@ -59,6 +59,17 @@ def test_a_step_in_time_is_found_where_it_is(open_ground):
     assert value(report, "receiver_drift", "step_db[r1]") == pytest.approx(-6.0, abs=1.0)
 
 
+def test_what_no_effect_explains_is_filled_in_over_the_variable_that_it_depends_on(open_ground):
+    world = open_ground.fly(8)
+    world.gain_db += 6.0 * np.exp(-(((world.slot - 30) / 8.0) ** 2))  # nothing of the catalogue comes and goes so
+    report = run(open_ground.measured(world))
+    assert report["verdict"] == "unexplained" and named(report) == ["unexplained_trend"]
+    assert report["effects"][0]["setting"]["variable"] == "time_in_flight_s"
+    assert "time_in_flight_s" in [driver["variable"] for driver in report["remaining"]["drivers"]]
+    assert value(report, "unexplained_trend", "rise_and_fall_db[time_in_flight_s]") == pytest.approx(6.0, abs=1.0)
+    assert report["error"]["after"]["rmse_db"] < 1.1 * 2.0 < report["error"]["before"]["rmse_db"]
+
+
 def test_a_sector_antenna_is_named_and_its_direction_found(open_ground):
     world = open_ground.fly(5)
     mine = world.device == np.abs(world.device_m[:, :2] - 250).max(axis=1).argmin()  # seen from all sides
