@@ -120,7 +120,7 @@ def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed:
     tell("looking at what is left")
     drivers_after = _drivers(search.model, seed) if search.model is not before else drivers_before
     if significant(drivers_after):
-        search_effects(search, [UnexplainedTrend()], seed, tell)
+        search_effects(search, [UnexplainedTrend(driver.variable) for driver in significant(drivers_after)], seed, tell)
         tell("correlated_shadowing")
         add_shadowing(search, seed)
     tell("other models")

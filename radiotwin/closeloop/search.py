@@ -20,6 +20,7 @@ from radiotwin.effects.base import Effect
 DOFS = (3.0, 5.0, 10.0, 30.0)
 LEAST_GAIN_NATS = 25.0
 LEAST_GAIN_PER_LINK = 0.01  # nats; 0.02 is what an RMSE lower by 2 % gains
+MOST_OF_RMSE = 0.98  # or what is left of it
 LEAST_FOLDS = 0.6  # of the folds must gain
 SIGNIFICANCE = 0.01
 CONSISTENT = 0.1
@@ -188,7 +189,9 @@ def search_effects(result: Search, catalogue: list[Effect], seed: int, tell: Cal
             better = next((each for each in passed if _beyond(each, look, result.model)), None)
             if better is None:
                 tell(f"step {step + 1}: {look.effect.name}, held out")
-                judged, extended = _judge(result.model, look, block, len(available), step, seed)
+                # One more of a kind needs no correction: that there is such a thing here has been shown already.
+                more = any(part.effect is look.effect for part in result.model.whole.parts)
+                judged, extended = _judge(result.model, look, block, 1 if more else len(available), step, seed)
             else:
                 judged, extended = Judged(look.effect.name, False, (
                     f"{better[1].name} gains more on held-out links than this on those that it is fitted to "
@@ -206,7 +209,7 @@ def search_effects(result: Search, catalogue: list[Effect], seed: int, tell: Cal
         rival = next((each for each in passed[1:] if each[0].repeatable), None)
         if rival is not None and not passed[0][0].repeatable:
             tell(f"step {step + 1}: more of {rival[1].name}")
-            several = _several(*rival, block, len(available), seed, passed[0][1].nll_gain)
+            several = _several(*rival, block, seed, passed[0][1].nll_gain)
             steps = several or steps
         best = steps[0][0]
         rivals = [judged.name for _, judged, _ in passed if judged.name != best.name and _alike(best, judged)]
@@ -236,7 +239,7 @@ def _alike(best: Judged, other: Judged) -> bool:
     return best.gain_by_fold.sum() - other.gain_by_fold.sum() < CLEARLY_NATS
 
 
-def _several(effect: Effect, judged: Judged, extended: Model, block: np.ndarray, tried: int, seed: int,
+def _several(effect: Effect, judged: Judged, extended: Model, block: np.ndarray, seed: int,
              least_gain: float) -> list[tuple[Judged, Model]] | None:
     """An effect of which a step finds one, again and again, until it gains more than one that finds all of its kind at
     once: groves or towers, each seen from few devices, against an antenna or an offset for each device. None where
@@ -246,7 +249,7 @@ def _several(effect: Effect, judged: Judged, extended: Model, block: np.ndarray,
         look = _look(extended, effect, judged.step + 1)
         if isinstance(look, Judged):
             return None
-        judged, extended = _judge(extended, look, block, tried, judged.step + 1, seed)
+        judged, extended = _judge(extended, look, block, 1, judged.step + 1, seed)
         if extended is None:
             return None
         steps.append((judged, extended))
@@ -266,11 +269,15 @@ def add_shadowing(search: Search, seed: int) -> None:
     model = search.model
     step = len(model.whole.parts)
     fields = [Shadowing.fit(side, fit, seed) for side, fit in zip(model.sides, model.fits)]
-    extended = replace(model, shadowing=fields, _known={})
-    judged = _weigh(model, extended, Judged(SHADOWING, False, "", np.nan, np.nan, np.nan, step),
-                    evidence_blocks(model.whole.records), 1, seed, nlos_only=True)
-    if not judged.reason:
-        judged, search.model = replace(judged, kept=True), extended
+    # Where what it learnt does not return on held-out flights, its mean may be right and its certainty is not.
+    for tried in (fields, [replace(each, certain=False) for each in fields]):
+        extended = Model(model.whole, model.folds, model.fits, model.index, tried)
+        judged = _weigh(model, extended, Judged(SHADOWING, False, "", np.nan, np.nan, np.nan, step),
+                        None, 1, seed, nlos_only=True)
+        if not judged.reason:
+            search.log.append(replace(judged, kept=True))
+            search.model = extended
+            return
     search.log.append(judged)
 
 
@@ -305,9 +312,10 @@ def _judge(model: Model, look: Look, block: np.ndarray, tried: int, step: int, s
     return judged, None if judged.reason else extended
 
 
-def _weigh(model: Model, extended: Model, judged: Judged, block: np.ndarray, tried: int, seed: int,
+def _weigh(model: Model, extended: Model, judged: Judged, block: np.ndarray | None, tried: int, seed: int,
            nlos_only: bool = False) -> Judged:
-    """What held-out links say of an extended model; with the reason where it is to be refused."""
+    """What held-out links say of an extended model; with the reason where it is to be refused. Without pieces of
+    evidence (n,) it may hang on a few places."""
     gain = model.held_out_nll() - extended.held_out_nll()
     usable, los = np.isfinite(gain), model.whole.records.los
     design_effect = model.whole.view(model.fits[0]).design_effect
@@ -315,12 +323,10 @@ def _weigh(model: Model, extended: Model, judged: Judged, block: np.ndarray, tri
     def by_fold(rows: np.ndarray) -> np.ndarray:
         return np.bincount(model.index[rows], weights=gain[rows], minlength=len(model.folds)) / design_effect
 
-    if any(part.effect.name == judged.name for part in model.whole.parts):
-        tried = 1  # that there is such a thing here has been shown already
     total, shares = float(gain[usable].sum()), by_fold(usable)
     per_link = max(gain[rows].mean() for rows in (usable, usable & los) if rows.any())
-    p_value = min(tried * gain_p(shares), 1.0)
-    one_sided = sign_flip_p(np.bincount(block[usable], weights=gain[usable]), seed)
+    p_value, after_db = min(tried * gain_p(shares), 1.0), rmse_db(extended, usable)
+    one_sided = 0.0 if block is None else sign_flip_p(np.bincount(block[usable], weights=gain[usable]), seed)
     unsupported = gain_p(by_fold(usable & los)) if los.any() and not los.all() and not nlos_only else 0.0
     reason = ""
     if total < LEAST_GAIN_NATS:
@@ -331,11 +337,11 @@ def _weigh(model: Model, extended: Model, judged: Judged, block: np.ndarray, tri
         reason = f"its gain hangs on a few places (p = {one_sided:.2g} if signs are flipped)"
     elif (shares > 0).mean() < LEAST_FOLDS:
         reason = f"gains in {(shares > 0).sum()} of {len(shares)} folds only"
-    elif per_link < LEAST_GAIN_PER_LINK:
+    elif per_link < LEAST_GAIN_PER_LINK and after_db > MOST_OF_RMSE * rmse_db(model, usable):
         reason = f"gains {per_link:.3f} nats a link only, {LEAST_GAIN_PER_LINK} are needed"
     elif unsupported > SUPPORTED:
         reason = f"links with line of sight, where the base is surest, do not support it (p = {unsupported:.2g})"
-    return replace(judged, reason=reason, nll_gain=total, rmse_db=rmse_db(extended, usable), p_value=p_value,
+    return replace(judged, reason=reason, nll_gain=total, rmse_db=after_db, p_value=p_value,
                    gain_by_fold=shares)
 
 

@@ -26,11 +26,13 @@ class Shadowing:
         field: of the residual in units of its own standard deviation.
         sigma: that standard deviation, in units of the error scale.
         receivers_move: whether devices stand still and receivers move, or the other way round.
+        certain: whether it lowers the error scale where it was measured.
     """
 
     field: ResidualField
     sigma: float
     receivers_move: bool
+    certain: bool = True
 
     @classmethod
     def fit(cls, side: Side, solution: Solution, seed: int) -> "Shadowing":
@@ -45,12 +47,13 @@ class Shadowing:
     def at(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
         """What it adds (n,) [error scales], and the factor (n,) that is left of the error scale."""
         mean, spread = self.field.predict(*self._points(records))
-        return self.sigma * mean, spread
+        return self.sigma * mean, spread if self.certain else np.ones_like(spread)
 
     def state(self) -> dict:
         """What JSON can hold and `from_state` reads; positions to the decimetre."""
         arrays, settings = self.field.state()
-        return {"sigma": self.sigma, "receivers_move": self.receivers_move, "settings": settings,
+        return {"sigma": self.sigma, "receivers_move": self.receivers_move, "certain": self.certain,
+                "settings": settings,
                 "arrays": {name: array.round(1 if name.startswith("position") else 4).tolist()
                            for name, array in arrays.items()}}
 
@@ -58,7 +61,8 @@ class Shadowing:
     def from_state(cls, state: dict) -> "Shadowing":
         """What `state` gave."""
         arrays = {name: np.array(array, dtype=float) for name, array in state["arrays"].items()}
-        return cls(ResidualField.from_state(arrays, state["settings"]), state["sigma"], state["receivers_move"])
+        return cls(ResidualField.from_state(arrays, state["settings"]), state["sigma"], state["receivers_move"],
+                   state["certain"])
 
     def _points(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
         if self.receivers_move:

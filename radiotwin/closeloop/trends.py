@@ -11,43 +11,43 @@ from radiotwin.effects.base import Effect, Parameter, Remembered, Term, View
 
 KNOTS = 8
 SPREAD_DB = 5.0
-LEAST_NATS = 6.0
+MOST_CURVES = 10
 LEAST_KNOWN = 0.5  # share of the links whose value is known
 CIRCULAR = ("azimuth_deg", "body_azimuth_deg", "heading_deg")
 
 
 class UnexplainedTrend(Effect):
-    """A curve over one variable, one for all receivers or one for each; one step finds one variable."""
+    """A curve over one variable, one for all receivers or one for each."""
 
     name = "unexplained_trend"
-    repeatable = True
     nlos_only = True  # may be: what it stands for is not known
     of_receiver = True
     explains = False
 
-    def __init__(self):
+    def __init__(self, variable: str):
+        self.variable, self.variant = variable, f"over {variable}"
         self._values = Remembered()
 
+    def lacks(self, records) -> str | None:
+        value = self._value(records, lambda records: np.zeros(len(records)))
+        return None if value.dtype.kind == "f" else "labels have no order that a curve could follow"
+
     def propose(self, view: View) -> list[dict]:
-        best = LEAST_NATS, None
-        done = set(view.done(self.name, "variable"))
-        for name, value in self._of(view.records, view.at).items():
-            known = np.isfinite(value)
-            if name in done or value.dtype.kind != "f" or known.mean() < LEAST_KNOWN or np.ptp(value[known]) < 1e-9:
-                continue
-            knots = _knots(name, value[known])
-            receivers = [int(receiver) for receiver in np.unique(view.records.receiver)]
-            for members in ([None], receivers) if 1 < len(receivers) <= 10 else ([None],):
-                setting = {"variable": name, "knots": knots, "receivers": members}
-                term = self.term(view.records, setting, view.at)
-                nats = view.score(term) - term.columns.shape[1]  # (Akaike 1974)
-                if nats > best[0]:
-                    best = nats, setting
-        return [best[1]] if best[1] else []
+        value = self._value(view.records, view.at)
+        known = np.isfinite(value)
+        if known.mean() < LEAST_KNOWN or np.ptp(value[known]) < 1e-9:
+            return []
+        receivers = [int(receiver) for receiver in np.unique(view.records.receiver)]
+        every = [None], *([receivers] if 1 < len(receivers) <= MOST_CURVES else [])
+        knots = _knots(self.variable, value[known])
+
+        def rating(setting: dict) -> float:
+            term = self.term(view.records, setting, view.at)
+            return view.score(term) - term.columns.shape[1]  # (Akaike 1974)
+        return [max(({"knots": knots, "receivers": members} for members in every), key=rating)]
 
     def term(self, records, setting, at) -> Term:
-        hats = _hats(self._of(records, at)[setting["variable"]], np.array(setting["knots"]),
-                     setting["variable"] in CIRCULAR)
+        hats = _hats(self._value(records, at), np.array(setting["knots"]), self.variable in CIRCULAR)
         columns = [hats if member is None else hats * (records.receiver == member)[:, None]
                    for member in setting["receivers"]]
         return Term.of_columns(np.hstack(columns), SPREAD_DB, [""] * len(columns) * hats.shape[1])
@@ -56,12 +56,12 @@ class UnexplainedTrend(Effect):
         curves = np.reshape(found.coefficients, (len(setting["receivers"]), -1))
         result = {}
         for member, curve in zip(setting["receivers"], curves):
-            whose = [setting["variable"], *([] if member is None else [records.receiver_names[member]])]
+            whose = [self.variable, *([] if member is None else [records.receiver_names[member]])]
             result[f"rise_and_fall_db[{', '.join(whose)}]"] = Parameter(float(np.ptp(curve)), np.nan, np.nan, "dB")
         return result
 
-    def _of(self, records, at) -> dict[str, np.ndarray]:
-        return self._values.of(records, "variables", lambda: variables(records, at(records)))
+    def _value(self, records, at) -> np.ndarray:
+        return self._values.of(records, at, lambda: variables(records, at(records)))[self.variable]
 
 
 def _knots(name: str, value: np.ndarray) -> list[float]:

@@ -64,7 +64,7 @@ def test_what_no_effect_explains_is_filled_in_over_the_variable_that_it_depends_
     world.gain_db += 6.0 * np.exp(-(((world.slot - 30) / 8.0) ** 2))  # nothing of the catalogue comes and goes so
     report = run(open_ground.measured(world))
     assert report["verdict"] == "unexplained" and named(report) == ["unexplained_trend"]
-    assert report["effects"][0]["setting"]["variable"] == "time_in_flight_s"
+    assert report["effects"][0]["variant"] == "over time_in_flight_s"
     assert "time_in_flight_s" in [driver["variable"] for driver in report["remaining"]["drivers"]]
     assert value(report, "unexplained_trend", "rise_and_fall_db[time_in_flight_s]") == pytest.approx(6.0, abs=1.0)
     assert report["error"]["after"]["rmse_db"] < 1.1 * 2.0 < report["error"]["before"]["rmse_db"]
