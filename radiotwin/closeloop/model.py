@@ -18,6 +18,7 @@ REFINED_ON = 5000  # links at most
 MOST_FITS = 2  # of proposals of one effect
 WORTH_REFINING_NATS = 5.0
 LEAST_RISE_NATS = 1e-3
+VERY_LOW_DB = -200.0  # where whatever a receiver does to a level shows
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,30 +252,40 @@ def _refine(side: Side, fitted: Solution) -> tuple[Side, Solution]:
 def _refine_members(side: Side, fitted: Solution, part: Part, variation: Variation) -> tuple[Side, Solution]:
     """Vary the numbers of each member by themselves, on links of its own; a level of its own is all that is fitted
     beside them."""
-    numbers, mean_db = variation.values.copy(), side.mean_db(fitted)
-    rest_db = mean_db - part.term.offset_db
+    numbers, at_receiver = variation.values.copy(), part.effect.stage == "receiver"
+    problem = replace(side.problem(slice(None)), receiver=None)
+    arriving_db = problem.mean(fitted.coefficients)[0] - part.term.offset_db
 
-    def offset_db(records: Records, numbers: np.ndarray) -> np.ndarray:
+    def changed(records: Records, numbers: np.ndarray) -> Part:
         setting = variation.setting(np.clip(numbers, variation.low, variation.high))
-        return part.effect.term(records, setting, side.base.shifted_db).offset_db
+        return Part(part.effect, setting, part.effect.term(records, setting, side.base.shifted_db))
+
+    def level_db(records: Records, numbers: np.ndarray) -> np.ndarray:
+        there = changed(records, numbers)
+        if not at_receiver:
+            return there.term.offset_db
+        return part.effect.bend(np.full(len(records), VERY_LOW_DB), records, there.setting, there.term.extra)[0]
 
     for member in variation.members:
         moved = numbers.copy()
         moved[member] += variation.steps[member]
         rows = np.flatnonzero(side.train)
         trained = side.records.select(rows)
-        rows = some(rows[offset_db(trained, moved) != offset_db(trained, numbers)], REFINED_ON)
+        rows = some(rows[level_db(trained, moved) != level_db(trained, numbers)], REFINED_ON)
         if not len(rows):
             continue
-        mine = side.records.select(rows)
+        mine, others = side.records.select(rows), [replace(p, term=p.term.select(rows)) for p in side.parts[:-1]]
         alone = replace(side.with_parts([]).problem(rows), law_columns=np.ones((len(rows), 1)),
                         spread_db=np.full(1, ANY_LEVEL_DB))
 
         def objective(values: np.ndarray) -> float:
             tried, inside = numbers.copy(), np.clip(values, variation.low[member], variation.high[member])
             tried[member] = inside
+            there = changed(mine, tried)
+            receiver = _bend([*others, there], "receiver", mine, slice(None))
             outside = np.abs((values - inside) / variation.steps[member]).sum()
-            return solve(replace(alone, law_db=rest_db[rows] + offset_db(mine, tried))).objective + 10.0 * outside
+            return solve(replace(alone, law_db=arriving_db[rows] + there.term.offset_db, receiver=receiver)
+                         ).objective + 10.0 * outside
 
         numbers[member] = _descend(objective, numbers[member], variation.steps[member])
     return _better(side, fitted, part, variation, numbers)

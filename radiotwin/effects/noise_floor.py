@@ -40,21 +40,17 @@ class NoiseFloor(Effect):
             floor[int(receiver)] = floor_db
         return floored(level_db, floor[records.receiver])
 
-    def vary(self, setting) -> Variation | None:
-        if len(setting["receivers"]) > 8:
-            return None
+    def vary(self, setting) -> Variation:
         receivers = list(setting["receivers"])
 
         def again(numbers: np.ndarray) -> dict:
             return {"receivers": dict(zip(receivers, map(float, numbers)))}
         times = len(receivers)
         return Variation(np.array(list(setting["receivers"].values())), np.full(times, 2.0), np.full(times, -250.0),
-                         np.full(times, 50.0), again)
+                         np.full(times, 50.0), again, list(np.arange(times)[:, None]))
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
         spreads = found.setting_deviations
-        if not len(spreads):  # too many to be varied
-            spreads = np.full(len(setting["receivers"]), np.nan)
         return {f"floor[{records.receiver_names[int(receiver)]}]": Parameter.normal(floor, spread,
                                                                                     "dB" if records.is_gain else "dBm")
                 for (receiver, floor), spread in zip(setting["receivers"].items(), spreads)}

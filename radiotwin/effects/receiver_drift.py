@@ -20,10 +20,11 @@ STEP_PENALTY = 1.0  # times log of the places where it may be
 
 
 class ReceiverDrift(Effect):
-    """For each receiver the one of three forms that explains it best; none where none does."""
+    """The one of three forms that explains a receiver best; one step finds one receiver."""
 
     name = "receiver_drift"
     of_receiver = True
+    repeatable = True
     confused_with = ("receiver_gain_offset", "interference")
 
     def lacks(self, records) -> str | None:
@@ -32,16 +33,17 @@ class ReceiverDrift(Effect):
         return None
 
     def propose(self, view: View) -> list[dict]:
-        records, found = view.records, {}
-        for receiver in measured(records.receiver[np.isfinite(records.time_s)], LEAST_LINKS):
+        records, best = view.records, (LEAST_NATS, None)
+        known = {int(receiver) for receivers in view.done(self.name, "receivers") for receiver in receivers}
+        for receiver in sorted(set(measured(records.receiver[np.isfinite(records.time_s)], LEAST_LINKS)) - known):
             rows = np.flatnonzero((records.receiver == receiver) & np.isfinite(records.time_s))
             candidates = _forms(
                 (records.time_s - records.first_s)[rows], records.time_s[rows], records.time_in_flight_s[rows],
                 records.flight[rows], view.residual_db[rows], view.weight[rows])
             nats, form, number = max(candidates)
-            if nats > LEAST_NATS:
-                found[str(receiver)] = [form, float(number)]
-        return [{"receivers": found}] if found else []
+            if nats > best[0]:
+                best = nats, {"receivers": {str(receiver): [form, float(number)]}}
+        return [best[1]] if best[1] else []
 
     def term(self, records, setting, at) -> Term:
         columns, names = [], []
