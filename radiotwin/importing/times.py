@@ -1,0 +1,90 @@
+"""Clock readings -> seconds since 1970-01-01 UTC."""
+
+from zoneinfo import ZoneInfo, available_timezones
+
+import numpy as np
+import pandas as pd
+
+from radiotwin.errors import BadInput
+from radiotwin.importing.read import Source, as_text
+
+EPOCH_S = {"epoch s": 1.0, "epoch ms": 1e-3}
+ISO = "ISO 8601"
+ALLOWED = f"allowed are {', '.join(EPOCH_S)}, {ISO}, or as of strftime, such as '%d.%m.%Y %H:%M:%S'"
+
+
+def seconds(source: Source, spec: str, form: str | None, zone: str | None) -> np.ndarray:
+    """(n,) seconds since the epoch, UTC; NaN where the cell is empty.
+
+    Args:
+        source: the file.
+        spec: column of the time.
+        form: one of `EPOCH_S`, `ISO`, or a format of strftime.
+        zone: of clock readings that carry no offset from UTC; a name of the IANA data base.
+
+    Raises:
+        BadInput: not declared, cannot be read, or a local time that the zone's clocks skipped or showed twice.
+    """
+    cells = source.cells(spec, "time")
+    if form is None:
+        raise BadInput(f"{source.path}: column {spec}: time_format is not given; {ALLOWED}. The values look like "
+                       f"{str(cells.iloc[0])!r} to {str(cells.iloc[-1])!r}")
+    if form in EPOCH_S:
+        return source.numbers(spec, "time") * EPOCH_S[form]
+    if form != ISO and "%" not in form:
+        raise BadInput(f"time_format {form!r} is unknown; {ALLOWED}")
+    if zone is not None:
+        check_zone(zone)
+    parsed, text = _parse(source, spec, cells, form)
+    if parsed.dt.tz is None:
+        if zone is None:
+            raise BadInput(f"{source.path}: column {spec}: the times, such as {text.iloc[0]!r}, carry no offset from "
+                           "UTC, and time_zone is not given; give UTC or a zone such as Europe/Berlin")
+        parsed = _localize(source, spec, text, parsed, zone)
+    since = (parsed.dt.tz_convert("UTC") - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
+    return since.to_numpy(dtype=float)
+
+
+def day(time_s: np.ndarray, zone: str | None) -> np.ndarray:
+    """(n,) dates such as 2022-04-25, in the zone's calendar [UTC]; "" where the time is unknown."""
+    stamp = pd.Series(pd.to_datetime(time_s, unit="s", utc=True))
+    return stamp.dt.tz_convert(zone or "UTC").dt.strftime("%Y-%m-%d").fillna("").to_numpy(dtype=object)
+
+
+def check_zone(zone: str) -> None:
+    """Raise BadInput unless the IANA data base knows `zone`."""
+    try:
+        ZoneInfo(zone)
+    except (KeyError, ValueError, OSError):  # what zoneinfo raises depends on how the name is wrong
+        city = zone.rpartition("/")[2].lower()
+        near = sorted(name for name in available_timezones() if city and city in name.lower())[:3]
+        raise BadInput(f"time_zone {zone!r} is unknown; allowed are UTC and the names of the IANA data base, such as "
+                       f"{', '.join(near or ['Europe/Berlin', 'America/Denver'])}") from None
+
+
+def _parse(source: Source, spec: str, cells: pd.Series, form: str) -> tuple[pd.Series, pd.Series]:
+    """Stamps, with a zone where the cells carry offsets, and the cells' texts."""
+    text = as_text(cells)
+    if cells.dtype.kind == "M":  # Parquet has times of its own
+        return cells, text
+    offset = "%z" in form or (form == ISO and text.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$", case=False))
+    some = np.broadcast_to(offset, len(text)) & (text != "")
+    if form == ISO and some.any():
+        source.refuse(spec, text, ~some & (text != ""), "carries no offset from UTC, other rows do; give it to all or "
+                      "to none")
+    parsed = pd.to_datetime(text.where(text != ""), format="ISO8601" if form == ISO else form, errors="coerce",
+                            utc=bool(some.any()))
+    source.refuse(spec, text, parsed.isna() & (text != ""), f"is no time in the form {form}; {ALLOWED}")
+    return parsed, text
+
+
+def _localize(source: Source, spec: str, text: pd.Series, parsed: pd.Series, zone: str) -> pd.Series:
+    """Local clock readings as moments; those that are none or two are refused rather than guessed."""
+    known = parsed.notna()
+    moved = parsed.dt.tz_localize(zone, ambiguous="NaT", nonexistent="shift_forward")
+    source.refuse(spec, text, known & moved.isna(),
+                  f"happened twice in {zone}: the clocks went back. Give the times in UTC or with their offset, or "
+                  "leave these rows out")
+    source.refuse(spec, text, known & (moved.dt.tz_localize(None) != parsed),
+                  f"never happened in {zone}: the clocks went forward. Is it another zone, or UTC?")
+    return moved
