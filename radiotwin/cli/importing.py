@@ -1,5 +1,6 @@
 """The command that brings in measurements of others."""
 
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -66,7 +67,8 @@ def import_(
     _print(report)
     say(f"wrote {out}: {report['written']} links, {report['not_detected']} not detected; {report['devices']} devices "
         f"({report['anchors']} anchors), {report['receivers']} receivers, {report['flights']} flights")
-    say(f"again: radiotwin import {file} --columns {out / 'import.toml'} -o {out}")
+    again = ["radiotwin", "import", file, "--columns", out / "import.toml", "-o", out]
+    say(f"again: {shlex.join(map(str, again))}")
 
 
 def _print(report: dict) -> None:
@@ -79,8 +81,8 @@ def _print(report: dict) -> None:
                rows)
     print_rows("Ranges", {"column": "left", "min": "right", "median": "right", "max": "right", "unit": "left",
                           "empty": "right"},
-               [[name, *(float("nan") if r[k] is None else r[k] for k in ("min", "median", "max")), r["unit"],
-                 r["empty"]] for name, r in report["ranges"].items()])
+               [[name, *(_number(r[k], name) for k in ("min", "median", "max")), r["unit"], r["empty"]]
+                for name, r in report["ranges"].items()])
     if report["time"]:
         say(f"from {report['time']['first']} to {report['time']['last']} (UTC)")
     if report["origin"]:
@@ -88,6 +90,13 @@ def _print(report: dict) -> None:
             **report["origin"]))
     for text in report["warnings"]:
         say(f"note: {text}")
+
+
+def _number(value: float | None, name: str) -> str:
+    """Degrees of a position need more decimals than anything else: 1e-5 is a metre."""
+    if value is None:
+        return "–"
+    return f"{value:.5f}" if name in ("latitude", "longitude") else f"{value:.2f}"
 
 
 def _values(text: str | None) -> list[float | str] | None:

@@ -33,8 +33,7 @@ def average(links: pd.DataFrame, length_m: float, how: str) -> pd.DataFrame:
         means["heading_deg"] = np.degrees(np.arctan2(_mean(np.sin(radians), bin_of, len(count)),
                                                      _mean(np.cos(radians), bin_of, len(count)))) % 360
     means["level_db"] = _level(links["level_db"].to_numpy(), bin_of, count, how)
-    result = links.iloc[first].reset_index(drop=True).assign(**means, quality=count.astype(float))
-    return result.assign(**{f"receiver_{axis}_m": result[f"receiver_{axis}_m"].round(3) for axis in "xyz"})
+    return links.iloc[first].reset_index(drop=True).assign(**means, quality=count.astype(float))
 
 
 def in_wavelengths(length_m: float, frequency_hz: float) -> float:

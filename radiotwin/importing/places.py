@@ -14,7 +14,6 @@ from radiotwin.importing.tally import Tally
 from radiotwin.measurements import DEVICE_OPTIONAL
 
 STILL_M = 1.0  # a device of which the file says places further apart than this moves
-DECIMALS = 3  # of what is written [m]
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,7 @@ def place(source: Source, links: pd.DataFrame, settings: Settings, tally: Tally)
     receivers = _positions(links, "", tables["receiver"], links["receiver"], settings.crs)
     devices = _positions(links, "device_", tables["device"], links["device"], settings.crs)
     frame = find_frame(settings.origin, receivers, devices)
-    receiver_m = np.round(frame.local_m(receivers), DECIMALS)
-    device_m = np.round(frame.local_m(devices), DECIMALS)
+    receiver_m, device_m = frame.local_m(receivers), frame.local_m(devices)
     nowhere = np.isnan(receiver_m[:, :2]).any(axis=1)
     links = links.assign(**{f"receiver_{axis}_m": receiver_m[:, i] for i, axis in enumerate("xyz")})
     lost = links["receiver"][nowhere]

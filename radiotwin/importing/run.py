@@ -19,7 +19,7 @@ from radiotwin.importing.tally import Tally
 from radiotwin.measurements import OPTIONAL, REQUIRED, Measurements
 
 OWN_FILES = {"measurements.csv", "measurements.csv.gz", "devices.csv", "import.toml", "import.json"}
-LEVEL_DECIMALS = 4
+DECIMALS = {"_m": 3, "_db": 4, "_dbm": 4, "_deg": 4, "_s": 6}  # of what is written: all below what is measured
 
 
 def import_file(path: Path | str, settings: Settings, out: Path | str, compress: bool = False,
@@ -113,6 +113,12 @@ def _or(value: float | None, otherwise: float) -> float:
 
 def _measurements(table: pd.DataFrame, devices: pd.DataFrame, settings: Settings) -> Measurements:
     level = COLUMN[settings.level_unit]
-    table = table.rename(columns={"level_db": level}).round({level: LEVEL_DECIMALS, "time_s": 6})
+    table = table.rename(columns={"level_db": level})
     order = ["time_s", *REQUIRED, level, *(name for name in OPTIONAL if name != "time_s")]
-    return Measurements(table[[name for name in order if name in table]].reset_index(drop=True), devices)
+    table = table[[name for name in order if name in table]].reset_index(drop=True)
+    return Measurements(_rounded(table), _rounded(devices))
+
+
+def _rounded(table: pd.DataFrame) -> pd.DataFrame:
+    return table.round({name: decimals for name in table for ending, decimals in DECIMALS.items()
+                        if name.endswith(ending)})

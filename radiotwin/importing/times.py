@@ -10,6 +10,7 @@ from radiotwin.importing.read import Source, as_text
 
 EPOCH_S = {"epoch s": 1.0, "epoch ms": 1e-3}
 ISO = "ISO 8601"
+OFFSET = r":\d\d(?:\.\d+)?(?:[Zz]|[+-]\d\d(?::?\d\d)?)$"
 ALLOWED = f"allowed are {', '.join(EPOCH_S)}, {ISO}, or as of strftime, such as '%d.%m.%Y %H:%M:%S'"
 
 
@@ -25,6 +26,8 @@ def seconds(source: Source, spec: str, form: str | None, zone: str | None) -> np
     Raises:
         BadInput: not declared, cannot be read, or a local time that the zone's clocks skipped or showed twice.
     """
+    if zone is not None:
+        check_zone(zone)
     cells = source.cells(spec, "time")
     if form is None:
         raise BadInput(f"{source.path}: column {spec}: time_format is not given; {ALLOWED}. The values look like "
@@ -33,8 +36,6 @@ def seconds(source: Source, spec: str, form: str | None, zone: str | None) -> np
         return source.numbers(spec, "time") * EPOCH_S[form]
     if form != ISO and "%" not in form:
         raise BadInput(f"time_format {form!r} is unknown; {ALLOWED}")
-    if zone is not None:
-        check_zone(zone)
     parsed, text = _parse(source, spec, cells, form)
     if parsed.dt.tz is None:
         if zone is None:
@@ -67,7 +68,7 @@ def _parse(source: Source, spec: str, cells: pd.Series, form: str) -> tuple[pd.S
     text = as_text(cells)
     if cells.dtype.kind == "M":  # Parquet has times of its own
         return cells, text
-    offset = "%z" in form or (form == ISO and text.str.contains(r"(?:Z|[+-]\d\d:?\d\d)$", case=False))
+    offset = "%z" in form or (form == ISO and text.str.contains(OFFSET))
     some = np.broadcast_to(offset, len(text)) & (text != "")
     if form == ISO and some.any():
         source.refuse(spec, text, ~some & (text != ""), "carries no offset from UTC, other rows do; give it to all or "
