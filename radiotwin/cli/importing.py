@@ -58,7 +58,7 @@ def import_(
              "min_distance_m": min_distance_m, "max_distance_m": max_distance_m, "average_m": average_m,
              "average": average, "origin": _origin(origin), "crs": crs, "devices": devices, "receivers": receivers,
              "wide": [parse_columns(text) for text in wide] if wide else None}
-    pairs = columns is not None and "=" in columns
+    pairs = columns is not None and "=" in columns and not columns.endswith(".toml")
     if pairs:
         given["columns"] = parse_columns(columns)
     settings = read_settings(None if pairs else columns, {k: v for k, v in given.items() if v is not None})

@@ -27,7 +27,8 @@ class Frame:
     def local_m(self, positions: pd.DataFrame) -> np.ndarray:
         """(n, 3) x, y, z of positions with columns of `POSITION`; NaN where unknown."""
         x_m, y_m = positions["x"].to_numpy(dtype=float), positions["y"].to_numpy(dtype=float)
-        z_m = positions["height"].fillna(positions["z"]).to_numpy(dtype=float)
+        ground_m = 0.0 if self.origin is None else self.origin.altitude_m
+        above_m = positions["height"].fillna(positions["z"]).fillna(positions["altitude"] - ground_m)
         if self.origin is not None:
             from pyproj import Proj
 
@@ -36,9 +37,7 @@ class Frame:
             x_m, y_m = x_m.copy(), y_m.copy()
             x_m[known], y_m[known] = plane(positions["longitude"][known].to_numpy(dtype=float),
                                            positions["latitude"][known].to_numpy(dtype=float))
-            above_m = positions["altitude"].to_numpy(dtype=float) - self.origin.altitude_m
-            z_m = np.where(np.isnan(z_m), above_m, z_m)
-        return np.column_stack([x_m, y_m, z_m])
+        return np.column_stack([x_m, y_m, above_m.to_numpy(dtype=float)])
 
 
 def find_frame(declared: Origin | None, receivers: pd.DataFrame, devices: pd.DataFrame) -> Frame:
@@ -83,4 +82,4 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
     if not (np.isfinite(longitude).all() and np.isfinite(latitude).all()):
         raise BadInput(f"some x, y lie outside of {crs}; is it another system?")
     positions.loc[known, "longitude"], positions.loc[known, "latitude"] = longitude, latitude
-    return positions.assign(x=np.nan, y=np.nan, height=positions["height"].fillna(positions["z"]), z=np.nan)
+    return positions.assign(x=np.nan, y=np.nan)

@@ -57,7 +57,8 @@ def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, nam
         return positions
     values = positions.to_numpy(copy=True)
     unknown = np.isnan(values[:, [POSITION.index("latitude"), POSITION.index("x")]]).all(axis=1)
-    values[unknown] = table[list(POSITION)].reindex(names[unknown]).to_numpy()
+    taken = table[list(POSITION)].reindex(names[unknown]).to_numpy()
+    values[unknown] = np.where(np.isnan(values[unknown]), taken, values[unknown])
     return pd.DataFrame(values, index=links.index, columns=positions.columns)
 
 

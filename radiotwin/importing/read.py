@@ -51,7 +51,7 @@ class Source:
         """(n,) numbers, NaN where empty; raises BadInput for a text and for what is not finite."""
         cells = self.cells(spec, purpose)
         if cells.dtype.kind in "fiu":
-            numbers = cells.to_numpy(dtype=float)
+            numbers = cells.to_numpy(dtype=float, na_value=np.nan)
         else:
             text = as_text(cells)
             parsed = pd.to_numeric(text, errors="coerce")
@@ -73,8 +73,7 @@ class Source:
 def as_text(cells: pd.Series) -> pd.Series:
     """Stripped texts, `""` for every spelling of an empty cell; whole numbers without a point."""
     if cells.dtype.kind == "f":
-        whole = cells.isna() | (cells == cells.round())
-        if whole.all():  # an integer column with gaps
+        if (cells.isna() | (np.isfinite(cells) & (cells == cells.round()))).all():  # an integer column with gaps
             cells = cells.astype("Int64")
     text = cells.astype(str).str.strip()
     return text.mask(cells.isna() | text.str.lower().isin(EMPTY), "")
@@ -116,5 +115,7 @@ def _read_geojson(path: Path) -> pd.DataFrame:
                 or len(coordinates) not in (2, 3):
             raise BadInput(f"{path}: feature {number} is {kind or 'without a geometry'}; allowed are points with two "
                            "or three coordinates: leave the others out")
-        rows.append((feature.get("properties") or {}) | dict(zip(("longitude", "latitude", "altitude"), coordinates)))
+        properties = feature.get("properties")
+        rows.append((properties if isinstance(properties, dict) else {})
+                    | dict(zip(("longitude", "latitude", "altitude"), coordinates)))
     return pd.DataFrame(rows)

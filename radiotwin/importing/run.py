@@ -14,7 +14,8 @@ from radiotwin.importing.links import build_links
 from radiotwin.importing.places import Placed, place
 from radiotwin.importing.read import Source, read_source
 from radiotwin.importing.sanity import make_report
-from radiotwin.importing.settings import Settings, write_settings
+from radiotwin.importing.settings import Settings
+from radiotwin.importing.settings_file import write_settings
 from radiotwin.importing.tally import Tally
 from radiotwin.measurements import OPTIONAL, REQUIRED, Measurements
 

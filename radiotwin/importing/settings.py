@@ -1,14 +1,8 @@
 """What an import must be told, as its TOML file and the options of the command line hold it alike."""
 
-import os
-import tomllib
-from pathlib import Path
 from typing import Annotated, Literal
 
-import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-
-from radiotwin.errors import BadInput
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Spec = Annotated[str, Field(min_length=1)]
 """A column of the file, or `always VALUE`."""
@@ -17,13 +11,13 @@ POSITION = ("latitude", "longitude", "altitude", "height", "x", "y", "z")
 
 
 def check_position(given: set[str], prefix: str) -> None:
-    """A position is latitude, longitude and one of altitude, height; or x, y and z. Raises ValueError."""
+    """A position is latitude, longitude or x, y, with one of altitude, height, z or none. Raises ValueError."""
     for pair in (("latitude", "longitude"), ("x", "y")):
         if len(given & set(pair)) == 1:
             raise ValueError(f"{prefix}{pair[0]} and {prefix}{pair[1]} are given together or not at all")
     if {"latitude", "x"} <= given or len(given & {"altitude", "height", "z"}) > 1:
-        raise ValueError(f"a position is either {prefix}latitude, {prefix}longitude with {prefix}altitude or "
-                         f"{prefix}height, or {prefix}x, {prefix}y, {prefix}z; given are {sorted(given)}")
+        raise ValueError(f"a position is either {prefix}latitude, {prefix}longitude or {prefix}x, {prefix}y, with one "
+                         f"of {prefix}altitude, {prefix}height, {prefix}z; given are {', '.join(sorted(given))}")
 
 
 class _Table(BaseModel):
@@ -144,57 +138,3 @@ class Settings(_Table):
             if None not in both and both[0] >= both[1]:
                 raise ValueError(f"{low} = {both[0]:g} must be less than {high} = {both[1]:g}")
         return self
-
-
-def parse_columns(text: str) -> dict[str, str]:
-    """`latitude=lat,longitude=lon` as a dict; raises BadInput."""
-    pairs = {}
-    for part in text.split(","):
-        name, equals, value = (piece.strip() for piece in part.partition("="))
-        if not (name and equals and value) or name in pairs:
-            raise BadInput(f"{part!r} in {text!r} is not a new NAME=COLUMN; for example latitude=lat,longitude=lon, or "
-                           "a file NAME.toml")
-        pairs[name] = value
-    return pairs
-
-
-def read_settings(path: Path | str | None, given: dict) -> Settings:
-    """Settings of a TOML file (tables named in it lie relative to it), overruled by those `given`; raises BadInput."""
-    data = {}
-    if path is not None:
-        path = Path(path)
-        try:
-            data = tomllib.loads(path.read_text("utf-8"))
-        except OSError as error:
-            raise BadInput(f"{path} cannot be read: {error.strerror}; --columns takes a TOML file or pairs such as "
-                           "latitude=lat,longitude=lon") from None
-        except ValueError as error:
-            raise BadInput(f"{path} is not TOML: {error}") from None
-        for table in ("devices", "receivers"):
-            if isinstance(data.get(table), str):
-                data[table] = str(path.parent / data[table])
-    try:
-        return Settings.model_validate(data | given)
-    except ValidationError as error:
-        raise BadInput("\n".join(_explain(problem, path) for problem in error.errors())) from None
-
-
-def _explain(problem: dict, path: Path | None) -> str:
-    key = ".".join(str(part) for part in problem["loc"])
-    reason = problem["msg"].removeprefix("Value error, ")
-    if problem["type"] == "extra_forbidden":
-        table = Columns if problem["loc"][0] == "columns" else Wide if problem["loc"][0] == "wide" else Settings
-        reason = f"unknown; allowed are {', '.join(table.model_fields)}"
-    elif problem["type"] != "value_error":
-        reason = f"{problem['input']!r}: {reason}"
-    return ": ".join(filter(None, [str(path or "the options"), key, reason]))
-
-
-def write_settings(settings: Settings, path: Path, folder: Path) -> None:
-    """Write `path`; the tables' paths become relative to `folder`, where the file will lie."""
-    data = settings.model_dump(exclude_none=True, exclude_defaults=True)
-    for table in ("devices", "receivers"):
-        if table in data:
-            data[table] = os.path.relpath(data[table], folder)
-    with path.open("wb") as file:
-        tomli_w.dump(data, file)

@@ -20,7 +20,7 @@ def seconds(source: Source, spec: str, form: str | None, zone: str | None) -> np
     Args:
         source: the file.
         spec: column of the time.
-        form: one of `EPOCH_S`, `ISO`, or a format of strftime.
+        form: one of `EPOCH_S`, `ISO`, or a format of strftime; not needed where the file has a type for times.
         zone: of clock readings that carry no offset from UTC; a name of the IANA data base.
 
     Raises:
@@ -29,14 +29,15 @@ def seconds(source: Source, spec: str, form: str | None, zone: str | None) -> np
     if zone is not None:
         check_zone(zone)
     cells = source.cells(spec, "time")
-    if form is None:
+    typed = cells.dtype.kind == "M"  # Parquet has times of its own
+    if form is None and not typed:
         raise BadInput(f"{source.path}: column {spec}: time_format is not given; {ALLOWED}. The values look like "
                        f"{str(cells.iloc[0])!r} to {str(cells.iloc[-1])!r}")
-    if form in EPOCH_S:
+    if form in EPOCH_S and not typed:
         return source.numbers(spec, "time") * EPOCH_S[form]
-    if form != ISO and "%" not in form:
+    if not typed and form != ISO and "%" not in form:
         raise BadInput(f"time_format {form!r} is unknown; {ALLOWED}")
-    parsed, text = _parse(source, spec, cells, form)
+    parsed, text = (cells, as_text(cells)) if typed else _parse(source, spec, cells, form)
     if parsed.dt.tz is None:
         if zone is None:
             raise BadInput(f"{source.path}: column {spec}: the times, such as {text.iloc[0]!r}, carry no offset from "
@@ -66,8 +67,6 @@ def check_zone(zone: str) -> None:
 def _parse(source: Source, spec: str, cells: pd.Series, form: str) -> tuple[pd.Series, pd.Series]:
     """Stamps, with a zone where the cells carry offsets, and the cells' texts."""
     text = as_text(cells)
-    if cells.dtype.kind == "M":  # Parquet has times of its own
-        return cells, text
     offset = "%z" in form or (form == ISO and text.str.contains(OFFSET))
     some = np.broadcast_to(offset, len(text)) & (text != "")
     if form == ISO and some.any():

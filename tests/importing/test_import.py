@@ -87,6 +87,20 @@ def test_a_column_for_each_receiver(bring_in, tmp_path):
     assert reasons(result) == {"no position of receiver yard": 1}
 
 
+def test_a_height_in_the_file_holds_for_places_of_a_table(bring_in, tmp_path):
+    (tmp_path / "fixed.csv").write_text("receiver,latitude,longitude\nroof,48,11\n")
+    result = bring_in("who,l,id\nroof,-70,d\n", length_unit="m", receivers=str(tmp_path / "fixed.csv"), columns={
+        "receiver": "who", "level": "l", "device": "id", "height": "always 12"})
+    assert result.table["receiver_z_m"].tolist() == [12]
+
+
+def test_altitudes_of_projected_positions(bring_in, local):
+    result = bring_in("device,x,y,a,level\na,500000,5300000,530,-80\n", columns=local | {"altitude": "a"},
+                      length_unit="m", crs="EPSG:32632", origin={"latitude_deg": 47.8, "longitude_deg": 9,
+                                                                 "altitude_m": 500})
+    assert result.table["receiver_z_m"].tolist() == [30] and abs(result.table["receiver_x_m"][0]) < 1e-3
+
+
 def test_filters(bring_in, local, tmp_path):
     (tmp_path / "sites.csv").write_text("device,x,y,z\na,0,0,40\n")
     text = ("device,x,y,z,level\na,30,0,0,-60\na,300,0,0,-70\na,3000,0,0,-80\nb,1,0,0,-70\na,300,0,0,-99\n"
@@ -144,6 +158,8 @@ def test_odd_heights_headings_and_swapped_sites(bring_in, tmp_path):
     ({"x": "device"}, "a,0,0,-80\n", {}, "row 2, column device: 'a' is not a number"),
     ({}, "a,0,0,-80\na,east,0,-80\nb,west,0,-80\n", {}, r"row 3, column x: 'east' is not a number \(2 such rows\)"),
     ({}, "a,5,7,-80\n", {"length_unit": None}, "column x: length_unit is not given; allowed are m and ft.*5 to 5"),
+    ({"height": "x", "z": "y"}, "a,0,0,-80\n", {}, "with one of altitude, height, z; given are height, x, y, z"),
+    ({"z": 1.5}, "a,0,0,-80\n", {}, 'columns.z: 1.5: give the name of a column, or "always 1.5"'),
     ({"y": None}, "a,0,0,-80\n", {}, "x and y are given together"),
     ({"latitude": "x", "longitude": "y"}, "a,0,0,-80\n", {}, "a position is either"),
     ({"device": None}, "a,0,0,-80\n", {}, "columns.device is missing"),

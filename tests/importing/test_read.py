@@ -38,6 +38,10 @@ def test_all_formats_give_the_same(bring_in, local, tmp_path):
 def test_points_of_geojson(bring_in, points):
     result = bring_in(json.dumps(points), "data.geojson", length_unit="m", columns={
         "latitude": "latitude", "longitude": "longitude", "altitude": "altitude", "device": "cell", "level": "rsrp"})
+    points["features"][0]["properties"] = ["odd"]
+    with pytest.raises(BadInput, match="feature 1, column rsrp: '' is empty"):
+        bring_in(json.dumps(points), "odd.geojson", columns={"latitude": "latitude", "longitude": "longitude",
+                                                             "device": "cell", "level": "rsrp"})
     assert list(result.table["device"]) == ["7", "8"] and list(result.table["rssi_dbm"]) == [-80.5, -99]
     assert result.report["origin"] == {"latitude_deg": 48.15, "longitude_deg": 11.55, "altitude_m": 0.0}
     assert (np.sign(result.table[["receiver_x_m", "receiver_y_m"]]).to_numpy() == [[-1, -1], [1, 1]]).all()
@@ -70,6 +74,17 @@ def test_files_that_are_not_tables(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(BadInput, match=message):
         read_source(tmp_path / name)
+
+
+def test_gaps_and_infinities_of_parquet(bring_in, local, tmp_path):
+    pytest.importorskip("pyarrow")
+    frame = pd.DataFrame({"device": "a", "x": pd.array([0, 3], dtype="Int64"), "y": [0, 4], "level": [-np.inf, -80],
+                          "z": pd.array([None, 4], dtype="Int64")})
+    frame.to_parquet(tmp_path / "made.parquet")
+    result = bring_in((tmp_path / "made.parquet").read_bytes(), "data.parquet", columns=local | {"z": "z"},
+                      length_unit="m", not_detected=["-inf"])
+    np.testing.assert_array_equal(result.table["rssi_dbm"], [np.nan, -80])
+    np.testing.assert_array_equal(result.table["receiver_z_m"], [np.nan, 4])
 
 
 def test_names_that_are_numbers_stay_whole(bring_in, local, tmp_path):
