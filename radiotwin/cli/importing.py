@@ -1,5 +1,6 @@
 """The command that brings in measurements of others."""
 
+import math
 import shlex
 from pathlib import Path
 from typing import Annotated
@@ -105,9 +106,10 @@ def _values(text: str | None) -> list[float | str] | None:
     values = []
     for part in text.split(","):
         try:
-            values.append(float(part))
+            number = float(part)
         except ValueError:
-            values.append(part.strip())
+            number = math.nan
+        values.append(number if math.isfinite(number) else part.strip())
     return values
 
 

@@ -8,6 +8,7 @@ import pandas as pd
 from radiotwin.errors import BadInput
 from radiotwin.importing.settings import POSITION, Origin
 
+MARGIN_DEG = 1.0  # around the area for which a projected system is made
 DECIMALS = 7  # of a found origin [degrees]: a centimetre
 
 
@@ -56,8 +57,11 @@ def find_frame(declared: Origin | None, receivers: pd.DataFrame, devices: pd.Dat
     if not geographic:
         return Frame(None)
     known = receivers if receivers["latitude"].notna().any() else devices
-    latitude, longitude = (round(float(known[name].median()), DECIMALS) for name in ("latitude", "longitude"))
-    return Frame(Origin(latitude_deg=latitude, longitude_deg=longitude))
+    first = known["longitude"].dropna().iloc[0]
+    east = (known["longitude"] - first + 180) % 360 - 180  # a median across the date line, too
+    longitude = (first + east.median() + 180) % 360 - 180
+    return Frame(Origin(latitude_deg=round(float(known["latitude"].median()), DECIMALS),
+                        longitude_deg=round(float(longitude), DECIMALS)))
 
 
 def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
@@ -69,17 +73,29 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
     positions = positions.reindex(columns=list(POSITION)).astype(float)
     if crs is None:
         return positions
-    from pyproj import Transformer
+    from pyproj import CRS, Transformer
     from pyproj.exceptions import CRSError
 
     try:
-        transformer = Transformer.from_crs(crs, "EPSG:4326", always_xy=True)
+        system = CRS(crs)
     except CRSError as error:
         raise BadInput(f"crs {crs!r} is unknown; allowed is what PROJ knows, such as EPSG:32633 (UTM 33 N): {error}"
                        ) from None
+    if not system.is_projected:
+        raise BadInput(f"crs {crs} is {system.type_name}, not a projected one with x and y; degrees go into latitude "
+                       "and longitude")
+    transformer = Transformer.from_crs(system, "EPSG:4326", always_xy=True)
     known = positions["x"].notna() & positions["y"].notna()
     longitude, latitude = transformer.transform(positions["x"][known].to_numpy(), positions["y"][known].to_numpy())
-    if not (np.isfinite(longitude).all() and np.isfinite(latitude).all()):
-        raise BadInput(f"some x, y lie outside of {crs}; is it another system?")
+    area = system.area_of_use
+    if area is not None:
+        east = (longitude - area.west + MARGIN_DEG) % 360  # the area may lie across the date line
+        inside = (east <= (area.east - area.west) % 360 + 2 * MARGIN_DEG) | (area.east - area.west >= 360)
+        inside &= (latitude >= area.south - MARGIN_DEG) & (latitude <= area.north + MARGIN_DEG)
+        if not inside.all():
+            i = int(np.argmin(inside))
+            raise BadInput(f"x, y = {positions['x'][known].iloc[i]:g}, {positions['y'][known].iloc[i]:g} is latitude "
+                           f"{latitude[i]:.3f}, longitude {longitude[i]:.3f}, far outside of the area of {crs}; is it "
+                           "another system, or are x and y swapped?")
     positions.loc[known, "longitude"], positions.loc[known, "latitude"] = longitude, latitude
     return positions.assign(x=np.nan, y=np.nan)

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.read import Source, as_text
+from radiotwin.importing.read import EMPTY, Source, as_text
 from radiotwin.importing.settings import Settings
 
 COLUMN = {"dBm": "rssi_dbm", "mW": "rssi_dbm", "W": "rssi_dbm", "dB": "gain_db"}
@@ -60,7 +60,8 @@ def _is_one_of(text: pd.Series, numbers: np.ndarray, values: list[float | str]) 
     result = np.zeros(len(text), dtype=bool)
     for value in values:
         if isinstance(value, str):
-            result |= (text.str.lower() == ("" if value == "empty" else value.lower())).to_numpy(dtype=bool)
+            word = value.strip().lower()
+            result |= (text.str.lower() == ("" if word in (*EMPTY, "empty") else word)).to_numpy(dtype=bool)
         else:
             result |= numbers == value
     return result

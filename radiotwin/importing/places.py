@@ -11,7 +11,7 @@ from radiotwin.importing.place_table import read_places
 from radiotwin.importing.read import Source
 from radiotwin.importing.settings import POSITION, Settings
 from radiotwin.importing.tally import Tally
-from radiotwin.measurements import DEVICE_OPTIONAL
+from radiotwin.measurements import DEVICE_OPTIONAL, GREATEST_COORDINATE_M
 
 STILL_M = 1.0  # a device of which the file says places further apart than this moves
 
@@ -39,6 +39,13 @@ def place(source: Source, links: pd.DataFrame, settings: Settings, tally: Tally)
     devices = _positions(links, "device_", tables["device"], links["device"], settings.crs)
     frame = find_frame(settings.origin, receivers, devices)
     receiver_m, device_m = frame.local_m(receivers), frame.local_m(devices)
+    for ends_m, what in ((receiver_m, "receiver"), (device_m, "device")):
+        far = (np.abs(ends_m) > GREATEST_COORDINATE_M).any(axis=1)
+        if far.any():
+            row = int(np.argmax(far))
+            raise BadInput(f"{source.path}: {source.where(links.index[row])}: the {what} lies "
+                           f"{np.nanmax(np.abs(ends_m[row])) / 1000:.0f} km from the origin ({far.sum()} such rows); "
+                           "are position, unit and origin right?")
     nowhere = np.isnan(receiver_m[:, :2]).any(axis=1)
     links = links.assign(**{f"receiver_{axis}_m": receiver_m[:, i] for i, axis in enumerate("xyz")})
     lost = links["receiver"][nowhere]

@@ -13,6 +13,7 @@ from radiotwin.measurements import read_cells
 
 EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
 """Texts, in lower case, of cells without a value."""
+FORMATS = (".csv", ".parquet", ".geojson", ".json")
 ALWAYS = "always "
 WGS84 = ("CRS84", "4326")
 
@@ -82,7 +83,9 @@ def as_text(cells: pd.Series) -> pd.Series:
 def read_source(path: Path | str) -> Source:
     """Open .csv, .csv.gz, .parquet, or .geojson of points; raises BadInput."""
     path = Path(path)
-    if path.suffix in (".geojson", ".json"):
+    if path.suffix not in FORMATS and path.suffixes[-2:] != [".csv", ".gz"]:
+        raise BadInput(f"{path}: unknown format; allowed are .csv.gz, {', '.join(FORMATS)}")
+    if path.suffix in FORMATS[2:]:
         source = Source(path, _read_geojson(path), lambda index: f"feature {index + 1}")
     else:
         first = 1 if path.suffix == ".parquet" else 2

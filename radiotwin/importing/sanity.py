@@ -101,8 +101,8 @@ def _odd_levels(placed: Placed, measurements: Measurements, tally: Tally, readin
     if len(seen) > 20 and seen.min() < seen.max():
         share = (seen == seen.min()).mean()
         if share > LEAST_CLUSTER:
-            yield (f"{share:.0%} of the levels are {seen.min():g}, the least; if that means not detected, say so with "
-                   f"not_detected")
+            yield (f"{share:.0%} of the levels are {seen.min():g}, the least; if that means not detected, put it "
+                   "into not_detected")
 
 
 def _odd_times_and_angles(table: pd.DataFrame):

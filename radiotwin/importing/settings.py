@@ -2,11 +2,13 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, Strict, model_validator
 
 Spec = Annotated[str, Field(min_length=1)]
 """A column of the file, or `always VALUE`."""
-Positive = Annotated[float, Field(gt=0)]
+Number = Annotated[float, Strict()]
+"""An integer will do, too, but not `true` or a text."""
+Positive = Annotated[Number, Field(gt=0)]
 POSITION = ("latitude", "longitude", "altitude", "height", "x", "y", "z")
 
 
@@ -94,9 +96,9 @@ class Wide(_Table):
 class Origin(_Table):
     """WGS84 position of the local frame's origin; `altitude_m` is the altitude of the scene's ground datum."""
 
-    latitude_deg: float = Field(ge=-90, le=90)
-    longitude_deg: float = Field(ge=-180, le=180)
-    altitude_m: float = 0.0
+    latitude_deg: Number = Field(ge=-90, le=90)
+    longitude_deg: Number = Field(ge=-180, le=180)
+    altitude_m: Number = 0.0
 
 
 class Settings(_Table):
@@ -106,12 +108,12 @@ class Settings(_Table):
     length_unit: Literal["m", "ft"] | None = None
     time_format: str | None = Field(None, description="epoch s, epoch ms, ISO 8601, or as of strftime")
     time_zone: str | None = None
-    not_detected: list[float | str] = Field([], description="levels that mean: not detected; `empty` is an empty cell")
-    not_measured: list[float | str] = Field([], description="levels that mean: nobody listened; left out")
-    not_detected_at_or_below: float | None = Field(None, description="in the file's unit")
-    min_level: float | None = Field(None, description="[dBm, or dB for gains]")
-    max_level: float | None = Field(None, description="[dBm, or dB for gains]")
-    min_distance_m: float | None = Field(None, ge=0)
+    not_detected: list[Number | str] = Field([], description="levels that mean: not detected; `empty` is an empty cell")
+    not_measured: list[Number | str] = Field([], description="levels that mean: nobody listened; left out")
+    not_detected_at_or_below: Number | None = Field(None, description="in the file's unit")
+    min_level: Number | None = Field(None, description="[dBm, or dB for gains]")
+    max_level: Number | None = Field(None, description="[dBm, or dB for gains]")
+    min_distance_m: Number | None = Field(None, ge=0)
     max_distance_m: Positive | None = None
     average_m: Positive | None = Field(None, description="length of the bins of the local mean")
     average: Literal["power", "median"] = "power"

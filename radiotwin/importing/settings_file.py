@@ -8,7 +8,7 @@ import tomli_w
 from pydantic import ValidationError
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.settings import Columns, Settings, Wide
+from radiotwin.importing.settings import Columns, Origin, Settings, Wide
 
 
 def parse_columns(text: str) -> dict[str, str]:
@@ -41,11 +41,19 @@ def read_settings(path: Path | str | None, given: dict) -> Settings:
     try:
         return Settings.model_validate(data | given)
     except ValidationError as error:
-        raise BadInput("\n".join(_explain(problem, path) for problem in error.errors())) from None
+        lines = {_key(problem): _explain(problem, path) for problem in reversed(error.errors())}
+        raise BadInput("\n".join(reversed(lines.values()))) from None
+
+
+def _key(problem: dict) -> str:
+    """`wide.0.level`; pydantic adds which of several types it has tried."""
+    names = {*Settings.model_fields, *Columns.model_fields, *Wide.model_fields, *Origin.model_fields}
+    return ".".join(str(part) for part in problem["loc"]
+                    if isinstance(part, int) or part in names or problem["type"] == "extra_forbidden")
 
 
 def _explain(problem: dict, path: Path | None) -> str:
-    key = ".".join(str(part) for part in problem["loc"])
+    key = _key(problem)
     reason = problem["msg"].removeprefix("Value error, ")
     if problem["type"] == "extra_forbidden":
         table = Columns if problem["loc"][0] == "columns" else Wide if problem["loc"][0] == "wide" else Settings

@@ -10,6 +10,7 @@ from radiotwin.importing.read import Source, as_text
 
 EPOCH_S = {"epoch s": 1.0, "epoch ms": 1e-3}
 ISO = "ISO 8601"
+YEARS = (1900, 2200)
 OFFSET = r":\d\d(?:\.\d+)?(?:[Zz]|[+-]\d\d(?::?\d\d)?)$"
 ALLOWED = f"allowed are {', '.join(EPOCH_S)}, {ISO}, or as of strftime, such as '%d.%m.%Y %H:%M:%S'"
 
@@ -34,7 +35,7 @@ def seconds(source: Source, spec: str, form: str | None, zone: str | None) -> np
         raise BadInput(f"{source.path}: column {spec}: time_format is not given; {ALLOWED}. The values look like "
                        f"{str(cells.iloc[0])!r} to {str(cells.iloc[-1])!r}")
     if form in EPOCH_S and not typed:
-        return source.numbers(spec, "time") * EPOCH_S[form]
+        return _checked(source, spec, as_text(cells), source.numbers(spec, "time") * EPOCH_S[form])
     if not typed and form != ISO and "%" not in form:
         raise BadInput(f"time_format {form!r} is unknown; {ALLOWED}")
     parsed, text = (cells, as_text(cells)) if typed else _parse(source, spec, cells, form)
@@ -43,8 +44,8 @@ def seconds(source: Source, spec: str, form: str | None, zone: str | None) -> np
             raise BadInput(f"{source.path}: column {spec}: the times, such as {text.iloc[0]!r}, carry no offset from "
                            "UTC, and time_zone is not given; give UTC or a zone such as Europe/Berlin")
         parsed = _localize(source, spec, text, parsed, zone)
-    since = (parsed.dt.tz_convert("UTC") - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
-    return since.to_numpy(dtype=float)
+    moments = parsed.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy(dtype="datetime64[us]")
+    return _checked(source, spec, text, (moments - np.datetime64(0, "us")) / np.timedelta64(1, "s"))
 
 
 def day(time_s: np.ndarray, zone: str | None) -> np.ndarray:
@@ -72,10 +73,21 @@ def _parse(source: Source, spec: str, cells: pd.Series, form: str) -> tuple[pd.S
     if form == ISO and some.any():
         source.refuse(spec, text, ~some & (text != ""), "carries no offset from UTC, other rows do; give it to all or "
                       "to none")
-    parsed = pd.to_datetime(text.where(text != ""), format="ISO8601" if form == ISO else form, errors="coerce",
-                            utc=bool(some.any()))
+    try:
+        parsed = pd.to_datetime(text.where(text != ""), format="ISO8601" if form == ISO else form, errors="coerce",
+                                utc=bool(some.any()))
+    except ValueError as error:
+        raise BadInput(f"time_format {form!r} is no format of strftime: {error}; {ALLOWED}") from None
     source.refuse(spec, text, parsed.isna() & (text != ""), f"is no time in the form {form}; {ALLOWED}")
     return parsed, text
+
+
+def _checked(source: Source, spec: str, text: pd.Series, time_s: np.ndarray) -> np.ndarray:
+    """`time_s`, none of it out of all reason."""
+    year = 1970 + time_s / 31_556_952
+    source.refuse(spec, text, (year < YEARS[0]) | (year > YEARS[1]),
+                  f"lies outside of the years {YEARS[0]} to {YEARS[1]}; is time_format right (epoch s, epoch ms)?")
+    return time_s
 
 
 def _localize(source: Source, spec: str, text: pd.Series, parsed: pd.Series, zone: str) -> pd.Series:

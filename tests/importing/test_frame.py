@@ -53,6 +53,12 @@ def test_the_origin_is_the_median_of_the_receivers():
     np.testing.assert_allclose(found.local_m(positions(latitude=48.1, longitude=11.2))[0, :2], 0, atol=1e-9)
 
 
+def test_the_median_across_the_date_line():
+    receivers = positions(latitude=[-17.0, -17.0, -17.0], longitude=[179.9, -179.9, -179.8])
+    assert find_frame(None, receivers, receivers).origin.longitude_deg == -179.9
+    assert np.abs(find_frame(None, receivers, receivers).local_m(receivers)[:, 0]).max() < 30_000
+
+
 def test_utm_gives_the_same_metres_as_degrees():
     """Easting 500 km, on the central meridian of zone 32 (9° E), where UTM has the scale 0.9996 exactly."""
     utm = to_geographic(pd.DataFrame({"x": [500_000.0, 500_000.0], "y": [5_300_000.0, 5_301_000.0], "z": [3.0, 4.0]}),
@@ -70,6 +76,20 @@ def test_local_and_geographic_positions_need_an_origin():
     np.testing.assert_array_equal(declared.local_m(devices), [[5, 6, 7]])
 
 
-def test_an_unknown_system():
-    with pytest.raises(BadInput, match="EPSG:1.*such as EPSG:32633"):
-        to_geographic(pd.DataFrame({"x": [0.0], "y": [0.0]}), "EPSG:1")
+@pytest.mark.parametrize(("crs", "x", "y", "message"), [
+    ("EPSG:1", 0, 0, "EPSG:1.*is unknown.*such as EPSG:32633"),
+    ("EPSG:4326", 11, 48, "not a projected one"),
+    ("EPSG:32632", 11, 48, "x, y = 11, 48 is latitude 0.000, longitude 4.511, far outside"),
+    ("EPSG:32632", 5.3e6, 5e5, "far outside of the area of EPSG:32632.*swapped"),
+])
+def test_systems_that_do_not_fit(crs, x, y, message):
+    with pytest.raises(BadInput, match=message):
+        to_geographic(pd.DataFrame({"x": [float(x)], "y": [float(y)]}), crs)
+
+
+def test_an_area_across_the_date_line():
+    """Zone 1 begins at 180° W; half a degree west of it is 179.5° E."""
+    from pyproj import Proj
+    x, y = Proj("EPSG:32601")(179.5, 52.0)
+    found = to_geographic(pd.DataFrame({"x": [x], "y": [y]}), "EPSG:32601")
+    assert found["longitude"][0] == pytest.approx(179.5) and found["latitude"][0] == pytest.approx(52.0)

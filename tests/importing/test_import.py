@@ -160,6 +160,8 @@ def test_odd_heights_headings_and_swapped_sites(bring_in, tmp_path):
     ({}, "a,5,7,-80\n", {"length_unit": None}, "column x: length_unit is not given; allowed are m and ft.*5 to 5"),
     ({"height": "x", "z": "y"}, "a,0,0,-80\n", {}, "with one of altitude, height, z; given are height, x, y, z"),
     ({"z": 1.5}, "a,0,0,-80\n", {}, 'columns.z: 1.5: give the name of a column, or "always 1.5"'),
+    ({}, "a,0,0,-80\na,1e9,0,-80\n", {}, "row 3: the receiver lies 1000000 km from the origin .1 such rows"),
+    ({}, "a,0,0,-80\n", {"average_m": True}, "average_m: True: Input should be a valid number"),
     ({"y": None}, "a,0,0,-80\n", {}, "x and y are given together"),
     ({"latitude": "x", "longitude": "y"}, "a,0,0,-80\n", {}, "a position is either"),
     ({"device": None}, "a,0,0,-80\n", {}, "columns.device is missing"),

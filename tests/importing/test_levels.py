@@ -21,8 +21,8 @@ def test_units(bring_in, local, unit, text, column, value):
 
 
 def test_not_detected_is_blank_and_not_measured_is_gone(bring_in, local):
-    result = bring_in(rows(-140, "No Signal", "", -101, -120, -119.5, "-inf"), columns=local, length_unit="m",
-                      not_detected=[-140.0, "no signal", "-inf", "empty"], not_measured=[-101.0],
+    result = bring_in(rows(-140, "No Signal", "NaN", -101, -120, -119.5, "-inf"), columns=local, length_unit="m",
+                      not_detected=[-140.0, "no signal", "-inf", "nan"], not_measured=[-101.0],
                       not_detected_at_or_below=-120.0)
     np.testing.assert_array_equal(result.table["rssi_dbm"], [np.nan] * 4 + [-119.5, np.nan])
     assert list(result.table["receiver_x_m"]) == [0, 10, 20, 40, 50, 60]
