@@ -165,18 +165,27 @@ def read_devices(path: Path | str) -> pd.DataFrame:
     return devices
 
 
-def _read_table(path: Path, required: list[str], optional: list[str], may_be_empty=MAY_BE_EMPTY) -> pd.DataFrame:
+def read_cells(path: Path) -> pd.DataFrame:
+    """The cells of any table as they stand: text from .csv and .csv.gz (`""` where empty), typed from .parquet.
+
+    Raises:
+        BadInput: no such file, unreadable, no header, a name twice, or a row with too few or too many fields.
+    """
     _check_suffix(path)
     if not path.is_file():
         raise BadInput(f"{path} does not exist")
     try:
-        raw = _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
+        return _read_parquet(path) if path.suffix == ".parquet" else _read_csv(path)
     except BadInput:
         raise
     except UnicodeDecodeError:
         raise BadInput(f"{path} is not text in UTF-8; allowed is comma-separated, UTF-8") from None
     except Exception as error:  # pandas, gzip and pyarrow each have their own
         raise BadInput(f"{path} cannot be read as {''.join(path.suffixes)}: {error}") from None
+
+
+def _read_table(path: Path, required: list[str], optional: list[str], may_be_empty=MAY_BE_EMPTY) -> pd.DataFrame:
+    raw = read_cells(path)
     missing = [name for name in required if name not in raw]
     if missing:
         raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {required}, it has {list(raw.columns)}")

@@ -1,0 +1,7 @@
+"""Anybody's measurements -> the project's two tables, with a report of what was kept and what was not."""
+
+from radiotwin.importing.run import import_file
+from radiotwin.importing.settings import Settings
+from radiotwin.importing.settings_file import parse_columns, read_settings
+
+__all__ = ["Settings", "import_file", "parse_columns", "read_settings"]

@@ -1,0 +1,164 @@
+"""`radiotwin import` as a user runs it: the worked examples, round trips, and input that cannot be used."""
+
+import json
+import shlex
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.measurements import read_measurements
+
+EXAMPLES = Path(__file__).parents[2] / "examples" / "import"
+SAMPLES = Path(__file__).parents[1] / "importing" / "samples"
+FILES = ["devices.csv", "import.json", "import.toml", "measurements.csv"]
+
+
+@pytest.fixture
+def example(run, tmp_path):
+    """Import a sample with its worked mapping, twice: with the example, and with what the first import has saved."""
+    def example(name: str, options: str = ""):
+        file = shlex.quote(str(SAMPLES / f"{name}.csv"))
+        first = run(f"import {file} --columns {shlex.quote(str(EXAMPLES / name))}.toml {options} -o out", tmp_path)
+        assert first.returncode == 0, first.stderr
+        again = run(f"import {file} --columns out/import.toml -o again", tmp_path)
+        assert again.returncode == 0, again.stderr
+        assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
+        for name in FILES:
+            assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+        report = json.loads((tmp_path / "out" / "import.json").read_text())
+        left_out = Counter()
+        for item in report["left_out"]:
+            left_out[item["reason"]] += item["readings"]
+        assert report["readings"] == report["kept"] + sum(left_out.values())
+        return read_measurements(tmp_path / "out" / "measurements.csv"), report, left_out, first.stdout
+    return example
+
+
+def test_duke_cbrs(example):
+    measurements, report, left_out, printed = example(
+        "duke_cbrs", f"--devices {shlex.quote(str(SAMPLES / 'duke_cbrs_sectors.csv'))}")
+    table, devices = measurements.table, measurements.devices.set_index("device")
+    assert list(table["rssi_dbm"]) == [-112, -98, -107, -121] and list(table["device"]) == ["C", "A", "C", "A"]
+    assert list(table["receiver"]) == list(table["flight"]) == ["Samsung", "Samsung", "Pixel", "Pixel"]
+    assert set(table["receiver_z_m"]) == {1.5} and left_out == {"repeats an earlier row exactly": 1}
+    assert devices.loc["C", ["z_m", "role", "frequency_hz"]].tolist() == [24, "anchor", 3.58e9]
+    apart_m = measurements.receiver_m - measurements.device_m[measurements.device_index]
+    assert np.allclose(apart_m[0, :2], [1e-3 * 90_165, 2e-3 * 110_960], rtol=1e-3)  # metres a degree at 36° north
+    assert "4 links, 0 not detected; 2 devices (2 anchors), 2 receivers, 2 flights" in printed
+    assert "origin: latitude 36.0015" in printed
+
+
+def test_powder_frs(example):
+    measurements, report, left_out, printed = example(
+        "powder_frs", f"--receivers {shlex.quote(str(SAMPLES / 'powder_frs_receivers.csv'))}")
+    table = measurements.table
+    assert report["rows"] == 3 and report["readings"] == 12 and left_out == {"not measured": 4}
+    assert list(table["device"]) == ["p1", "p1", "p2", "p2", "p2", "p1", "p1", "p1"]
+    assert sorted(set(table["receiver"])) == ["bus-4407", "cbrssdr1-hill-comp", "cnode-yard-dd-b210", "roof-nuc1-b210"]
+    assert measurements.flights == ["2022-11-23", "2022-07-11"]
+    assert table["time_s"].iloc[0] == pd.Timestamp("2022-11-23 13:24:40-07:00").timestamp()
+    assert table["time_s"].iloc[-1] == pd.Timestamp("2022-07-11 08:49:44-06:00").timestamp()
+    assert measurements.is_anchor.all() and set(measurements.devices["frequency_hz"]) == {462.7e6}
+    bus = table[table["receiver"] == "bus-4407"]
+    assert np.diff(bus["receiver_y_m"])[0] == pytest.approx(111.05, abs=0.1) and len(bus) == 2
+    assert table["receiver_z_m"].isna().all()
+
+
+def test_drive_test(example):
+    measurements, report, left_out, printed = example(
+        "drive_test", f"--devices {shlex.quote(str(SAMPLES / 'drive_test_sites.csv'))}")
+    table = measurements.table
+    assert left_out == {"impossible level": 1, "no device": 1, "nearer than 100.0 m": 1}
+    assert list(table["device"]) == ["111", "111", "222"] and list(table["quality"]) == [3, 1, 1]
+    power = np.array([1e-9, 1e-10, 0]).mean()
+    np.testing.assert_allclose(table["rssi_dbm"], [10 * np.log10(power), -95, np.nan], atol=1e-4)
+    assert set(table["receiver_z_m"]) == {2.5} and set(table["flight"]) == {"2023-07-04"}
+    assert table["time_s"].iloc[0] == pd.Timestamp("2023-07-04 07:00:01Z").timestamp()
+    assert measurements.devices[["role", "z_m"]].values.tolist()[0] == ["anchor", 30.48]
+    assert measurements.devices["role"].tolist() == ["anchor", "unknown"]
+    assert "impossible level" in printed and "row 9" in printed
+
+
+def test_uav_log(example):
+    measurements, report, left_out, printed = example("uav_log")
+    table = measurements.table
+    assert left_out == {} and report["not_detected"] == 1
+    np.testing.assert_array_equal(table["rssi_dbm"], [-71.5, np.nan, -73])
+    np.testing.assert_allclose(table["receiver_z_m"], [60, 60, 60.12], atol=1e-3)
+    np.testing.assert_allclose(table["receiver_y_m"], [0, 11.12, 22.24], atol=0.01)
+    assert list(table["heading_deg"]) == [350, 10, 20] and list(table["roll_deg"]) == [-1, -1, 0]
+    assert list(table["time_s"]) == [1688461200, 1688461200.5, 1688461201]
+    assert measurements.devices["role"].tolist() == ["unknown"]
+
+
+GOOD = "time,lat,lon,cell,rsrp\n2022-10-30 12:00:00,48.1,11.5,a,-80\n2022-10-30 12:00:01,48.2,11.6,a,-99\n"
+MAPPING = "--columns 'time=time,latitude=lat,longitude=lon,device=cell,level=rsrp'"
+WORDS = f"import data.csv {MAPPING} --level-unit dBm --time-format 'ISO 8601' --time-zone Europe/Berlin -o out"
+
+
+def test_options_alone_are_enough_and_gzip_is_read_by_all(run, tmp_path):
+    (tmp_path / "data.csv").write_text(GOOD)
+    done = run(WORDS + " --gzip --origin 48.1,11.5,100 --not-detected -99,empty", tmp_path)
+    assert done.returncode == 0, done.stderr
+    measurements = read_measurements(tmp_path / "out" / "measurements.csv.gz")
+    np.testing.assert_array_equal(measurements.level_db, [-80, np.nan])
+    np.testing.assert_allclose(measurements.receiver_m[0, :2], 0, atol=1e-3)
+    saved = (tmp_path / "out" / "import.toml").read_text()
+    assert "altitude_m = 100.0" in saved and 'not_detected = [\n    -99.0,\n    "empty",\n]' in saved
+    assert run(WORDS, tmp_path).returncode == 0, "an earlier import may be replaced"
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
+
+
+def test_many_columns_of_levels_by_options(run, tmp_path):
+    (tmp_path / "data.csv").write_text("x,y,rx1_rss,rx2_rss\n1,2,-80,-81\n")
+    done = run("import data.csv --columns device_x=x,device_y=y,device='by position',x='always 0',y='always 0' --wide "
+               "level=*_rss,receiver=* --level-unit dBm --length-unit m -o out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert list(read_measurements(tmp_path / "out" / "measurements.csv").table["receiver"]) == ["rx1", "rx2"]
+
+
+@pytest.mark.parametrize(("text", "change", "parts"), [
+    (GOOD.replace("rsrp", "rssi"), "", ["data.csv", "column 'rsrp'", "missing", "rssi"]),
+    (GOOD, "--level-unit bel", ["level_unit", "bel", "dBm"]),
+    (GOOD, "--time-zone Europe/Atlantis", ["time_zone 'Europe/Atlantis' is unknown", "Europe/Berlin"]),
+    (GOOD.replace("12:00:01", "02:30:00"), "", ["row 3", "column time", "happened twice"]),
+    (GOOD.replace("-99", "weak"), "", ["row 3", "column rsrp", "'weak'"]),
+    (GOOD.replace("48.2", "1000"), "", ["row 3", "column lat", "1000", "-90 to 90"]),
+    ("", "", ["data.csv is empty"]),
+    ("a,b\n", "", ["has no rows"]),
+    (None, "", ["data.csv does not exist"]),
+    (GOOD, "--columns nowhere.toml", ["nowhere.toml cannot be read"]),
+    (GOOD, "--columns time", ["time cannot be read", "latitude=lat"]),
+    (GOOD, "--origin here", ["--origin 'here'", "LATITUDE,LONGITUDE"]),
+    (GOOD, "--origin 91,0", ["origin.latitude_deg", "91"]),
+    (GOOD, "--average mode", ["average", "mode", "median"]),
+    (GOOD, "--devices data.csv", ["data.csv", "column 'device'", "missing"]),
+    (GOOD, "-o data.csv", ["data.csv is a file"]),
+])
+def test_bad_input_is_one_message_and_no_folder(run, tmp_path, text, change, parts):
+    if text is not None:
+        (tmp_path / "data.csv").write_text(text)
+    done = run(f"{WORDS} {change}", tmp_path)
+    assert done.returncode == 2, (done.returncode, done.stderr)
+    assert "Traceback" not in done.stderr and done.stdout == ""
+    assert all(part in done.stderr for part in parts), done.stderr
+    assert {path.name for path in tmp_path.iterdir()} <= {"data.csv"}
+
+
+def test_an_undeclared_unit_shows_the_values(run, tmp_path):
+    (tmp_path / "data.csv").write_text(GOOD)
+    done = run(WORDS.replace("--level-unit dBm", ""), tmp_path)
+    assert done.returncode == 2 and "level_unit is not given; allowed are dBm, mW and W" in done.stderr
+    assert "from -99 to -80" in done.stderr and not (tmp_path / "out").exists()
+
+
+def test_polygons(run, tmp_path):
+    ring = [[[11, 48], [12, 48], [12, 49], [11, 48]]]
+    (tmp_path / "data.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [
+        {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": ring}, "properties": {"rsrp": -80}}]}))
+    done = run(WORDS.replace("data.csv", "data.geojson"), tmp_path)
+    assert done.returncode == 2 and "feature 1 is Polygon; allowed are points" in done.stderr
+    assert not (tmp_path / "out").exists() and "Traceback" not in done.stderr

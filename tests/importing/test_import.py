@@ -1,0 +1,241 @@
+"""Rows -> links: mapping, places, filters, and the account of what was left out."""
+
+import numpy as np
+import pytest
+
+from radiotwin.errors import BadInput
+from radiotwin.importing import parse_columns, read_settings
+
+HEAD = "device,x,y,level\n"
+
+
+def reasons(result):
+    return {item["reason"]: item["readings"] for item in result.report["left_out"]}
+
+
+def test_repeated_rows_count_once(bring_in, local):
+    result = bring_in(HEAD + "a,0,0,-80\na,0,0,-81\na,0,0,-80\na,0,0,-80\n", columns=local, length_unit="m")
+    assert list(result.table["rssi_dbm"]) == [-80, -81]
+    assert reasons(result) == {"repeats an earlier row exactly": 2}
+
+
+def test_feet_become_metres(bring_in, local):
+    result = bring_in("device,x,y,z,level\na,1000,2000,10,-80\n", columns=local | {"z": "z"}, length_unit="ft")
+    assert result.table[["receiver_x_m", "receiver_y_m", "receiver_z_m"]].values.tolist() == [[304.8, 609.6, 3.048]]
+
+
+def test_constants_and_all_other_columns(bring_in, local):
+    text = "device,x,y,level,h,p,r,q,t\na,1,2,-80,370,3,-4,9,100.5\n"
+    result = bring_in(text, length_unit="m", time_format="epoch s", columns=local | {
+        "z": "always 1.5", "receiver": "always phone", "flight": "by day", "time": "t", "heading": "h", "pitch": "p",
+        "roll": "r", "quality": "q"})
+    assert result.table.iloc[0].to_dict() == {
+        "time_s": 100.5, "flight": "1970-01-01", "receiver": "phone", "receiver_x_m": 1, "receiver_y_m": 2,
+        "receiver_z_m": 1.5, "device": "a", "rssi_dbm": -80, "heading_deg": 370, "pitch_deg": 3, "roll_deg": -4,
+        "quality": 9}
+    assert any("since 1970" in text for text in result.report["warnings"])
+
+
+def test_places_of_devices_from_columns(bring_in, local):
+    text = "device,x,y,level,dx,dy,dz\na,1,2,-80,30,40,5\nb,1,2,-80,,,\na,9,9,-80,30,40,5\n"
+    result = bring_in(text, length_unit="m", columns=local | {"device_x": "dx", "device_y": "dy", "device_z": "dz"})
+    assert result.devices.set_index("device").loc["a"].tolist() == [30, 40, 5, "anchor"]
+    assert result.devices["role"].tolist() == ["anchor", "unknown"] and result.devices["x_m"].isna().tolist() == [0, 1]
+
+
+def test_places_of_devices_from_a_table(bring_in, local, tmp_path):
+    (tmp_path / "sites.csv").write_text("device,x_ft,y_ft,z_m,frequency_hz,azimuth_deg\n"
+                                        "b,100,0,24,9e8,120\nc,1,1,1,9e8,0\n")
+    result = bring_in(HEAD + "a,0,0,-80\nb,0,0,-81\n", columns=local, length_unit="m",
+                      devices=str(tmp_path / "sites.csv"))
+    devices = result.devices.set_index("device")
+    assert devices.index.tolist() == ["a", "b"] and devices["role"].tolist() == ["unknown", "anchor"]
+    assert devices.loc["b"].tolist() == [30.48, 0, 24, "anchor", 9e8, 120]
+
+
+def test_a_moving_device_is_named_by_its_position(bring_in, local):
+    """Hand-held transmitters heard by a fixed receiver."""
+    text = "device,x,y,level,tx,ty\n_,1,2,-80,30,40\n_,1,2,-81,50,60\n_,1,2,-82,30,40\n_,1,2,-83,,60\n"
+    by_position = local | {"device_x": "tx", "device_y": "ty", "device": "by position"}
+    result = bring_in(text, columns=by_position, length_unit="m")
+    assert list(result.table["device"]) == ["p1", "p2", "p1"] and reasons(result) == {"no device": 1}
+    assert result.measurements.device_m[:, :2].tolist() == [[30, 40], [50, 60]] and result.measurements.is_anchor.all()
+    with pytest.raises(BadInput, match=r"device '_' stands at places 20 m apart.*by position"):
+        bring_in(text, columns=by_position | {"device": "device"}, length_unit="m")
+
+
+def test_a_column_for_each_device(bring_in, tmp_path):
+    (tmp_path / "sites.csv").write_text("device,x,y,z\nA,5,6,7\n")
+    result = bring_in("x,y,rssi A,rssi B\n1,2,-80,-81\n3,4,-101,-83\n", length_unit="m", columns={"x": "x", "y": "y"},
+                      wide=[{"level": "rssi *", "device": "*"}], not_measured=[-101.0],
+                      devices=str(tmp_path / "sites.csv"))
+    assert result.table[["device", "receiver_x_m", "rssi_dbm"]].values.tolist() == [
+        ["A", 1, -80], ["B", 1, -81], ["B", 3, -83]]
+    assert result.devices["role"].tolist() == ["anchor", "unknown"]
+    assert result.report["readings"] == 4 and result.report["rows"] == 2
+
+
+def test_a_column_for_each_receiver(bring_in, tmp_path):
+    """Two fixed ones with places in a table, listed by name; one that moves and has columns of its own."""
+    (tmp_path / "fixed.csv").write_text("receiver,x,y\nroof,100,0\n")
+    result = bring_in("roof,yard,bus_l,bus_x,bus_y,id\n-70,-75,-80,7,8,d\n", length_unit="m", columns={"device": "id"},
+                      receivers=str(tmp_path / "fixed.csv"), wide=[
+                          {"level": ["roof", "yard"], "receiver": "*"},
+                          {"level": "*_l", "receiver": "*", "x": "*_x", "y": "*_y"}])
+    assert result.table[["receiver", "receiver_x_m", "receiver_y_m", "rssi_dbm"]].values.tolist() == [
+        ["roof", 100, 0, -70], ["bus", 7, 8, -80]]
+    assert reasons(result) == {"no position of receiver yard": 1}
+
+
+def test_a_height_in_the_file_holds_for_places_of_a_table(bring_in, tmp_path):
+    (tmp_path / "fixed.csv").write_text("receiver,latitude,longitude\nroof,48,11\n")
+    result = bring_in("who,l,id\nroof,-70,d\n", length_unit="m", receivers=str(tmp_path / "fixed.csv"), columns={
+        "receiver": "who", "level": "l", "device": "id", "height": "always 12"})
+    assert result.table["receiver_z_m"].tolist() == [12]
+
+
+def test_altitudes_of_projected_positions(bring_in, local):
+    result = bring_in("device,x,y,a,level\na,500000,5300000,530,-80\n", columns=local | {"altitude": "a"},
+                      length_unit="m", crs="EPSG:32632", origin={"latitude_deg": 47.8, "longitude_deg": 9,
+                                                                 "altitude_m": 500})
+    assert result.table["receiver_z_m"].tolist() == [30] and abs(result.table["receiver_x_m"][0]) < 1e-3
+
+
+def test_filters(bring_in, local, tmp_path):
+    (tmp_path / "sites.csv").write_text("device,x,y,z\na,0,0,40\n")
+    text = ("device,x,y,z,level\na,30,0,0,-60\na,300,0,0,-70\na,3000,0,0,-80\nb,1,0,0,-70\na,300,0,0,-99\n"
+            "a,301,0,0,-41\na,302,0,0,none\n")
+    result = bring_in(text, columns=local | {"z": "z"}, length_unit="m", min_distance_m=51.0, max_distance_m=1000.0,
+                      min_level=-90.0, max_level=-50.0, not_detected=["empty"], devices=str(tmp_path / "sites.csv"))
+    assert list(result.table["receiver_x_m"]) == [300, 1, 302]  # a device without a place and a blank level pass
+    assert reasons(result) == {"nearer than 51.0 m": 1, "further than 1000.0 m": 1, "level below -90.0": 1,
+                               "level above -50.0": 1}
+    near = bring_in(text, columns=local | {"z": "z"}, length_unit="m", min_distance_m=49.0, not_detected=["empty"],
+                    devices=str(tmp_path / "sites.csv"))
+    assert list(near.table["receiver_x_m"])[0] == 30  # 50 m away: in three dimensions
+
+
+def test_read_is_kept_and_left_out(bring_in):
+    text = "cell,lat,lon,level\na,48,11,-80\na,0,0,-80\na,,,-80\n,48,11,-80\na,48,11,0\na,48,11,-80\n"
+    result = bring_in(text, columns={"device": "cell", "latitude": "lat", "longitude": "lon", "level": "level"})
+    assert reasons(result) == {"impossible level": 1, "no device": 1, "latitude, longitude 0, 0 (no fix)": 1,
+                               "no position of receiver receiver": 1, "repeats an earlier row exactly": 1}
+    assert result.report["readings"] == result.report["kept"] + sum(reasons(result).values())
+
+
+def test_local_means_say_how_many_readings(bring_in, local):
+    result = bring_in(HEAD + "a,0,0,-80\na,1,0,-80\na,10,0,-90\n", columns=local | {"frequency_hz": "always 1e9"},
+                      length_unit="m", average_m=5.0)
+    assert list(result.table["quality"]) == [2, 1] and list(result.table["receiver_x_m"]) == [0.5, 10]
+    assert result.report["kept"] == 3 and result.report["written"] == 2
+    assert any("17 wavelengths; 20 to 40 (Lee 1985) are 6.0 to 12.0 m" in text for text in result.report["warnings"])
+
+
+@pytest.mark.parametrize(("text", "given", "words"), [
+    ("a,0,0,-80\nb,300000,0,-80\n", {}, "300 km apart"),
+    ("a,0,0,none\na,0,1,none\na,0,2,-80\n", {"not_detected": ["empty"]}, "67% of the levels are not detected"),
+    ("".join(f"a,{i},0,{-90 - i % 5}\n" for i in range(30)), {}, "20% of the levels are -94, the least"),
+    ("a,0,0,-80\n", {}, "1 of 1 devices have no position"),
+])
+def test_what_looks_odd_is_said(bring_in, local, text, given, words):
+    result = bring_in(HEAD + text, columns=local, length_unit="m", **given)
+    assert any(words in note for note in result.report["warnings"])
+
+
+def test_odd_heights_headings_and_swapped_sites(bring_in, tmp_path):
+    (tmp_path / "sites.csv").write_text("device,latitude,longitude\na,11.5,48.1\n")
+    rows = "".join(f"a,48.1,11.5,{z},{0.2 * i},-{80 + i}\n" for i, z in enumerate([1400] * 25))
+    columns = {"device": "d", "latitude": "la", "longitude": "lo", "altitude": "z", "heading": "h", "level": "l"}
+    result = bring_in("d,la,lo,z,h,l\n" + rows, columns=columns, length_unit="m", devices=str(tmp_path / "sites.csv"))
+    notes = "\n".join(result.report["warnings"])
+    assert "lowest receiver is at 1400 m" in notes and "radians" in notes and "swapped" in notes
+    zero = bring_in("d,la,lo,z,h,l\n" + rows.replace("1400", "0"), columns=columns, length_unit="m")
+    assert any("height of every receiver is 0" in note for note in zero.report["warnings"])
+
+
+@pytest.mark.parametrize(("columns", "text", "given", "message"), [
+    ({"level": "rsrp"}, "a,0,0,-80\n", {}, r"column 'rsrp' \(level\) is missing; the file has device, x, y, level"),
+    ({"x": "device"}, "a,0,0,-80\n", {}, "row 2, column device: 'a' is not a number"),
+    ({}, "a,0,0,-80\na,east,0,-80\nb,west,0,-80\n", {}, r"row 3, column x: 'east' is not a number \(2 such rows\)"),
+    ({}, "a,5,7,-80\n", {"length_unit": None}, "column x: length_unit is not given; allowed are m and ft.*5 to 5"),
+    ({"height": "x", "z": "y"}, "a,0,0,-80\n", {}, "with one of altitude, height, z; given are height, x, y, z"),
+    ({"z": 1.5}, "a,0,0,-80\n", {}, 'columns.z: 1.5: give the name of a column, or "always 1.5"'),
+    ({}, "a,0,0,-80\na,1e9,0,-80\n", {}, "row 3: the receiver lies 1000000 km from the origin .1 such rows"),
+    ({}, "a,0,0,-80\n", {"average_m": True}, "average_m: True: Input should be a valid number"),
+    ({"y": None}, "a,0,0,-80\n", {}, "x and y are given together"),
+    ({"latitude": "x", "longitude": "y"}, "a,0,0,-80\n", {}, "a position is either"),
+    ({"device": None}, "a,0,0,-80\n", {}, "columns.device is missing"),
+    ({"level": None}, "a,0,0,-80\n", {}, "columns.level is missing"),
+    ({"colour": "x"}, "a,0,0,-80\n", {}, "columns.colour: unknown; allowed are level, device"),
+    ({"device": "by position"}, "a,0,0,-80\n", {}, "by position.*needs"),
+    ({"flight": "by day"}, "a,0,0,-80\n", {}, "by day.*needs"),
+    ({"frequency_hz": "always 3"}, "a,0,0,-80\n", {}, "'3' is no frequency"),
+    ({}, "a,0,0,-80\n", {"min_level": -50.0, "max_level": -90.0}, "min_level = -50 must be less than max_level"),
+    ({}, "a,0,0,-80\n", {"average_m": -1.0}, "average_m"),
+    ({}, "a,0,0,-80\n", {"min_level": -70.0}, "nothing is left of 1 readings: 1 level below -70"),
+    ({"x": None, "y": None}, "a,0,0,-80\n", {}, "nothing is left.*no position of receiver"),
+    ({}, "a,0,0,-80\n", {"devices": "nowhere.csv"}, "nowhere.csv does not exist"),
+    ({}, "a,0,0,-80\n", {"wide": [{"level": "x", "receiver": "*"}]}, "cannot both be given"),
+    ({"level": None}, "a,0,0,-80\n", {"wide": [{"level": "no*", "receiver": "*"}]}, "no column fits 'no\\*'"),
+    ({"level": None}, "a,0,0,-80\n", {"wide": [{"level": ["x", "*"], "receiver": "*"}]}, "'x' fits two"),
+    ({"level": None}, "a,0,0,-80\n", {"wide": [{"level": "x"}]}, "needs either receiver or device"),
+])
+def test_what_cannot_be_imported(bring_in, local, tmp_path, columns, text, given, message):
+    mapping = {name: spec for name, spec in (local | columns).items() if spec}
+    with pytest.raises(BadInput, match=message):
+        bring_in(HEAD + text, **{"columns": mapping, "length_unit": "m"} | given)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("48,11\n1000,11\n", r"row 3, column lat: '1000.0' is no latitude; allowed are -90 to 90"),
+    ("48,11\n48,400\n", r"row 3, column lon: '400.0' is no longitude"),
+    ("-111.8,40.7\n-111.9,40.8\n", r"row 2, column lat.*swapped"),
+])
+def test_degrees_that_are_none(bring_in, text, message):
+    rows = "".join(f"a,-80,{line}\n" for line in text.split())
+    with pytest.raises(BadInput, match=message):
+        bring_in("cell,level,lat,lon\n" + rows,
+                 columns={"device": "cell", "latitude": "lat", "longitude": "lon", "level": "level"})
+
+
+@pytest.mark.parametrize(("table", "message"), [
+    ("name,x,y\na,1,2\n", r"column 'device'.*is missing"),
+    ("device,x,y\na,1,2\na,1,2\n", "row 3, column device: 'a' stands there twice"),
+    ("device,height\na,1\n", "there is no position"),
+    ("device,latitude,longitude\na,95,2\n", "row 2, column latitude: '95' is no latitude"),
+    ("device,x,y,frequency_hz\na,1,2,2.4\n", "row 2, column frequency_hz: '2.4' is no frequency"),
+])
+def test_tables_of_places_that_cannot_be_used(bring_in, local, tmp_path, table, message):
+    (tmp_path / "sites.csv").write_text(table)
+    with pytest.raises(BadInput, match=message):
+        bring_in(HEAD + "a,0,0,-80\n", columns=local, length_unit="m", devices=str(tmp_path / "sites.csv"))
+
+
+def test_another_folder_is_not_replaced(bring_in, local, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").write_text("years")
+    with pytest.raises(BadInput, match="not empty and not an earlier import .it has thesis.tex"):
+        bring_in(HEAD + "a,0,0,-80\n", columns=local, length_unit="m")
+    (tmp_path / "out" / "thesis.tex").rename(tmp_path / "out" / "measurements.csv")
+    with pytest.raises(BadInput, match="not empty and not an earlier import"):
+        bring_in(HEAD + "a,0,0,-80\n", columns=local, length_unit="m")
+
+
+def test_pairs_of_the_command_line():
+    assert parse_columns("latitude=lat, level=RSRP (dBm)") == {"latitude": "lat", "level": "RSRP (dBm)"}
+    for text in ("latitude", "latitude=", "x=a,x=b"):
+        with pytest.raises(BadInput, match="NAME=COLUMN"):
+            parse_columns(text)
+
+
+def test_options_overrule_the_file_and_tables_lie_beside_it(tmp_path):
+    (tmp_path / "m.toml").write_text('devices = "sites.csv"\naverage_m = 3\n[columns]\nlevel = "l"\ndevice = "d"\n')
+    settings = read_settings(tmp_path / "m.toml", {"average_m": 5.0})
+    assert settings.average_m == 5 and settings.devices == str(tmp_path / "sites.csv") and np.isscalar(settings.average)
+    for text, message in (("devices = [", "is not TOML"), ("colour = 1", "m.toml: colour: unknown")):
+        (tmp_path / "m.toml").write_text(text)
+        with pytest.raises(BadInput, match=message):
+            read_settings(tmp_path / "m.toml", {})
+    with pytest.raises(BadInput, match="none.toml cannot be read"):
+        read_settings(tmp_path / "none.toml", {})
