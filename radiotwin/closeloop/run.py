@@ -11,6 +11,7 @@ from radiotwin.channel.likelihood import mean_if_detected
 from radiotwin.channel.log_distance import LogDistance
 from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.closeloop.bases import Base, LogDistanceBase, RaytraceBase, TwinBase
+from radiotwin.closeloop.between_flights import search_between_flights
 from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.records import Records, make_records
 from radiotwin.closeloop.search import Model, Search, add_shadowing, make_model, rmse_db, search_effects
@@ -117,6 +118,7 @@ def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed:
     drivers_before = _drivers(before, seed)
     search = Search(before)
     search_effects(search, [effect() for effect in CATALOGUE], seed, tell)
+    search_between_flights(search, bases[best], folds, seed, tell)
     tell("looking at what is left")
     drivers_after = _drivers(search.model, seed) if search.model is not before else drivers_before
     if significant(drivers_after):

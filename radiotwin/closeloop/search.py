@@ -163,6 +163,12 @@ class Search:
     log: list[Judged] = field(default_factory=list)
     rivals: list[list[str]] = field(default_factory=list)
 
+    def keep(self, judged: Judged, model: Model) -> None:
+        """Take over a model with one more effect."""
+        self.model = model
+        self.log.append(replace(judged, kept=True))
+        self.rivals.append([])
+
 
 def search_effects(result: Search, catalogue: list[Effect], seed: int, tell: Callable[[str], None]) -> None:
     """Add to the model the effect that gains most, and again, until none passes."""
@@ -180,7 +186,7 @@ def search_effects(result: Search, catalogue: list[Effect], seed: int, tell: Cal
             tell(f"step {step + 1}: {effect.name}")
             if not effect.repeatable and any(part.effect is effect for part in result.model.whole.parts):
                 continue
-            look = _look(result.model, effect, step)
+            look = look_at(result.model, effect, step)
             if isinstance(look, Judged):
                 result.log.append(look)
             else:
@@ -191,7 +197,7 @@ def search_effects(result: Search, catalogue: list[Effect], seed: int, tell: Cal
                 tell(f"step {step + 1}: {look.effect.name}, held out")
                 # One more of a kind needs no correction: that there is such a thing here has been shown already.
                 more = any(part.effect is look.effect for part in result.model.whole.parts)
-                judged, extended = _judge(result.model, look, block, 1 if more else len(available), step, seed)
+                judged, extended = judge(result.model, look, block, 1 if more else len(available), step, seed)
             else:
                 judged, extended = Judged(look.effect.name, False, (
                     f"{better[1].name} gains more on held-out links than this on those that it is fitted to "
@@ -246,10 +252,10 @@ def _several(effect: Effect, judged: Judged, extended: Model, block: np.ndarray,
     it does not."""
     steps = [(judged, extended)]
     while len(extended.whole.parts) < MOST_EFFECTS and len(steps) < MOST_OF_A_KIND:
-        look = _look(extended, effect, judged.step + 1)
+        look = look_at(extended, effect, judged.step + 1)
         if isinstance(look, Judged):
             return None
-        judged, extended = _judge(extended, look, block, 1, judged.step + 1, seed)
+        judged, extended = judge(extended, look, block, 1, judged.step + 1, seed)
         if extended is None:
             return None
         steps.append((judged, extended))
@@ -281,7 +287,7 @@ def add_shadowing(search: Search, seed: int) -> None:
     search.log.append(judged)
 
 
-def _look(model: Model, effect: Effect, step: int) -> Look | Judged:
+def look_at(model: Model, effect: Effect, step: int) -> Look | Judged:
     """Fit a candidate to all links; what is said of it where that is enough to refuse it."""
     refused = Judged(effect.name, False, "", np.nan, np.nan, np.nan, step)
     whole = add(model.whole, effect, model.fits[0])
@@ -299,7 +305,7 @@ def _look(model: Model, effect: Effect, step: int) -> Look | Judged:
     return Look(effect, *whole, gain)
 
 
-def _judge(model: Model, look: Look, block: np.ndarray, tried: int, step: int, seed: int):
+def judge(model: Model, look: Look, block: np.ndarray, tried: int, step: int, seed: int):
     """Fit a candidate to each fold's links; what the others say of it, and the model with it where it passes."""
     sides, fits = [], [look.fit]
     for side, fit in zip(model.folds, model.fits[1:]):

@@ -59,6 +59,15 @@ def test_a_step_in_time_is_found_where_it_is(open_ground):
     assert value(report, "receiver_drift", "step_db[r1]") == pytest.approx(-6.0, abs=1.0)
 
 
+def test_a_step_after_the_first_flight_is_found_though_no_other_flight_tells_it(open_ground):
+    world = open_ground.fly(7)
+    world.gain_db[(world.receiver == 1) & (world.flight == 0)] += 12.0
+    report = run(open_ground.measured(world))
+    assert named(report) == ["receiver_drift"]
+    assert value(report, "receiver_drift", "step_db[r1]") == pytest.approx(-12.0, abs=1.0)
+    assert 59 <= value(report, "receiver_drift", "step_time_s[r1]") <= 200
+
+
 def test_what_no_effect_explains_is_filled_in_over_the_variable_that_it_depends_on(open_ground):
     world = open_ground.fly(8)
     world.gain_db += 6.0 * np.exp(-(((world.slot - 30) / 8.0) ** 2))  # nothing of the catalogue comes and goes so

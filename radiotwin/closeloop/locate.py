@@ -1,0 +1,134 @@
+"""Where devices of unknown position are, by the model that the loop has corrected: for networks without a 3D map, too.
+
+The posterior over the ground of each device by itself: the likelihood of its links (`regression`), with everything that
+was found of their receivers, and a level of the device's own that nobody knows (hand, pocket, battery), which is
+integrated out (Gauss and Hermite). Flat over the area; a coarse grid first, then a finer one where the probability is.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from radiotwin.closeloop.model import Side
+from radiotwin.closeloop.records import Records
+from radiotwin.closeloop.regression import Solution, nll_at, residual_db
+
+COARSE_CELLS = 1500
+FINER = 4  # times
+MOST_FINE = 40  # coarse cells that are looked at again
+LEAST_SHARE = 1e-4
+NODES = 7
+CREDIBLE = 0.9
+LEAST_LINKS = 3
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a device may be.
+
+    Attributes:
+        device: row of the records' devices.
+        x_m, y_m: the place of least expected distance.
+        radius_m: around it, of 90 % of the probability.
+        links: that tell it.
+    """
+
+    device: int
+    x_m: float
+    y_m: float
+    radius_m: float
+    links: int
+
+
+def locate(side: Side, fit: Solution, records: Records, area_m: tuple[float, float, float, float],
+           tell: Callable[[], None] = lambda: None) -> Iterator[Place]:
+    """Find the devices of some links, whatever position they have in the records but for their height.
+
+    Args:
+        side, fit: the corrected model; `records` count their receivers as it does.
+        records: links of the devices.
+        area_m: west, east, south and north end of where they may be.
+        tell: called after each device.
+    """
+    spread_db = device_spread_db(side, fit)
+    west, east, south, north = area_m
+    width_m = max(np.sqrt((east - west) * (north - south) / COARSE_CELLS), 1.0)
+    coarse_m = _grid(west, east, south, north, width_m)
+    for device in np.unique(records.device):
+        mine = records.select(records.device == device)
+        if len(mine) < LEAST_LINKS:
+            tell()
+            continue
+        coarse = _share(_log_likelihood(side, fit, mine, coarse_m, spread_db))
+        best = np.argsort(-coarse)[:MOST_FINE]
+        best = best[coarse[best] > LEAST_SHARE * coarse[best[0]]]
+        steps_m = (np.arange(FINER) + 0.5) * width_m / FINER - width_m / 2
+        around_m = np.stack(np.meshgrid(steps_m, steps_m), axis=-1).reshape(-1, 2)
+        fine_m = (coarse_m[best, None] + around_m).reshape(-1, 2)
+        share = _share(_log_likelihood(side, fit, mine, fine_m, spread_db))
+        yield _place(int(device), fine_m, share, width_m / FINER, len(mine))
+        tell()
+
+
+def device_spread_db(side: Side, fit: Solution) -> float:
+    """Standard deviation of what the training links of a device have in common [dB], beyond what single links make of
+    their mean (method of moments)."""
+    problem = side.problem(side.train)
+    seen = np.isfinite(problem.level_db)
+    rest_db, scale_db = residual_db(problem, fit)[seen], fit.scale_db[problem.group][seen]
+    device = side.records.device[side.train][seen]
+    rest_db = np.clip(rest_db, -4 * scale_db, 4 * scale_db)
+    count = np.bincount(device)
+    enough = count >= LEAST_LINKS
+    if enough.sum() < LEAST_LINKS:
+        return 0.0
+    mean_db = np.bincount(device, weights=rest_db)[enough] / count[enough]
+    within = np.bincount(device, weights=rest_db**2)[enough] / count[enough] - mean_db**2
+    noise = (within / (count[enough] - 1)).mean()
+    return float(np.sqrt(max(mean_db.var() - noise, 0.0)))
+
+
+def _log_likelihood(side: Side, fit: Solution, mine: Records, places_m: np.ndarray, spread_db: float) -> np.ndarray:
+    """(c,) of the links of one device, if it stood at places (c, 2)."""
+    links, cells = len(mine), len(places_m)
+    height_m = mine.device_m[mine.device[0], 2]
+    known = side.records.device_m
+    rows = np.tile(np.arange(links), cells)
+    every = replace(
+        mine.select(rows),
+        device=len(known) + np.repeat(np.arange(cells), links),
+        device_m=np.vstack([known, np.column_stack([places_m, np.full(cells, height_m)])]))
+    every.__dict__["first_s"] = side.records.first_s
+    every.__dict__["time_in_flight_s"] = mine.time_in_flight_s[rows]
+    everything = np.ones(len(every), dtype=bool)
+    there = replace(side, records=every, train=everything, usable=everything, base_db=side.base.mean_db(every),
+                    base_columns=side.base.columns(every)[0], group=side.base.group(every), parts=[])
+    there = there.with_parts([there.part(part.effect, part.setting) for part in side.parts])
+    problem = there.problem(slice(None))
+    nodes, weights = np.polynomial.hermite_e.hermegauss(NODES if spread_db > 0 else 1)
+    values = []
+    for node, weight in zip(nodes, weights / weights.sum()):
+        moved = replace(problem, gain_db=problem.gain_db + node * spread_db)
+        nll = nll_at(moved, moved.mean(fit.coefficients)[0], fit.scale_db[problem.group])
+        values.append(np.log(weight) - nll.reshape(cells, links).sum(axis=1))
+    return np.logaddexp.reduce(values, axis=0)
+
+
+def _share(log_likelihood: np.ndarray) -> np.ndarray:
+    share = np.exp(log_likelihood - log_likelihood.max())
+    return share / share.sum()
+
+
+def _place(device: int, places_m: np.ndarray, share: np.ndarray, width_m: float, links: int) -> Place:
+    apart_m = np.linalg.norm(places_m[:, None] - places_m[None], axis=2)
+    best = int((apart_m @ share).argmin())
+    order = np.argsort(apart_m[best])
+    reached = np.searchsorted(np.cumsum(share[order]), CREDIBLE)
+    radius_m = apart_m[best][order[min(reached, len(order) - 1)]] + width_m / 2
+    return Place(device, *map(float, places_m[best]), float(radius_m), links)
+
+
+def _grid(west: float, east: float, south: float, north: float, width_m: float) -> np.ndarray:
+    x, y = (np.arange(low + width_m / 2, high + width_m / 2, width_m) for low, high in ((west, east), (south, north)))
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
