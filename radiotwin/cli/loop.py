@@ -11,6 +11,7 @@ from radiotwin.cli.model import MeasurementFile
 
 def add_commands(app: typer.Typer) -> None:
     app.command("close-loop")(close_loop)
+    app.command("locate")(locate)
 
 
 def close_loop(
@@ -53,8 +54,7 @@ def close_loop(
     report = make_report(loop)
     draw_figures(loop, world, report, out)
     write_report(report, out / "closeloop.json")
-    if world is not None:
-        corrected_twin(loop, world).save(out / "twin")
+    corrected_twin(loop, world).save(out / "twin")
     write_page(report, out, f"What the model of {measurements.name} lacks")
     for remark in report["remarks"]:
         say(f"note: {remark}")
@@ -77,3 +77,42 @@ def close_loop(
         changes = write_corrected_scene(loop, world, write_scene)
         say(f"wrote {write_scene}: {'; '.join(changes)}" if changes else
             f"{write_scene} is not written: no building and no anchor was found to be wrong in {scene}")
+
+
+def locate(
+    measurements: MeasurementFile,
+    twin: Annotated[Path, typer.Option(help="Corrected twin: the folder twin of what close-loop wrote.")],
+    scene: Annotated[Path | None, typer.Option(help="Scene folder; without one every link has line of sight.")] = None,
+    devices: Annotated[Path | None, typer.Option(help="Table of devices [devices.csv beside the file].")] = None,
+    truth: Annotated[Path | None, typer.Option(help="Table of devices with their true positions, to say how far off "
+                                                    "the places are.")] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Table of the places.")] = Path("located.csv"),
+) -> None:
+    """Find devices of role unknown by a corrected model, with or without a 3D map."""
+    from radiotwin.closeloop.corrected import corrected_model
+    from radiotwin.closeloop.locate_file import locate_file, off_by
+    from radiotwin.files import atomic_path, require_writable
+    from radiotwin.measurements import read_devices, read_measurements
+    from radiotwin.progress import progress
+    from radiotwin.scene import Scene
+    from radiotwin.twin import Twin
+
+    show_warnings_plainly()
+    data, known = read_measurements(measurements, devices), Twin.load(twin)
+    true = read_devices(truth) if truth else None
+    require_writable(out)
+    unknown = int((data.devices["role"] == "unknown").sum())
+    with progress("locating", total=unknown) as advance:
+        places, remarks = locate_file(data, known, corrected_model(known), Scene.load(scene) if scene else None,
+                                      lambda: advance(1))
+    for remark in remarks:
+        say(f"note: {remark}")
+    with atomic_path(out) as temporary:
+        places.to_csv(temporary, index=False)
+    if true is not None:
+        error = off_by(places, true)
+        print_rows("How far off [m]", {"devices": "right", "median": "right", "90 %": "right",
+                                       "within the 90 % radius": "right"},
+                   [[error["devices"], error["median_m"], error["ninety_m"], f"{error['within']:.0%}"]])
+    say(f"wrote {out}: {len(places)} of {unknown} unknown devices; half of the 90 % radii are below "
+        f"{places['radius_m'].median():.0f} m")

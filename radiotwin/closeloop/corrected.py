@@ -4,7 +4,9 @@ import numpy as np
 
 import radiotwin
 from radiotwin.closeloop.bases import FittedBase, FittedChannel, FittedPaths
+from radiotwin.closeloop.locate import Corrected, device_spread_db
 from radiotwin.closeloop.records import Records
+from radiotwin.closeloop.regression import Solution
 from radiotwin.closeloop.run import Loop
 from radiotwin.closeloop.shadowing import Shadowing
 from radiotwin.effects import CATALOGUE
@@ -18,7 +20,7 @@ from radiotwin.twin import Twin, TwinDevice
 CHUNK = 20_000  # links at once
 
 
-def corrected_twin(loop: Loop, scene: Scene) -> Twin:
+def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     """The twin of a loop, fitted to all its links, with all effects.
 
     What belongs to a receiver (its offset, drift, antenna, …) is kept in the record, too, but a map is of what arrives
@@ -35,13 +37,16 @@ def corrected_twin(loop: Loop, scene: Scene) -> Twin:
                           bool(sure), 0.0 if i in records.anchors else np.inf, None)
                for i, (name, place_m, sure) in enumerate(zip(records.device_names, law.device_m, located))]
     effects = {"base": loop.base, "coefficients": fit.coefficients[:split].tolist(), "dof": whole.dof,
-               "scale_db": fit.scale_db.tolist(), "receivers": records.receiver_names, "parts": parts}
+               "scale_db": fit.scale_db.tolist(), "receivers": records.receiver_names, "parts": parts,
+               "first_s": None if np.isnan(records.first_s) else records.first_s,
+               "device_spread_db": device_spread_db(whole, fit)}
     if isinstance(law, FittedPaths):
         effects["rest"] = list(law.rest)
     if loop.after.shadowing:
         effects["shadowing"] = loop.after.shadowing[0].state()
-    provenance = {"scene": scene.config.name, "scene_hash": scene.content_hash(), "links": len(records),
-                  "radiotwin_version": radiotwin.__version__}
+    provenance = {"links": len(records), "radiotwin_version": radiotwin.__version__}
+    if scene is not None:
+        provenance |= {"scene": scene.config.name, "scene_hash": scene.content_hash()}
     return Twin(_channel(law), devices, "gain_db" if records.is_gain else "rssi_dbm", records.limit_db, provenance,
                 effects)
 
@@ -84,6 +89,27 @@ def corrected_map(twin: Twin, scene: Scene) -> RadioMap:
                   "frequency_hz": scene.config.radio.frequency_hz, "gain_limit_db": scene.config.gain_limit_db,
                   "scene_hash": scene.content_hash(), "radiotwin_version": radiotwin.__version__}
     return RadioMap.build([twin.devices[i].device for i in known], scene.lattice, mean_db, los, sigma_db, attributes)
+
+
+def corrected_model(twin: Twin) -> Corrected:
+    """What `locate` needs of a twin with effects.
+
+    Raises:
+        BadInput: no effects, or some that this version does not know, or a base that follows paths.
+    """
+    found = twin.effects
+    if not found or "device_spread_db" not in found:
+        raise BadInput("the twin was not made by `radiotwin close-loop`, or by an earlier version of it; run that on "
+                       "measurements of devices whose positions are known")
+    if found["base"] == "raytrace":
+        raise BadInput("the twin's base is 'raytrace', and to follow paths from every place where a device may be "
+                       "takes too long; close the loop with --base twin")
+    parts = [(_effect(part["name"], part["variant"]), part) for part in found["parts"]]
+    coefficients = np.concatenate([found["coefficients"], *(part["coefficients"] for _, part in parts)])
+    solution = Solution(coefficients, np.array(found["scale_db"]), np.nan)
+    return Corrected(FittedChannel(twin.channel, twin.device_m), [(effect, part["setting"]) for effect, part in parts],
+                     solution, found["dof"], np.nan_to_num(twin.device_m),
+                     np.nan if found["first_s"] is None else found["first_s"], found["device_spread_db"])
 
 
 def _mean_db(base: FittedBase, records: Records, coefficients: np.ndarray,

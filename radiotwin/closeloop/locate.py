@@ -10,9 +10,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from radiotwin.closeloop.bases import FittedBase
 from radiotwin.closeloop.model import Side
 from radiotwin.closeloop.records import Records
 from radiotwin.closeloop.regression import Solution, nll_at, residual_db
+from radiotwin.effects.base import Effect, Setting
 
 COARSE_CELLS = 1500
 FINER = 4  # times
@@ -41,17 +43,42 @@ class Place:
     links: int
 
 
-def locate(side: Side, fit: Solution, records: Records, area_m: tuple[float, float, float, float],
+@dataclass(frozen=True, eq=False)
+class Corrected:
+    """A base with effects, ready for links of devices that it does not know.
+
+    Attributes:
+        base, effects, solution, dof: as fitted.
+        device_m: (k, 3) positions of the devices that it knows; effects count devices by their rows.
+        first_s: time of the first measurement that it was fitted to [s].
+        device_spread_db: see `device_spread_db`.
+    """
+
+    base: FittedBase
+    effects: list[tuple[Effect, Setting]]
+    solution: Solution
+    dof: float
+    device_m: np.ndarray
+    first_s: float
+    device_spread_db: float
+
+    @classmethod
+    def of(cls, side: Side, fit: Solution) -> "Corrected":
+        """What was learned from the training links of a side."""
+        return cls(side.base, [(part.effect, part.setting) for part in side.parts], fit, side.dof,
+                   side.records.device_m, side.records.first_s, device_spread_db(side, fit))
+
+
+def locate(model: Corrected, records: Records, area_m: tuple[float, float, float, float],
            tell: Callable[[], None] = lambda: None) -> Iterator[Place]:
     """Find the devices of some links, whatever position they have in the records but for their height.
 
     Args:
-        side, fit: the corrected model; `records` count their receivers as it does.
+        model: counts receivers as `records` do.
         records: links of the devices.
         area_m: west, east, south and north end of where they may be.
         tell: called after each device.
     """
-    spread_db = device_spread_db(side, fit)
     west, east, south, north = area_m
     width_m = max(np.sqrt((east - west) * (north - south) / COARSE_CELLS), 1.0)
     coarse_m = _grid(west, east, south, north, width_m)
@@ -60,13 +87,13 @@ def locate(side: Side, fit: Solution, records: Records, area_m: tuple[float, flo
         if len(mine) < LEAST_LINKS:
             tell()
             continue
-        coarse = _share(_log_likelihood(side, fit, mine, coarse_m, spread_db))
+        coarse = _share(_log_likelihood(model, mine, coarse_m))
         best = np.argsort(-coarse)[:MOST_FINE]
         best = best[coarse[best] > LEAST_SHARE * coarse[best[0]]]
         steps_m = (np.arange(FINER) + 0.5) * width_m / FINER - width_m / 2
         around_m = np.stack(np.meshgrid(steps_m, steps_m), axis=-1).reshape(-1, 2)
         fine_m = (coarse_m[best, None] + around_m).reshape(-1, 2)
-        share = _share(_log_likelihood(side, fit, mine, fine_m, spread_db))
+        share = _share(_log_likelihood(model, mine, fine_m))
         yield _place(int(device), fine_m, share, width_m / FINER, len(mine))
         tell()
 
@@ -89,28 +116,25 @@ def device_spread_db(side: Side, fit: Solution) -> float:
     return float(np.sqrt(max(mean_db.var() - noise, 0.0)))
 
 
-def _log_likelihood(side: Side, fit: Solution, mine: Records, places_m: np.ndarray, spread_db: float) -> np.ndarray:
+def _log_likelihood(model: Corrected, mine: Records, places_m: np.ndarray) -> np.ndarray:
     """(c,) of the links of one device, if it stood at places (c, 2)."""
-    links, cells = len(mine), len(places_m)
+    links, cells, spread_db = len(mine), len(places_m), model.device_spread_db
     height_m = mine.device_m[mine.device[0], 2]
-    known = side.records.device_m
     rows = np.tile(np.arange(links), cells)
     every = replace(
-        mine.select(rows),
-        device=len(known) + np.repeat(np.arange(cells), links),
-        device_m=np.vstack([known, np.column_stack([places_m, np.full(cells, height_m)])]))
-    every.__dict__["first_s"] = side.records.first_s
+        mine.select(rows), device=len(model.device_m) + np.repeat(np.arange(cells), links),
+        device_m=np.vstack([model.device_m, np.column_stack([places_m, np.full(cells, height_m)])]))
+    every.__dict__["first_s"] = model.first_s
     every.__dict__["time_in_flight_s"] = mine.time_in_flight_s[rows]
-    everything = np.ones(len(every), dtype=bool)
-    there = replace(side, records=every, train=everything, usable=everything, base_db=side.base.mean_db(every),
-                    base_columns=side.base.columns(every)[0], group=side.base.group(every), parts=[])
-    there = there.with_parts([there.part(part.effect, part.setting) for part in side.parts])
-    problem = there.problem(slice(None))
+    everything, base = np.ones(len(every), dtype=bool), model.base
+    side = Side(every, everything, everything, base, base.mean_db(every), *base.columns(every), base.group(every),
+                model.dof)
+    problem = side.with_parts([side.part(*each) for each in model.effects]).problem(slice(None))
     nodes, weights = np.polynomial.hermite_e.hermegauss(NODES if spread_db > 0 else 1)
     values = []
     for node, weight in zip(nodes, weights / weights.sum()):
         moved = replace(problem, gain_db=problem.gain_db + node * spread_db)
-        nll = nll_at(moved, moved.mean(fit.coefficients)[0], fit.scale_db[problem.group])
+        nll = nll_at(moved, moved.mean(model.solution.coefficients)[0], model.solution.scale_db[problem.group])
         values.append(np.log(weight) - nll.reshape(cells, links).sum(axis=1))
     return np.logaddexp.reduce(values, axis=0)
 

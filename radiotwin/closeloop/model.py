@@ -15,6 +15,7 @@ from radiotwin.effects.base import Effect, Found, Setting, Term, Variation, View
 TRIALS = 25  # for each number of a setting, while it is refined
 DESCENTS = 2  # a simplex that has collapsed too early starts anew
 REFINED_ON = 5000  # links at most
+MEMBER_REFINED_ON = 1500  # of each member
 MOST_FITS = 2  # of proposals of one effect
 WORTH_REFINING_NATS = 5.0
 LEAST_RISE_NATS = 1e-3
@@ -271,7 +272,7 @@ def _refine_members(side: Side, fitted: Solution, part: Part, variation: Variati
         moved[member] += variation.steps[member]
         rows = np.flatnonzero(side.train)
         trained = side.records.select(rows)
-        rows = some(rows[level_db(trained, moved) != level_db(trained, numbers)], REFINED_ON)
+        rows = some(rows[level_db(trained, moved) != level_db(trained, numbers)], MEMBER_REFINED_ON)
         if not len(rows):
             continue
         mine, others = side.records.select(rows), [replace(p, term=p.term.select(rows)) for p in side.parts[:-1]]

@@ -185,8 +185,13 @@ class Records:
         return other
 
 
-def make_records(measurements: Measurements, scene: Scene | None) -> Records:
+def make_records(measurements: Measurements, scene: Scene | None, unplaced: bool = False) -> Records:
     """Prepare measurements: what cannot be used is left out and told.
+
+    Args:
+        measurements: links.
+        scene: the 3D map and the radio, if there is one.
+        unplaced: whether devices of unknown position are kept where there is no scene.
 
     Raises:
         BadInput: nothing that can be used is left, or positions or levels that cannot be what they are said to be.
@@ -220,7 +225,7 @@ def make_records(measurements: Measurements, scene: Scene | None) -> Records:
     flat = np.isnan(measurements.device_m[:, 2]).sum()
     if flat:
         remarks.append(f"{flat:,} device heights are empty and taken for {MISSING_HEIGHT_M} m")
-    placed = np.isfinite(device_m).all(axis=1) | (scene is not None)
+    placed = np.isfinite(device_m).all(axis=1) | (scene is not None) | unplaced
     leave_out(~placed[device_index], "without a scene, devices of unknown position cannot be located")
     for bad, why in useless_receivers(table, level_db, keep):
         leave_out(bad, why)

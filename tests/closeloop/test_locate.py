@@ -1,0 +1,92 @@
+"""Devices are found by the corrected model: where they are, how surely, and better than by the uncorrected one."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.closeloop.corrected import corrected_twin
+from radiotwin.closeloop.locate import Corrected, locate
+from radiotwin.closeloop.run import close_loop
+from radiotwin.measurements import Measurements
+
+COMMAND = Path(sys.executable).with_name("radiotwin")
+AREA_M = (-200.0, 700.0, -200.0, 700.0)
+
+
+def run(*words):
+    return subprocess.run([str(word) for word in (COMMAND, *words)], capture_output=True, text=True, timeout=300)
+
+
+def loop_of(world, open_ground):
+    return close_loop(open_ground.measured(world), None, "log-distance", 0, lambda text: None)
+
+
+def off_m(model, records, truth_m):
+    places = list(locate(model, records, AREA_M))
+    return np.array([[np.hypot(p.x_m - truth_m[p.device, 0], p.y_m - truth_m[p.device, 1]), p.radius_m]
+                     for p in places])
+
+
+def few_links(records, rng, links):
+    """Every device with links of its own only, few of them."""
+    rows = [rng.choice(np.flatnonzero(records.device == device), links, replace=False)
+            for device in range(len(records.device_names))]
+    return records.select(np.concatenate(rows))
+
+
+def test_what_is_known_of_receivers_brings_devices_nearer_and_the_radii_hold_nine_in_ten(open_ground):
+    world = open_ground.fly(11)
+    world.gain_db[world.receiver == 1] += 12.0
+    loop = loop_of(world, open_ground)
+    before = Corrected.of(loop.before.whole, loop.before.fits[0])
+    after = Corrected.of(loop.after.whole, loop.after.fits[0])
+    rng, results = np.random.default_rng(0), {"before": [], "after": []}
+    for _ in range(12):
+        part = few_links(loop.records, rng, 20)
+        for name, model in (("before", before), ("after", after)):
+            results[name].append(off_m(model, part, world.device_m))
+    before_m, after_m = (np.vstack(results[name]) for name in ("before", "after"))
+    assert np.median(after_m[:, 0]) < 0.6 * np.median(before_m[:, 0])
+    assert 0.75 <= (after_m[:, 0] <= after_m[:, 1]).mean() <= 1.0  # 60 places: 0.9 +- 2 * 0.04, and the grid
+    assert np.median(after_m[:, 1]) < 60.0
+
+
+def test_the_command_finds_an_unknown_device_and_says_how_far_off_it_is(tmp_path, open_ground):
+    world = open_ground.fly(12)
+    world.gain_db[world.receiver == 0] -= 6.0
+    data = open_ground.measured(world)
+    hidden = data.devices.copy()
+    hidden.loc[4, ["x_m", "y_m"]] = np.nan
+    hidden.loc[4, "role"] = "unknown"
+    Measurements(data.table, hidden).write(tmp_path / "flight" / "measurements.csv")
+    data.devices.to_csv(tmp_path / "truth.csv", index=False)
+    done = run("close-loop", tmp_path / "flight" / "measurements.csv", "-o", tmp_path / "loop")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "loop" / "closeloop.json").read_text())
+    assert report["effects"][0]["name"] == "receiver_gain_offset"
+    done = run("locate", tmp_path / "flight" / "measurements.csv", "--twin", tmp_path / "loop" / "twin",
+                   "--truth", tmp_path / "truth.csv", "-o", tmp_path / "located.csv")
+    assert done.returncode == 0, done.stderr
+    place = pd.read_csv(tmp_path / "located.csv").iloc[0]
+    assert place["device"] == "d4" and place["links"] == 720
+    assert np.hypot(place["x_m"] - world.device_m[4, 0], place["y_m"] - world.device_m[4, 1]) < 15.0
+    assert "wrote" in done.stdout and "How far off" in done.stdout
+
+
+@pytest.mark.parametrize("role, twin, message", [
+    ("anchor", "loop/twin", "role unknown"), ("unknown", "nowhere", "not a twin")])
+def test_bad_input_is_one_message(tmp_path, open_ground, role, twin, message):
+    data = open_ground.measured(open_ground.fly(13))
+    data.write(tmp_path / "flight" / "measurements.csv")
+    if role == "anchor":
+        loop = close_loop(data, None, "log-distance", 0, lambda text: None)
+        corrected_twin(loop, None).save(tmp_path / "loop" / "twin")
+    done = run("locate", tmp_path / "flight" / "measurements.csv", "--twin", tmp_path / twin,
+                   "-o", tmp_path / "located.csv")
+    assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
+    assert not (tmp_path / "located.csv").exists()
