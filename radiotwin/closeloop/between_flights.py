@@ -18,8 +18,8 @@ from radiotwin.effects.receiver_drift import ReceiverDrift
 
 def search_between_flights(search: Search, base: Base, folds: Folds, seed: int, tell: Callable[[str], None]) -> None:
     """Add receivers' steps in time to a model whose folds are flights, one after the other, until none passes."""
-    effect, records = ReceiverDrift(), search.model.whole.records
-    if folds.by != "flight" or effect.lacks(records) or not _is_step(look_at(search.model, effect, 0)):
+    effect, records = ReceiverDrift(steps_only=True), search.model.whole.records
+    if folds.by != "flight" or effect.lacks(records) or not isinstance(look_at(search.model, effect, 0), Look):
         return
     tell("receiver_drift, held out by block")
     model = make_model(records, base, make_folds(records, seed, "block"))
@@ -29,7 +29,7 @@ def search_between_flights(search: Search, base: Base, folds: Folds, seed: int, 
     while len(search.model.whole.parts) < MOST_EFFECTS:
         step = len(search.model.whole.parts)
         look = look_at(model, effect, step)
-        if not _is_step(look):
+        if not isinstance(look, Look):
             return
         judged, extended = judge(model, look, block, 1, step, seed)
         if extended is None:
@@ -37,11 +37,6 @@ def search_between_flights(search: Search, base: Base, folds: Folds, seed: int, 
             return
         model = extended
         search.keep(judged, _with(search.model, effect, look.whole.parts[-1].setting))
-
-
-def _is_step(look) -> bool:
-    return isinstance(look, Look) and all(
-        form == "step" for form, _ in look.whole.parts[-1].setting["receivers"].values())
 
 
 def _with(model: Model, effect: Effect, setting: Setting) -> Model:

@@ -173,14 +173,20 @@ def _lost(parts: list[Part], records: Records | None) -> np.ndarray | float:
     return 1.0 - kept
 
 
-def add(side: Side, effect: Effect, solution: Solution) -> tuple[Side, Solution] | None:
+def add(side: Side, effect: Effect, solution: Solution, like: Setting | None = None) -> tuple[Side, Solution] | None:
     """Find the best setting of an effect on the training links of a side, beside the effects that it has.
+
+    Args:
+        side, effect: what is learned from, and what is added.
+        solution: the fit without it.
+        like: what was found on all links, where the side is a fold.
 
     Returns:
         the side with the effect, and its fit; None where nothing in the residual looks like the effect
     """
     view = side.view(solution)
-    parts = [side.part(effect, setting) for setting in effect.propose(view)]
+    parts = [side.part(effect, setting) for setting in
+             (effect.propose(view) if like is None else effect.propose_like(view, like))]
     if effect.stage == "gain" and len(parts) > MOST_FITS:  # the others do not say what they add to a residual
         parts = sorted(parts, key=lambda part: -view.score(part.term.select(side.train)))[:MOST_FITS]
     best = None

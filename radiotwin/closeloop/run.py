@@ -26,6 +26,7 @@ from radiotwin.scene import Scene
 BASES = ("twin", "raytrace", "log-distance")
 STRUCTURED = 0.01
 LEAST_EFFECT_DB = 0.5  # a dependence that is weaker is of no use to anybody
+MOST_TRENDS = 4  # variables, the strongest drivers
 MOST_FOR_KRIGING = 30_000
 
 
@@ -122,7 +123,8 @@ def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed:
     tell("looking at what is left")
     drivers_after = _drivers(search.model, seed) if search.model is not before else drivers_before
     if significant(drivers_after):
-        search_effects(search, [UnexplainedTrend(driver.variable) for driver in significant(drivers_after)], seed, tell)
+        trends = [UnexplainedTrend(driver.variable) for driver in significant(drivers_after)]
+        search_effects(search, [trend for trend in trends if trend.lacks(records) is None][:MOST_TRENDS], seed, tell)
         tell("correlated_shadowing")
         add_shadowing(search, seed)
     tell("other models")

@@ -309,7 +309,7 @@ def judge(model: Model, look: Look, block: np.ndarray, tried: int, step: int, se
     """Fit a candidate to each fold's links; what the others say of it, and the model with it where it passes."""
     sides, fits = [], [look.fit]
     for side, fit in zip(model.folds, model.fits[1:]):
-        added = add(side, look.effect, fit) or (side, fit)
+        added = add(side, look.effect, fit, look.whole.parts[-1].setting) or (side, fit)
         sides.append(added[0])
         fits.append(added[1])
     extended = Model(look.whole, sides, fits, model.index)

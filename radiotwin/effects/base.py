@@ -177,6 +177,10 @@ class Effect(ABC):
     def propose(self, view: View) -> list[Setting]:
         """Settings worth trying, best first; empty where nothing looks like this effect."""
 
+    def propose_like(self, view: View, setting: Setting) -> list[Setting]:
+        """The same for a part of the data, once all of it has proposed `setting`."""
+        return self.propose(view)
+
     @abstractmethod
     def term(self, records: Records, setting: Setting, at: Callable[..., np.ndarray]) -> Term:
         """What it adds to the mean level of links; `at` asks the base for the mean level of other records, such as with

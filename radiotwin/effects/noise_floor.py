@@ -9,6 +9,7 @@ import numpy as np
 from radiotwin.effects.base import LEAST_POWER, NEPERS, Effect, Parameter, Term, Variation, View, measured
 
 LEAST_LINKS = 40
+COMMON_QUANTILES = (0.03, 0.15)
 QUANTILES = (0.01, 0.05, 0.1, 0.2, 0.35, 0.5)
 
 
@@ -29,7 +30,12 @@ class NoiseFloor(Effect):
             found[str(receiver)] = max(
                 (-float(weight @ (residual + mean - floored(mean, floor)[0]) ** 2), float(floor))
                 for floor in np.quantile(records.level_db[rows], QUANTILES))[1]
-        return [{"receivers": found}] if found else []
+        if not found:
+            return []
+        # A law that was fitted without a floor is too flat, and asks for none: where it lies may have to be tried.
+        tried = [{receiver: float(np.nanquantile(records.level_db[records.receiver == int(receiver)], share))
+                  for receiver in found} for share in COMMON_QUANTILES]
+        return [{"receivers": floors} for floors in (found, *tried)]
 
     def term(self, records, setting, at) -> Term:
         return Term.of_offset(np.zeros(len(records)))

@@ -27,20 +27,31 @@ class ReceiverDrift(Effect):
     repeatable = True
     confused_with = ("receiver_gain_offset", "interference")
 
+    def __init__(self, steps_only: bool = False):
+        self._steps_only = steps_only
+
     def lacks(self, records) -> str | None:
         if np.isfinite(records.time_s).sum() < LEAST_LINKS:
             return "there is no time_s"
         return None
 
     def propose(self, view: View) -> list[dict]:
+        receivers = measured(view.records.receiver[np.isfinite(view.records.time_s)], LEAST_LINKS)
+        known = {int(receiver) for kept in view.done(self.name, "receivers") for receiver in kept}
+        return self._best(view, sorted(set(receivers) - known))
+
+    def propose_like(self, view: View, setting: dict) -> list[dict]:
+        # Whether this receiver drifts is the question, and not whether any does.
+        return self._best(view, [int(receiver) for receiver in setting["receivers"]])
+
+    def _best(self, view: View, receivers: list[int]) -> list[dict]:
         records, best = view.records, (LEAST_NATS, None)
-        known = {int(receiver) for receivers in view.done(self.name, "receivers") for receiver in receivers}
-        for receiver in sorted(set(measured(records.receiver[np.isfinite(records.time_s)], LEAST_LINKS)) - known):
+        for receiver in receivers:
             rows = np.flatnonzero((records.receiver == receiver) & np.isfinite(records.time_s))
             candidates = _forms(
                 (records.time_s - records.first_s)[rows], records.time_s[rows], records.time_in_flight_s[rows],
                 records.flight[rows], view.residual_db[rows], view.weight[rows])
-            nats, form, number = max(candidates)
+            nats, form, number = max(each for each in candidates if each[1] == "step" or not self._steps_only)
             if nats > best[0]:
                 best = nats, {"receivers": {str(receiver): [form, float(number)]}}
         return [best[1]] if best[1] else []
@@ -98,7 +109,7 @@ def _shape(form: str, number: float, since_first_s: np.ndarray, time_s: np.ndarr
 
 def _forms(since_first_s, time_s, time_in_flight_s, flight, residual_db, weight):
     """(nats, form, number) of each form that the times allow."""
-    yield 0.0, "ageing", float(time_s.mean())
+    yield 0.0, "step", float(time_s.mean())
 
     def nats(shape):
         centred = shape - weight @ shape / weight.sum()
