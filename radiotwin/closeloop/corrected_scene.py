@@ -11,7 +11,7 @@ import trimesh
 from radiotwin.closeloop.run import Loop
 from radiotwin.effects.boxes import Box
 from radiotwin.effects.missing_obstacle import MissingObstacle
-from radiotwin.effects.position_errors import DevicePositionError
+from radiotwin.effects.position_errors import DevicePositionError, site_of
 from radiotwin.effects.removed_obstacle import RemovedObstacle, buildings
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, require_writable
@@ -91,9 +91,9 @@ def _moved(loop: Loop, scene: Scene, city: CityMap | None) -> tuple[SceneConfig,
     found_m: dict[str, np.ndarray] = {}
     for part in loop.after.whole.parts:
         if isinstance(part.effect, DevicePositionError):
-            name = records.device_names[part.setting["device"]]
-            before_m = found_m.get(name, records.device_m[part.setting["device"], :2])
-            found_m[name] = before_m + part.setting["move_m"]
+            for device in site_of(records, part.setting["device"]):
+                name = records.device_names[device]
+                found_m[name] = found_m.get(name, records.device_m[device, :2]) + part.setting["move_m"]
     devices, changes = [], []
     for device in scene.config.devices:
         if device.device in found_m:

@@ -19,7 +19,7 @@ from radiotwin.closeloop.drawing import (
 )
 from radiotwin.closeloop.effect_figures import draw_effects
 from radiotwin.closeloop.folds import evidence_blocks
-from radiotwin.closeloop.map_figures import Ground, draw_residual_map
+from radiotwin.closeloop.map_figures import Ground, draw_level_map, draw_residual_map
 from radiotwin.closeloop.run import Loop, significant
 from radiotwin.closeloop.structure import variables
 from radiotwin.closeloop.words import LAST_RESORTS, plainly
@@ -37,6 +37,7 @@ def draw_figures(loop: Loop, scene: Scene | None, report: dict, folder: Path) ->
     ground = Ground(loop.after.whole.records, scene)
     draw_waterfall(report, folder / "waterfall.png")
     draw_residual_map(loop, ground, folder / "residual_map.png")
+    draw_level_map(loop, ground, folder / "level_map.png")
     draw_drivers(loop, folder / "drivers.png")
     draw_effects(loop, ground, folder)
 

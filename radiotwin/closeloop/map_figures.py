@@ -138,6 +138,32 @@ def draw_residual_map(loop: Loop, ground: Ground, path: Path) -> None:
     save(figure, path)
 
 
+def draw_level_map(loop: Loop, ground: Ground, path: Path) -> None:
+    """Mean level at the places of the end that moves: measured, as expected of held-out links, and the difference."""
+    records, mean_db = loop.after.whole.records, loop.after.held_out_mean_db()
+    seen = np.isfinite(records.level_db) & np.isfinite(mean_db)
+    if not seen.any():
+        return
+    levels_db = [np.where(seen, values, np.nan) for values in (records.level_db, mean_db)]
+    grids = [ground.cells(values) for values in (*levels_db, levels_db[0] - levels_db[1])]
+    known_db = grids[0][2][np.isfinite(grids[0][2])]
+    low_db, high_db = np.quantile(known_db, [0.02, 0.98]) if len(known_db) else (-1.0, 0.0)
+    most_db, unit = range_db(grids[2][2]), "gain [dB]" if records.is_gain else "received power [dBm]"
+    titles = ("measured", "predicted, held out", "measured − predicted")
+    figure = new_figure(15.6, ground.height_in(4.3) + 1.2)
+    for number, (grid, title) in enumerate(zip(grids, titles)):
+        ax = figure.add_subplot(1, 3, number + 1)
+        ground.draw(ax, labelled=number == 0)
+        colours = {"cmap": RESIDUAL_COLOURS, "vmin": -most_db, "vmax": most_db} if number == 2 else {
+            "cmap": "viridis", "vmin": low_db, "vmax": high_db}
+        image = ax.pcolormesh(*grid, zorder=2, alpha=0.9, linewidth=0, rasterized=True, **colours)
+        ax.set_title(title, fontsize=11)
+        figure.colorbar(image, ax=ax, shrink=0.85, extend="both", location="bottom",
+                        label="difference [dB]" if number == 2 else unit)
+    _legend(figure, f"mean of the links in a cell of {ground.cell_m:g} m")
+    save(figure, path)
+
+
 def draw_added(added_db: np.ndarray, ground: Ground, path: Path) -> None:
     """What an effect adds, on the map.
 

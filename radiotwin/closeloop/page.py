@@ -14,6 +14,8 @@ FIGURES = (
      "what each effect that was added takes off, and what is left. Thin lines: other models, held out alike."),
     ("residual_map.png", "Where the error is", "Measured minus predicted on held-out links, before and after. Red: "
      "measured less than predicted. What was found is drawn in purple."),
+    ("level_map.png", "Levels on the map", "Measured, predicted for the same links from others, and the difference, by "
+     "the place of the end that moves."),
     ("drivers.png", "What the error depends on", "Mean held-out residual against the variables that matter most, with "
      "one standard error; dashed: what the effects add to the prediction there."),
 )

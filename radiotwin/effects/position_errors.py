@@ -15,10 +15,11 @@ FARTHEST_M = 120.0
 MOST_DEVICES = 60
 RECEIVER_OFFSETS_M = (5.0, 10.0, 20.0)
 ENOUGH_LINKS = 600  # of a device, for a first look
+SAME_SITE_M = 1.0  # devices this close together are on one mast, and move together
 
 
 class DevicePositionError(Effect):
-    """An anchor stands elsewhere; one step finds one anchor, the worst."""
+    """An anchor stands elsewhere, and all that share its mast; one step finds one, the worst."""
 
     name = "device_position_error"
     repeatable = True
@@ -37,9 +38,11 @@ class DevicePositionError(Effect):
         records, best = view.records, (LEAST_NATS, None)
         moves = [(radius * np.sin(angle), radius * np.cos(angle)) for radius in RADII_M
                  for angle in np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS]
-        for device in sorted(set(_anchors(records)) - set(view.done(self.name, "device"))):
-            rows = some(np.flatnonzero(records.device == device), ENOUGH_LINKS)
-            mine, share = records.select(rows), (records.device == device).sum() / len(rows)
+        known = {other for device in view.done(self.name, "device") for other in site_of(records, device)}
+        for device in sorted({min(site_of(records, device)) for device in _anchors(records)} - known):
+            every = np.flatnonzero(np.isin(records.device, site_of(records, device)))
+            rows = some(every, ENOUGH_LINKS)
+            mine, share = records.select(rows), len(every) / len(rows)
             before_db = view.at(mine)
             for east, north in moves:
                 moved_db = view.at(_with_moved(mine, device, (east, north))) - before_db
@@ -50,7 +53,7 @@ class DevicePositionError(Effect):
 
     def term(self, records, setting, at) -> Term:
         offset_db = np.zeros(len(records))
-        rows = np.flatnonzero(records.device == setting["device"])
+        rows = np.flatnonzero(np.isin(records.device, site_of(records, setting["device"])))
         mine = records.select(rows)
         exact = setting.get("exact", False)
         offset_db[rows] = at(_with_moved(mine, setting["device"], setting["move_m"]), exact) - at(mine, exact)
@@ -64,9 +67,9 @@ class DevicePositionError(Effect):
                          lambda numbers: {"device": setting["device"], "move_m": [float(v) for v in numbers]})
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        name = records.device_names[setting["device"]]
         declared_m = records.device_m[setting["device"], :2]
-        return {f"{axis}_m[{name}]": Parameter.normal(declared + move, spread, "m") for axis, declared, move, spread in
+        return {f"{axis}_m[{records.device_names[device]}]": Parameter.normal(declared + move, spread, "m")
+                for device in site_of(records, setting["device"]) for axis, declared, move, spread in
                 zip("xy", declared_m, setting["move_m"], found.setting_deviations)}
 
 
@@ -121,7 +124,14 @@ def _anchors(records) -> list[int]:
     return [device for device in measured(records.device, LEAST_LINKS) if device in records.anchors]
 
 
+def site_of(records, device: int) -> list[int]:
+    """The device, and the anchors that share its mast."""
+    apart_m = np.linalg.norm(records.device_m - records.device_m[device], axis=1)
+    return [int(other) for other in np.flatnonzero(apart_m <= SAME_SITE_M)
+            if other == device or other in records.anchors]
+
+
 def _with_moved(records, device: int, move_m):
     device_m = records.device_m.copy()
-    device_m[device, :2] += move_m
+    device_m[site_of(records, device), :2] += move_m
     return records.with_devices(device_m)

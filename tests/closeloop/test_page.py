@@ -173,7 +173,8 @@ def test_every_picture_is_written_without_a_map(loop, tmp_path):
     (tmp_path / "effect_7_of_an_earlier_run.png").write_bytes(b"")
     draw_figures(loop, None, content, tmp_path)
     found = sorted(path.name for path in tmp_path.glob("*.png"))
-    assert found == ["drivers.png", "effect_1_receiver_gain_offset.png", "residual_map.png", "waterfall.png"]
+    assert found == ["drivers.png", "effect_1_receiver_gain_offset.png", "level_map.png", "residual_map.png",
+                     "waterfall.png"]
     assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in found)
     assert page(content, tmp_path).count("data:image/png;base64,") == 4
 

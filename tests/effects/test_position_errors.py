@@ -1,5 +1,7 @@
 """Ends that stand elsewhere: the level changes as the law says of the new place, for the links of that end only."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -55,3 +57,21 @@ def test_what_stands_where_it_is_declared_is_left_there(records, view):
     records.level_db[:] = law_db(records) + np.random.default_rng(2).normal(0, 0.5, len(records))
     given = view(records, law_db(records), 0.5, law_db)
     assert DevicePositionError().propose(given) == [] and ReceiverPositionError().propose(given) == []
+
+
+def test_sectors_on_one_mast_move_together_and_count_as_one(links, view):
+    rng = np.random.default_rng(3)
+    sectors_m = np.vstack([DEVICES_M, DEVICES_M[1:]])  # the third shares the mast of the second
+    receiver_m = np.column_stack([rng.uniform(-150, 250, (300, 2)), np.full(300, 40.0)])
+    records = links(sectors_m, receiver_m)
+    assert DevicePositionError().lacks(records) is None
+    moved_m = (sectors_m + [(0, 0, 0), (36, -22, 0), (36, -22, 0)])[records.device]
+    expected_db = -22 * np.log10(np.linalg.norm(receiver_m.repeat(3, axis=0) - moved_m, axis=1)
+                                 / np.linalg.norm(records.receiver_m - sectors_m[records.device], axis=1))
+    term = DevicePositionError().term(records, {"device": 1, "move_m": [36.0, -22.0]}, law_db)
+    np.testing.assert_allclose(term.offset_db, expected_db, atol=1e-9)
+    records.level_db[:] = law_db(records) + expected_db + rng.normal(0, 0.5, len(records))
+    (setting,) = DevicePositionError().propose(view(records, law_db(records), 0.5, law_db))
+    assert setting["device"] == 1 and np.hypot(setting["move_m"][0] - 36, setting["move_m"][1] + 22) < 15
+    given = replace(view(records, law_db(records), 0.5, law_db), kept=(("device_position_error", setting),))
+    assert all(other["device"] == 0 for other in DevicePositionError().propose(given))
