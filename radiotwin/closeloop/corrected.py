@@ -4,7 +4,7 @@ import numpy as np
 
 import radiotwin
 from radiotwin.closeloop.bases import FittedBase, FittedChannel, FittedPaths
-from radiotwin.closeloop.locate import Corrected, device_spread_db
+from radiotwin.closeloop.locate import Corrected, calibrated_temper, device_spread_db, whole_area
 from radiotwin.closeloop.records import Records
 from radiotwin.closeloop.regression import Solution
 from radiotwin.closeloop.run import Loop
@@ -39,7 +39,7 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     effects = {"base": loop.base, "coefficients": fit.coefficients[:split].tolist(), "dof": whole.dof,
                "scale_db": fit.scale_db.tolist(), "receivers": records.receiver_names, "parts": parts,
                "first_s": None if np.isnan(records.first_s) else records.first_s,
-               "device_spread_db": device_spread_db(whole, fit)}
+               "device_spread_db": device_spread_db(whole, fit), "temper": _temper(loop)}
     if isinstance(law, FittedPaths):
         effects["rest"] = list(law.rest)
     if loop.after.shadowing:
@@ -49,6 +49,16 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
         provenance |= {"scene": scene.config.name, "scene_hash": scene.content_hash()}
     return Twin(_channel(law), devices, "gain_db" if records.is_gain else "rssi_dbm", records.limit_db, provenance,
                 effects)
+
+
+def _temper(loop: Loop) -> float:
+    """How sure the likelihood may be of places where there is no map; with one, `radiotwin fit` finds devices."""
+    model, records = loop.after, loop.records
+    if records.city is not None:
+        return 1.0
+    models = [Corrected.of(side, fit) for side, fit in zip(model.folds, model.fits[1:])]
+    held_out = [records.select(model.index == number) for number in range(len(models))]
+    return calibrated_temper(models, held_out, whole_area(models[0], records), 0)
 
 
 def corrected_map(twin: Twin, scene: Scene) -> RadioMap:
@@ -98,7 +108,7 @@ def corrected_model(twin: Twin) -> Corrected:
         BadInput: no effects, or some that this version does not know, or a base that follows paths.
     """
     found = twin.effects
-    if not found or "device_spread_db" not in found:
+    if not found or "temper" not in found:
         raise BadInput("the twin was not made by `radiotwin close-loop`, or by an earlier version of it; run that on "
                        "measurements of devices whose positions are known")
     if found["base"] == "raytrace":
@@ -109,7 +119,8 @@ def corrected_model(twin: Twin) -> Corrected:
     solution = Solution(coefficients, np.array(found["scale_db"]), np.nan)
     return Corrected(FittedChannel(twin.channel, twin.device_m), [(effect, part["setting"]) for effect, part in parts],
                      solution, found["dof"], np.nan_to_num(twin.device_m),
-                     np.nan if found["first_s"] is None else found["first_s"], found["device_spread_db"])
+                     np.nan if found["first_s"] is None else found["first_s"], found["device_spread_db"],
+                     found["temper"])
 
 
 def _mean_db(base: FittedBase, records: Records, coefficients: np.ndarray,

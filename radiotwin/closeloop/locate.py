@@ -25,6 +25,8 @@ CREDIBLE = 0.9
 LEAST_LINKS = 3
 TEMPERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08)
 MOST_TASKS = 100
+LEAST_DEVICES = 50  # fewer do not tell a share of nine in ten
+AROUND_M = 300.0  # beyond all ends that are known
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,13 @@ def locate(model: Corrected, records: Records, area_m: tuple[float, float, float
         tell()
 
 
+def whole_area(model: Corrected, records: Records) -> tuple[float, float, float, float]:
+    """West, east, south and north end of where devices may be: around all ends that are known."""
+    known = np.vstack([records.receiver_m[:, :2], model.device_m[:, :2]])
+    (west, south), (east, north) = known.min(axis=0) - AROUND_M, known.max(axis=0) + AROUND_M
+    return west, east, south, north
+
+
 def calibrated_temper(models: list[Corrected], held_out: list[Records], area_m: tuple[float, float, float, float],
                       seed: int) -> float:
     """The power of the likelihood with which as many places lie within their radius as ought to.
@@ -113,7 +122,12 @@ def calibrated_temper(models: list[Corrected], held_out: list[Records], area_m: 
         held_out: links of each fold, devices where they are.
         area_m: as of `locate`.
         seed: of which devices are taken.
+
+    Returns:
+        the power; 1 where devices are too few to tell
     """
+    if len(np.unique(np.concatenate([records.device for records in held_out]))) < LEAST_DEVICES:
+        return 1.0
     coarse_m, width_m = _grid(area_m)
     tasks = [(model, records, device) for model, records in zip(models, held_out)
              for device in np.flatnonzero(np.bincount(records.device) >= LEAST_LINKS)]

@@ -6,14 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from radiotwin.closeloop.locate import Corrected, locate
-from radiotwin.closeloop.records import Records, make_records
+from radiotwin.closeloop.locate import Corrected, locate, whole_area
+from radiotwin.closeloop.records import make_records
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin
-
-AROUND_M = 300.0  # beyond all ends that are known
 
 
 def locate_file(measurements: Measurements, twin: Twin, model: Corrected, scene: Scene | None,
@@ -49,7 +47,8 @@ def locate_file(measurements: Measurements, twin: Twin, model: Corrected, scene:
     number = np.array([every.index(name) for name in records.receiver_names])
     records = replace(records, receiver=number[records.receiver], receiver_names=every,
                       device_m=np.nan_to_num(records.device_m))
-    found = list(locate(model, records, _area(records, model, scene), tell))
+    area_m = scene.config.extent.bounds if scene is not None else whole_area(model, records)
+    found = list(locate(model, records, area_m, tell))
     table = pd.DataFrame({"device": [records.device_names[place.device] for place in found],
                           "x_m": [place.x_m for place in found], "y_m": [place.y_m for place in found],
                           "radius_m": [place.radius_m for place in found],
@@ -70,12 +69,3 @@ def off_by(places: pd.DataFrame, truth: pd.DataFrame) -> dict[str, float]:
     apart_m = np.hypot(both["x_m"] - both["x_m_true"], both["y_m"] - both["y_m_true"])
     return {"devices": len(both), "median_m": float(apart_m.median()), "ninety_m": float(apart_m.quantile(0.9)),
             "within": float((apart_m <= both["radius_m"]).mean())}
-
-
-def _area(records: Records, model: Corrected, scene: Scene | None) -> tuple[float, float, float, float]:
-    """West, east, south and north end of where devices may be."""
-    if scene is not None:
-        return scene.config.extent.bounds
-    known = np.vstack([records.receiver_m[:, :2], model.device_m[:, :2]])
-    (west, south), (east, north) = known.min(axis=0) - AROUND_M, known.max(axis=0) + AROUND_M
-    return west, east, south, north

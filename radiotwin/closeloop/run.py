@@ -120,6 +120,7 @@ def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed:
     search = Search(before)
     search_effects(search, [effect() for effect in CATALOGUE], seed, tell)
     search_between_flights(search, bases[best], folds, seed, tell)
+    search.explained = search.model
     tell("looking at what is left")
     drivers_after = _drivers(search.model, seed) if search.model is not before else drivers_before
     if significant(drivers_after):

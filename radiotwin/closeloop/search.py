@@ -157,11 +157,13 @@ class Search:
         model: base and kept effects.
         log: every candidate of every step.
         rivals: of each kept effect, names of those that the data cannot tell from it.
+        explained: the model before any last resort.
     """
 
     model: Model
     log: list[Judged] = field(default_factory=list)
     rivals: list[list[str]] = field(default_factory=list)
+    explained: Model | None = None
 
     def keep(self, judged: Judged, model: Model) -> None:
         """Take over a model with one more effect."""

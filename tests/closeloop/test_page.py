@@ -176,7 +176,7 @@ def test_every_picture_is_written_without_a_map(loop, tmp_path):
     assert found == ["drivers.png", "effect_1_receiver_gain_offset.png", "level_map.png", "residual_map.png",
                      "waterfall.png"]
     assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in found)
-    assert page(content, tmp_path).count("data:image/png;base64,") == 4
+    assert page(content, tmp_path).count("data:image/png;base64,") == 5
 
 
 def test_pictures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_path):
