@@ -186,7 +186,7 @@ def test_pictures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_
     assert content["verdict"] == "none" and not content["effects"]
     draw_figures(nothing, None, content, tmp_path)
     text = page(content, tmp_path)
-    assert text.count("data:image/png;base64,") == 3 and "No structure" in text
+    assert text.count("data:image/png;base64,") == 4 and "No structure" in text
 
 
 @pytest.mark.parametrize("effect, setting", [
