@@ -16,6 +16,7 @@ from radiotwin.closeloop.regression import Solution, detected_db, nll_at
 from radiotwin.closeloop.shadowing import NAME as SHADOWING
 from radiotwin.closeloop.shadowing import Shadowing
 from radiotwin.effects.base import Effect
+from radiotwin.effects.position_errors import site_of
 
 DOFS = (3.0, 5.0, 10.0, 30.0)
 LEAST_GAIN_NATS = 25.0
@@ -215,10 +216,10 @@ def search_effects(result: Search, catalogue: list[Effect], seed: int, tell: Cal
         passed.sort(key=lambda each: each[1].rmse_db if each in alike else np.inf)
         steps = [passed[0][1:]]
         rival = next((each for each in passed[1:] if each[0].repeatable), None)
-        if rival is not None and not passed[0][0].repeatable:
+        most = MOST_OF_A_KIND if not passed[0][0].repeatable else _on_one_mast(passed[0][2])
+        if rival is not None and most > 1:
             tell(f"step {step + 1}: more of {rival[1].name}")
-            several = _several(*rival, block, seed, passed[0][1].nll_gain)
-            steps = several or steps
+            steps = _several(*rival, block, seed, passed[0][1].nll_gain, most) or steps
         best = steps[0][0]
         rivals = [judged.name for _, judged, _ in passed if judged.name != best.name and _alike(best, judged)]
         for i, entry in enumerate(result.log):
@@ -247,13 +248,21 @@ def _alike(best: Judged, other: Judged) -> bool:
     return best.gain_by_fold.sum() - other.gain_by_fold.sum() < CLEARLY_NATS
 
 
+def _on_one_mast(extended: Model) -> int:
+    """How many devices the last effect acts on, if they are all on one mast; else 0."""
+    part, records = extended.whole.parts[-1], extended.whole.records
+    acts = (part.term.offset_db != 0) | (part.term.columns != 0).any(axis=1)
+    devices = np.unique(records.device[acts])
+    return len(devices) if len(devices) and set(devices) <= set(site_of(records, devices[0])) else 0
+
+
 def _several(effect: Effect, judged: Judged, extended: Model, block: np.ndarray, seed: int,
-             least_gain: float) -> list[tuple[Judged, Model]] | None:
+             least_gain: float, most: int) -> list[tuple[Judged, Model]] | None:
     """An effect of which a step finds one, again and again, until it gains more than one that finds all of its kind at
-    once: groves or towers, each seen from few devices, against an antenna or an offset for each device. None where
-    it does not."""
+    once: groves or towers, each seen from few devices, against an offset for each device; or antennas against another
+    place of the mast that carries them. None where it does not."""
     steps = [(judged, extended)]
-    while len(extended.whole.parts) < MOST_EFFECTS and len(steps) < MOST_OF_A_KIND:
+    while len(extended.whole.parts) < MOST_EFFECTS and len(steps) < most:
         look = look_at(extended, effect, judged.step + 1)
         if isinstance(look, Judged):
             return None
