@@ -2,16 +2,20 @@
 
 Where a receiver changed after its first flight, that flight held out leaves nothing that speaks of it, and the others
 held out are predicted well by each other. So these candidates are judged on blocks of ground that are held out in all
-flights at once, with the effects that were found already.
+flights at once, with the effects that were found already. Places cannot tell a step from flights that differ anyhow, so
+it must also stand out from how much all receivers' flights differ.
 """
 
 from collections.abc import Callable
+
+import numpy as np
+from scipy.stats import t
 
 from radiotwin.closeloop.bases import Base
 from radiotwin.closeloop.folds import Folds, evidence_blocks, make_folds
 from radiotwin.closeloop.model import Side
 from radiotwin.closeloop.regression import Solution
-from radiotwin.closeloop.search import MOST_EFFECTS, Look, Model, Search, judge, look_at, make_model
+from radiotwin.closeloop.search import MOST_EFFECTS, SIGNIFICANCE, Look, Model, Search, judge, look_at, make_model
 from radiotwin.effects.base import Effect, Setting
 from radiotwin.effects.receiver_drift import ReceiverDrift
 
@@ -19,7 +23,7 @@ from radiotwin.effects.receiver_drift import ReceiverDrift
 def search_between_flights(search: Search, base: Base, folds: Folds, seed: int, tell: Callable[[str], None]) -> None:
     """Add receivers' steps in time to a model whose folds are flights, one after the other, until none passes."""
     effect, records = ReceiverDrift(steps_only=True), search.model.whole.records
-    if folds.by != "flight" or effect.lacks(records) or not isinstance(look_at(search.model, effect, 0), Look):
+    if folds.by != "flight" or effect.lacks(records) or not _stands_out(search.model, look_at(search.model, effect, 0)):
         return
     tell("receiver_drift, held out by block")
     model = make_model(records, base, make_folds(records, seed, "block"))
@@ -29,7 +33,7 @@ def search_between_flights(search: Search, base: Base, folds: Folds, seed: int, 
     while len(search.model.whole.parts) < MOST_EFFECTS:
         step = len(search.model.whole.parts)
         look = look_at(model, effect, step)
-        if not isinstance(look, Look):
+        if not _stands_out(model, look):
             return
         judged, extended = judge(model, look, block, 1, step, seed)
         if extended is None:
@@ -37,6 +41,32 @@ def search_between_flights(search: Search, base: Base, folds: Folds, seed: int, 
             return
         model = extended
         search.keep(judged, _with(search.model, effect, look.whole.parts[-1].setting))
+
+
+def _stands_out(model: Model, look) -> bool:
+    """Whether a step is larger than flights of all receivers let expect: Student's t with their pooled spread, as many
+    times as there are receivers and places between flights."""
+    if not isinstance(look, Look):
+        return False
+    ((receiver, (_, when_s)),) = look.whole.parts[-1].setting["receivers"].items()
+    view = model.whole.view(model.fits[0])
+    records, seen = view.records, np.isfinite(view.records.level_db) & np.isfinite(view.records.time_s)
+    group = np.where((records.receiver == int(receiver)) & (records.time_s >= when_s), -1, records.receiver)[seen]
+    cells, cell = np.unique(np.column_stack([group, records.flight[seen]]), axis=0, return_inverse=True)
+    mean_db = np.bincount(cell.ravel(), weights=(view.residual_db * view.weight)[seen]) \
+        / np.bincount(cell.ravel(), weights=view.weight[seen])
+    groups, member = np.unique(cells[:, 0], return_inverse=True)
+    flights = np.bincount(member)
+    level_db = np.bincount(member, weights=mean_db) / flights
+    freedom = len(mean_db) - len(groups)
+    if freedom < 1 or not {-1, int(receiver)} <= set(groups):
+        return False
+    spread_db = np.sqrt(((mean_db - level_db[member]) ** 2).sum() / freedom)
+    after, before = np.flatnonzero(groups == -1)[0], np.flatnonzero(groups == int(receiver))[0]
+    gap_db = abs(level_db[after] - level_db[before])
+    error_db = max(spread_db * np.sqrt(1 / flights[after] + 1 / flights[before]), 1e-9)
+    places = len(np.unique(records.receiver)) * max(len(np.unique(records.flight)) - 1, 1)
+    return bool(2 * t.sf(gap_db / error_db, freedom) * places <= SIGNIFICANCE)
 
 
 def _with(model: Model, effect: Effect, setting: Setting) -> Model:

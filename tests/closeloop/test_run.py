@@ -68,6 +68,13 @@ def test_a_step_after_the_first_flight_is_found_though_no_other_flight_tells_it(
     assert 59 <= value(report, "receiver_drift", "step_time_s[r1]") <= 200
 
 
+def test_flights_that_differ_anyhow_are_no_step(open_ground):
+    world = open_ground.fly(9)
+    each_db = np.array([[2.0, -2, 2, -2, 2, -2], [-3.0, 3, 0, 0, 3, -3]])
+    world.gain_db += each_db[world.receiver, world.flight]
+    assert "receiver_drift" not in named(run(open_ground.measured(world)))
+
+
 def test_what_no_effect_explains_is_filled_in_over_the_variable_that_it_depends_on(open_ground):
     world = open_ground.fly(8)
     world.gain_db += 6.0 * np.exp(-(((world.slot - 30) / 8.0) ** 2))  # nothing of the catalogue comes and goes so
