@@ -1,6 +1,7 @@
 """The models whose residual is looked at: the twin, the log-distance law, and (in `raytraced`) the ray tracer."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -14,7 +15,7 @@ from radiotwin.closeloop.paths import COMPONENTS, paths_of
 from radiotwin.closeloop.records import Records
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
-from radiotwin.twin import Twin, fit_twin
+from radiotwin.twin import Twin, TwinDevice, fit_twin
 
 LEVEL_SPREAD_DB = 20.0
 SLOPE_SPREAD_DB = 10.0  # per decade
@@ -31,9 +32,11 @@ class FittedBase(ABC):
 
     Attributes:
         device_m: (k, 3) positions that it has for the devices; NaN where it could not locate one.
+        found: the devices as they were located, those that are not relied on, too; empty where all were given.
     """
 
     device_m: np.ndarray
+    found: Sequence[TwinDevice] = ()
 
     @abstractmethod
     def mean_db(self, records: Records) -> np.ndarray:
@@ -76,7 +79,7 @@ class LogDistanceBase(Base):
     def fit(self, records: Records) -> FittedBase:
         if np.isnan(records.device_m).any():
             twin = _fit_twin(records, self._scene, "log_distance", self._seed)
-            return FittedChannel(twin.channel, _located_m(twin))
+            return FittedChannel(twin.channel, _located_m(twin), twin.devices)
         return _fit_channel(records, LogDistance(), self._seed)
 
 
@@ -98,7 +101,7 @@ class TwinBase(Base):
     def _fit(self, records: Records) -> FittedBase:
         if self._scene is not None:
             twin = _fit_twin(records, self._scene, "segmented_log_distance", self._seed)
-            return FittedChannel(twin.channel, _located_m(twin, LOST_M))
+            return FittedChannel(twin.channel, _located_m(twin, LOST_M), twin.devices)
         return _fit_channel(records, SegmentedLogDistance(), self._seed)
 
 
@@ -127,7 +130,7 @@ class FittedPaths(FittedBase):
     follows_paths = True
 
     def __init__(self, law: FittedBase, rest: tuple[float, float]):
-        self.law, self.device_m, self.rest = law, law.device_m, rest
+        self.law, self.device_m, self.found, self.rest = law, law.device_m, law.found, rest
 
     def mean_db(self, records: Records) -> np.ndarray:
         return _with_rest_db(paths_of(records, COMPONENTS), records, *self.rest)
@@ -175,8 +178,8 @@ def _fit_rest(records: Records, device_m: np.ndarray) -> tuple[float, float]:
 class FittedChannel(FittedBase):
     """Any channel model; its level and slope are fitted again for each class of line of sight."""
 
-    def __init__(self, channel: ChannelModel, device_m: np.ndarray):
-        self.channel, self.device_m = channel, device_m
+    def __init__(self, channel: ChannelModel, device_m: np.ndarray, found: Sequence[TwinDevice] = ()):
+        self.channel, self.device_m, self.found = channel, device_m, found
 
     def mean_db(self, records: Records) -> np.ndarray:
         return self.channel.predict(_links(records))[0]

@@ -32,10 +32,9 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     parts = [{"name": part.effect.name, "variant": part.effect.variant, "setting": part.setting,
               "coefficients": found.coefficients.tolist()}
              for part, found in zip(whole.parts, whole.found(fit)) if part.effect.explains]
-    located = np.isfinite(law.device_m).all(axis=1)
-    devices = [TwinDevice(name, *(place_m if sure else (np.nan,) * 3), "anchor" if i in records.anchors else "unknown",
-                          bool(sure), 0.0 if i in records.anchors else np.inf, None)
-               for i, (name, place_m, sure) in enumerate(zip(records.device_names, law.device_m, located))]
+    # Also devices whose place is too unsure to be learned from: a map with them is better than one without.
+    devices = list(law.found) or [TwinDevice(name, *map(float, place_m), "anchor", True, 0.0, None)
+                                  for name, place_m in zip(records.device_names, law.device_m)]
     effects = {"base": loop.base, "coefficients": fit.coefficients[:split].tolist(), "dof": whole.dof,
                "scale_db": fit.scale_db.tolist(), "receivers": records.receiver_names, "parts": parts,
                "first_s": None if np.isnan(records.first_s) else records.first_s,
