@@ -125,7 +125,8 @@ def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed:
     drivers_after = _drivers(search.model, seed) if search.model is not before else drivers_before
     if significant(drivers_after):
         trends = [UnexplainedTrend(driver.variable) for driver in significant(drivers_after)]
-        search_effects(search, [trend for trend in trends if trend.lacks(records) is None][:MOST_TRENDS], seed, tell)
+        told = [trend for trend in trends if trend.lacks(search.model.whole.records) is None]
+        search_effects(search, told[:MOST_TRENDS], seed, tell)
         tell("correlated_shadowing")
         add_shadowing(search, seed)
     tell("other models")
