@@ -72,9 +72,8 @@ class Acting:
 def acting_alone(loop: Loop, number: int, part: Part, parameters: dict[str, Parameter]) -> Acting:
     """What the effect of that number does in the model that learned from all links."""
     whole, fit = loop.after.whole, loop.after.fits[0]
-    start = whole.base_columns.shape[1] + sum(other.term.columns.shape[1] for other in whole.parts[:number])
     others = [other for other in whole.parts if other is not part]
-    rest = np.delete(fit.coefficients, slice(start, start + part.term.columns.shape[1]))
+    rest = np.delete(fit.coefficients, whole.places[number])
     without_db = whole.with_parts(others).mean_db(replace(fit, coefficients=rest))
     nowhere = ~whole.usable
     return Acting(part, parameters, whole.records, np.where(nowhere, np.nan, without_db),

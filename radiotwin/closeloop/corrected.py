@@ -30,8 +30,8 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     records, law = whole.records, whole.base
     split = whole.base_columns.shape[1]
     parts = [{"name": part.effect.name, "variant": part.effect.variant, "setting": part.setting,
-              "coefficients": found.coefficients.tolist()}
-             for part, found in zip(whole.parts, whole.found(fit)) if part.effect.explains]
+              "coefficients": fit.coefficients[place].tolist()}
+             for part, place in zip(whole.parts, whole.places) if part.effect.explains]
     # Also devices whose place is too unsure to be learned from: a map with them is better than one without.
     devices = list(law.found) or [TwinDevice(name, *map(float, place_m), "anchor", True, 0.0, None)
                                   for name, place_m in zip(records.device_names, law.device_m)]

@@ -113,17 +113,19 @@ class Side:
                     mean_db(problem, solution), self.base.shifted_db,
                     tuple((part.effect.name, part.setting) for part in self.parts))
 
+    @property
+    def places(self) -> list[slice]:
+        """Of each part: where its coefficients stand among all."""
+        ends = np.cumsum([self.base_columns.shape[1], *(part.term.columns.shape[1] for part in self.parts)]).tolist()
+        return [slice(first, end) for first, end in zip(ends, ends[1:])]
+
     def found(self, solution: Solution) -> list[Found]:
         """Of each part: what was fitted, and how surely, in view of how many links count as one."""
         design_effect = self.view(solution).design_effect
         spread = design_effect * covariance(self.problem(self.train), solution)
-        at, result = self.base_columns.shape[1], []
-        for number, part in enumerate(self.parts):
-            place = slice(at, at + part.term.columns.shape[1])
-            result.append(Found(solution.coefficients[place], spread[place, place],
-                                np.sqrt(design_effect) * self._setting_sides(number, solution)))
-            at = place.stop
-        return result
+        return [Found(solution.coefficients[place], spread[place, place],
+                      np.sqrt(design_effect) * self._setting_sides(number, solution))
+                for number, place in enumerate(self.places)]
 
     def _setting_sides(self, number: int, solution: Solution) -> np.ndarray:
         """(2, q) how far below and above each number of a setting the likelihood, all coefficients fitted again, has

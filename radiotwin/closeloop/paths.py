@@ -8,7 +8,7 @@ import numpy as np
 
 from radiotwin.closeloop.records import Records
 from radiotwin.paths import path_powers
-from radiotwin.paths.powers import COMPONENTS, SECTORS
+from radiotwin.paths.powers import COMPONENTS, SECTORS, SPEED_OF_LIGHT_M_S
 from radiotwin.scene.citymap import CityMap
 
 GRID_M = 1.0  # estimated positions of devices, which no estimate tells better, are rounded to it and share their paths
@@ -31,6 +31,26 @@ def rays_of(records: Records, end: str) -> np.ndarray:
     for rows, followed, place in _by_device(records):
         rays[rows] = getattr(followed, end)[place]
     return rays
+
+
+def free_space(records: Records) -> np.ndarray:
+    """(n,) power gain along the straight line if nothing stood in the way (ITU-R P.525); 0 where there is no map, and
+    the straight line is all that is known."""
+    if records.city is None:
+        return np.zeros(len(records))
+    return (SPEED_OF_LIGHT_M_S / records.frequency_hz / (4 * np.pi * records.distance_m)) ** 2
+
+
+def through_antenna_db(power: np.ndarray, gain: np.ndarray, scattered: np.ndarray, mean_gain: float) -> np.ndarray:
+    """(n,) what an antenna makes of links [dB].
+
+    Args:
+        power: (n, sectors) of the rays.
+        gain: (n, sectors) of the antenna in their directions, linear.
+        scattered: (n,) power from everywhere.
+        mean_gain: of the antenna over all directions, linear.
+    """
+    return 10 * np.log10(((power * gain).sum(axis=1) + scattered * mean_gain) / (power.sum(axis=1) + scattered))
 
 
 class _Followed(NamedTuple):

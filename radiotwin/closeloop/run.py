@@ -15,7 +15,7 @@ from radiotwin.closeloop.between_flights import search_between_flights
 from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.records import Records, make_records
 from radiotwin.closeloop.search import Model, Search, add_shadowing, make_model, rmse_db, search_effects
-from radiotwin.closeloop.structure import Driver, find_drivers
+from radiotwin.closeloop.structure import Driver, find_drivers, variables
 from radiotwin.closeloop.trends import UnexplainedTrend
 from radiotwin.effects import CATALOGUE
 from radiotwin.effects.base import Parameter
@@ -124,9 +124,10 @@ def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed:
     tell("looking at what is left")
     drivers_after = _drivers(search.model, seed) if search.model is not before else drivers_before
     if significant(drivers_after):
-        trends = [UnexplainedTrend(driver.variable) for driver in significant(drivers_after)]
-        told = [trend for trend in trends if trend.lacks(search.model.whole.records) is None]
-        search_effects(search, told[:MOST_TRENDS], seed, tell)
+        values = variables(search.model.whole.records, search.model.held_out_mean_db())
+        trends = [UnexplainedTrend(driver.variable) for driver in significant(drivers_after)
+                  if values[driver.variable].dtype.kind == "f"]  # labels have no order that a curve could follow
+        search_effects(search, trends[:MOST_TRENDS], seed, tell)
         tell("correlated_shadowing")
         add_shadowing(search, seed)
     tell("other models")

@@ -305,8 +305,7 @@ def look_at(model: Model, effect: Effect, step: int) -> Look | Judged:
     if whole is None:
         return replace(refused, reason="nothing in the residual looks like it")
     last = whole[0].parts[-1]
-    own = whole[1].coefficients[len(whole[1].coefficients) - len(last.term.spread_db):]
-    strange = effect.unphysical(last.setting, own)
+    strange = effect.unphysical(last.setting, whole[1].coefficients[whole[0].places[-1]])
     if strange:
         return replace(refused, reason=strange)
     gain = model.fits[0].objective - whole[1].objective

@@ -28,10 +28,6 @@ class UnexplainedTrend(Effect):
         self.variable, self.variant = variable, f"over {variable}"
         self._values = Remembered()
 
-    def lacks(self, records) -> str | None:
-        value = self._value(records, lambda records: np.zeros(len(records)))
-        return None if value.dtype.kind == "f" else "labels have no order that a curve could follow"
-
     def propose(self, view: View) -> list[dict]:
         value = self._value(view.records, view.at)
         known = np.isfinite(value)
@@ -61,7 +57,7 @@ class UnexplainedTrend(Effect):
         return result
 
     def _value(self, records, at) -> np.ndarray:
-        return self._values.of(records, at, lambda: variables(records, at(records)))[self.variable]
+        return self._values.of(records, at, lambda: variables(records, at(records))[self.variable])
 
 
 def _knots(name: str, value: np.ndarray) -> list[float]:

@@ -10,11 +10,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from radiotwin.closeloop.paths import rays_of
+from radiotwin.closeloop.paths import free_space, rays_of, through_antenna_db
 from radiotwin.closeloop.records import Records
 from radiotwin.effects.base import Effect, Parameter, Remembered, Term, Variation, View, measured, one_hot, some
 
-LIGHT_M_S = 299_792_458.0
 LEAST_LINKS = 100
 LEAST_NATS = 4.0
 LEVEL_SPREAD_DB = 15.0
@@ -131,21 +130,18 @@ class _Rays(NamedTuple):
     def of(cls, records: Records) -> "_Rays":
         if records.city is None:
             return cls(np.ones((len(records), 1)), records.azimuth_deg[:, None], records.elevation_deg[:, None],
-                       np.zeros(len(records)))
+                       free_space(records))
         ray = rays_of(records, "departures")
         power = np.linalg.norm(ray, axis=2)
         sine = ray[..., 2] / np.maximum(power, 1e-30)
         return cls(power, np.degrees(np.arctan2(ray[..., 0], ray[..., 1])),
-                   np.degrees(np.arcsin(np.clip(sine, -1, 1))),
-                   (LIGHT_M_S / records.frequency_hz / (4 * np.pi * records.distance_m)) ** 2)
+                   np.degrees(np.arcsin(np.clip(sine, -1, 1))), free_space(records))
 
     def offset_db(self, pattern: np.ndarray) -> np.ndarray:
         """(n,) what a pattern (6,), as in `FIELDS`, takes from each link [dB]."""
         gain = 10 ** (sector_pattern_db(self.azimuth_deg, self.elevation_deg, pattern[:5]) / 10)
         mean = np.mean(10 ** (sector_pattern_db(AROUND_DEG, np.full(len(AROUND_DEG), pattern[3]), pattern[:5]) / 10))
-        scattered = self.free * 10 ** (pattern[5] / 10)
-        return 10 * np.log10(((self.power * gain).sum(axis=1) + scattered * mean)
-                             / (self.power.sum(axis=1) + scattered))
+        return through_antenna_db(self.power, gain, self.free * 10 ** (pattern[5] / 10), mean)
 
 
 def _best_pattern(rays: _Rays, view: View, rows: np.ndarray) -> tuple[list[float], float]:

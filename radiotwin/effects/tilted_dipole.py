@@ -11,11 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from radiotwin.closeloop.paths import rays_of
+from radiotwin.closeloop.paths import free_space, rays_of, through_antenna_db
 from radiotwin.closeloop.records import Records
 from radiotwin.effects.base import Effect, Parameter, Remembered, Term, Variation, View, measured
 
-LIGHT_M_S = 299_792_458.0
 LEAST_LINKS = 100
 LEAST_NATS = 4.0
 DIRECTIVITY = 1.64
@@ -133,18 +132,16 @@ class _Arrivals(NamedTuple):
     def of(cls, records: Records) -> "_Arrivals":
         if records.city is None:
             return cls(-_unit(records.offset_m)[:, None], np.ones((len(records), 1)), records.receiver_axes,
-                       np.zeros(len(records)))
+                       free_space(records))
         ray = rays_of(records, "arrivals")
         power = np.linalg.norm(ray, axis=2)
         return cls(ray / np.maximum(power, 1e-30)[..., None], power, records.receiver_axes,
-                   (LIGHT_M_S / records.frequency_hz / (4 * np.pi * records.distance_m)) ** 2)
+                   free_space(records))
 
     def offset_db(self, tilt_deg: float, azimuth_deg: float, scattered_db: float) -> np.ndarray:
         """(n,) what the dipole adds to each link [dB]."""
         gain = dipole_gain(self.ray, _axis(self.axes, tilt_deg, azimuth_deg)[:, None])
-        scattered = self.free * 10 ** (scattered_db / 10)
-        return 10 * np.log10(((self.power * gain).sum(axis=1) + scattered * MEAN_GAIN)
-                             / (self.power.sum(axis=1) + scattered))
+        return through_antenna_db(self.power, gain, self.free * 10 ** (scattered_db / 10), MEAN_GAIN)
 
 
 def _axis(axes: np.ndarray, tilt_deg: float, azimuth_deg: float) -> np.ndarray:

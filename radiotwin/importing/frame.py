@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.settings import POSITION, Origin
+from radiotwin.importing.settings import POSITION
+from radiotwin.tables import Origin
 
 MARGIN_DEG = 1.0  # around the area for which a projected system is made
 DECIMALS = 7  # of a found origin [degrees]: a centimetre

@@ -90,10 +90,15 @@ def _quantity(source: Source, name: str, spec: str, settings: Settings) -> np.nd
     if base in POSITION and base not in LIMITS_DEG and not (settings.crs and base in "xy"):
         return in_metres(numbers, settings.length_unit, f"{source.path}: column {spec}")
     if name == "frequency_hz":
-        low, high = FREQUENCIES_HZ
-        source.refuse(spec, source.cells(spec, name), (numbers < low) | (numbers > high),
-                      f"is no frequency; allowed are {low:g} to {high:g} Hz")
+        refuse_frequencies(source, spec, source.cells(spec, name), numbers)
     return numbers
+
+
+def refuse_frequencies(source: Source, spec: str, cells, numbers: np.ndarray) -> None:
+    """Raise BadInput for the first of the numbers (n,) of a column's cells that is no frequency [Hz]."""
+    low, high = FREQUENCIES_HZ
+    source.refuse(spec, cells, (numbers < low) | (numbers > high),
+                  f"is no frequency; allowed are {low:g} to {high:g} Hz")
 
 
 def _names(source: Source, name: str, spec: str, shared: pd.DataFrame, settings: Settings) -> np.ndarray:

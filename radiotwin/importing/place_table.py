@@ -5,10 +5,10 @@ import pandas as pd
 from radiotwin.errors import BadInput
 from radiotwin.importing.frame import to_geographic
 from radiotwin.importing.lengths import METRES, in_metres
-from radiotwin.importing.links import LIMITS_DEG
+from radiotwin.importing.links import LIMITS_DEG, refuse_frequencies
 from radiotwin.importing.read import Source, read_source
 from radiotwin.importing.settings import POSITION, Settings, check_position
-from radiotwin.measurements import DEVICE_OPTIONAL, FREQUENCIES_HZ
+from radiotwin.measurements import DEVICE_OPTIONAL
 
 
 def read_places(path: str, key: str, settings: Settings) -> pd.DataFrame:
@@ -39,10 +39,7 @@ def read_places(path: str, key: str, settings: Settings) -> pd.DataFrame:
                            for name, (spec, unit) in columns.items()}, index=names.to_numpy(dtype=object))
     others = {name: source.numbers(name, name) for name in DEVICE_OPTIONAL if name in source.table}
     if "frequency_hz" in others:
-        low, high = FREQUENCIES_HZ
-        source.refuse("frequency_hz", source.table["frequency_hz"],
-                      (others["frequency_hz"] < low) | (others["frequency_hz"] > high),
-                      f"is no frequency; allowed are {low:g} to {high:g} Hz")
+        refuse_frequencies(source, "frequency_hz", source.table["frequency_hz"], others["frequency_hz"])
     return to_geographic(places, settings.crs).assign(**others)
 
 

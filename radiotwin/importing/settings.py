@@ -2,12 +2,12 @@
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, Strict, model_validator
+from pydantic import Field, model_validator
+
+from radiotwin.tables import Number, Origin, Table
 
 Spec = Annotated[str, Field(min_length=1)]
 """A column of the file, or `always VALUE`."""
-Number = Annotated[float, Strict()]
-"""An integer will do, too, but not `true` or a text."""
 Positive = Annotated[Number, Field(gt=0)]
 POSITION = ("latitude", "longitude", "altitude", "height", "x", "y", "z")
 
@@ -22,11 +22,7 @@ def check_position(given: set[str], prefix: str) -> None:
                          f"of {prefix}altitude, {prefix}height, {prefix}z; given are {', '.join(sorted(given))}")
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class Columns(_Table):
+class Columns(Table):
     """Quantity -> where it stands. Angles in degrees; `height` and `z` count from the scene's ground datum, `altitude`
     from wherever the altitude of the origin does."""
 
@@ -67,7 +63,7 @@ class Columns(_Table):
         return self
 
 
-class Wide(_Table):
+class Wide(Table):
     """Levels of several receivers or devices in one row: every column that fits `level` is one of them.
 
     `*` in `level` stands for any text; in the other values it stands for that same text, or for the whole name of the
@@ -93,15 +89,7 @@ class Wide(_Table):
         return self
 
 
-class Origin(_Table):
-    """WGS84 position of the local frame's origin; `altitude_m` is the altitude of the scene's ground datum."""
-
-    latitude_deg: Number = Field(ge=-90, le=90)
-    longitude_deg: Number = Field(ge=-180, le=180)
-    altitude_m: Number = 0.0
-
-
-class Settings(_Table):
+class Settings(Table):
     """All that an import needs besides the file."""
 
     level_unit: Literal["dBm", "dB", "mW", "W"] | None = None

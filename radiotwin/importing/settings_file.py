@@ -8,7 +8,8 @@ import tomli_w
 from pydantic import ValidationError
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.settings import Columns, Origin, Settings, Wide
+from radiotwin.importing.settings import Columns, Settings, Wide
+from radiotwin.tables import Origin
 
 
 def parse_columns(text: str) -> dict[str, str]:

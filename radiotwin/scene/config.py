@@ -5,23 +5,18 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
+from radiotwin.tables import Number, Origin, Table
 
 SCHEMA = "radiotwin.scene/1"
 MOST_POSITIONS = 10_000_000
-Number = Annotated[float, Strict()]
-"""An integer will do, too, but not `true` or a text."""
 Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.+-]+$")]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class RadioConfig(_Table):
+class RadioConfig(Table):
     """One radio for all links; a device's own frequency or power may come with later formats."""
 
     frequency_hz: Number = 2.4e9
@@ -46,7 +41,7 @@ class RadioConfig(_Table):
         return self
 
 
-class Extent(_Table):
+class Extent(Table):
     """The part of the plane that UAVs fly over and devices are searched in."""
 
     x_min_m: Number
@@ -66,7 +61,7 @@ class Extent(_Table):
         return self.x_min_m, self.x_max_m, self.y_min_m, self.y_max_m
 
 
-class LatticeConfig(_Table):
+class LatticeConfig(Table):
     step_m: Number = Field(20.0, gt=0)
     altitudes_m: list[Annotated[Number, Field(gt=0)]] = Field(min_length=1)
 
@@ -79,15 +74,7 @@ class LatticeConfig(_Table):
         return altitudes_m
 
 
-class Origin(_Table):
-    """WGS84 position of the local frame's origin."""
-
-    latitude_deg: Number = Field(ge=-90, le=90)
-    longitude_deg: Number = Field(ge=-180, le=180)
-    altitude_m: Number = 0.0
-
-
-class DeviceConfig(_Table):
+class DeviceConfig(Table):
     """The true position of a device; `role` says whether a survey may tell it."""
 
     device: Name
@@ -97,7 +84,7 @@ class DeviceConfig(_Table):
     role: Literal["anchor", "unknown"] = "unknown"
 
 
-class UavConfig(_Table):
+class UavConfig(Table):
     """A UAV flies at one altitude, from its start to its terminal, on `battery` units (move 1, hover 0.5)."""
 
     uav: Name
@@ -109,13 +96,13 @@ class UavConfig(_Table):
     battery: Number = Field(gt=0, le=100_000)
 
 
-class MissionConfig(_Table):
+class MissionConfig(Table):
     data_units: Number = Field(16_000.0, gt=0, description="data waiting at each device")
     rate_scale: Number = Field(100.0, gt=0, description="data units per slot and bit/s/Hz")
     slot_s: Number = Field(2.0, gt=0, description="duration of one move or hover")
 
 
-class SceneConfig(_Table):
+class SceneConfig(Table):
     """All of `scene.toml`."""
 
     schema_: Literal["radiotwin.scene/1"] = Field(SCHEMA, alias="schema")
