@@ -64,7 +64,7 @@ def drawn(world: int, base: str, seed: int) -> Measurements:
     """Measurements of a base's own world."""
     measurements, side, fit = fitted(world, base)
     rng = np.random.default_rng(seed)
-    level_db = side.mean_db(fit) + fit.scale_db[side.group] * rng.standard_t(DOF, len(side.records))
+    level_db = side.expect(fit).mean_db + fit.scale_db[side.group] * rng.standard_t(DOF, len(side.records))
     level_db = np.round(level_db / STEP_DB) * STEP_DB
     table = measurements.table.copy()
     table["gain_db"] = np.where(level_db >= side.records.limit_db, level_db, np.nan)

@@ -74,10 +74,10 @@ def acting_alone(loop: Loop, number: int, part: Part, parameters: dict[str, Para
     whole, fit = loop.after.whole, loop.after.fits[0]
     others = [other for other in whole.parts if other is not part]
     rest = np.delete(fit.coefficients, whole.places[number])
-    without_db = whole.with_parts(others).mean_db(replace(fit, coefficients=rest))
+    without_db = whole.with_parts(others).expect(replace(fit, coefficients=rest)).mean_db
     nowhere = ~whole.usable
     return Acting(part, parameters, whole.records, np.where(nowhere, np.nan, without_db),
-                  np.where(nowhere, np.nan, whole.mean_db(fit)))
+                  np.where(nowhere, np.nan, whole.expect(fit).mean_db))
 
 
 def acts_through(acting: Acting) -> tuple[str, float]:

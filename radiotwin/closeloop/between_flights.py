@@ -53,8 +53,8 @@ def _stands_out(model: Model, look) -> bool:
     records, seen = view.records, np.isfinite(view.records.level_db) & np.isfinite(view.records.time_s)
     group = np.where((records.receiver == int(receiver)) & (records.time_s >= when_s), -1, records.receiver)[seen]
     cells, cell = np.unique(np.column_stack([group, records.flight[seen]]), axis=0, return_inverse=True)
-    mean_db = np.bincount(cell.ravel(), weights=(view.residual_db * view.weight)[seen]) \
-        / np.bincount(cell.ravel(), weights=view.weight[seen])
+    # Plain means: where all of a flight is off, its links are no outliers.
+    mean_db = np.bincount(cell.ravel(), weights=view.residual_db[seen]) / np.bincount(cell.ravel())
     groups, member = np.unique(cells[:, 0], return_inverse=True)
     flights = np.bincount(member)
     level_db = np.bincount(member, weights=mean_db) / flights

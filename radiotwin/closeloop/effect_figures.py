@@ -41,7 +41,7 @@ def draw_effects(loop: Loop, ground: Ground, folder: Path) -> None:
         acting = acting_alone(loop, number, part, parameters)
         _draw(acting, ground, folder / f"effect_{number + 1}_{part.effect.name}.png")
     if loop.after.shadowing:
-        added_db = loop.after.held_out_shadowing[0] * loop.after.held_out(lambda side, fit: fit.scale_db[side.group])
+        added_db = loop.after.held_out_shadowing[0] * loop.after.held_out(lambda side, fit: side.expect(fit).scale_db)
         draw_added(added_db, ground, folder / f"effect_{len(loop.after.whole.parts) + 1}_{LAST_RESORT}.png")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from radiotwin.closeloop.bases import FittedBase
 from radiotwin.closeloop.model import Side
 from radiotwin.closeloop.records import Records
-from radiotwin.closeloop.regression import Solution, nll_at, residual_db
+from radiotwin.closeloop.regression import Solution, expect, nll, residual_db
 from radiotwin.effects.base import Effect, Setting
 
 COARSE_CELLS = 1500
@@ -23,6 +23,7 @@ LEAST_SHARE = 1e-4
 NODES = 7
 CREDIBLE = 0.9
 LEAST_LINKS = 3
+LEAST_SLOPE = 0.5
 TEMPERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08)
 MOST_TASKS = 100
 LEAST_DEVICES = 50  # fewer do not tell a share of nine in ten
@@ -147,8 +148,11 @@ def device_spread_db(side: Side, fit: Solution) -> float:
     """Standard deviation of what the training links of a device have in common [dB], beyond what single links make of
     their mean (method of moments)."""
     problem = side.problem(side.train)
-    seen = np.isfinite(problem.level_db)
-    rest_db, scale_db = residual_db(problem, fit)[seen], fit.scale_db[problem.group][seen]
+    expected = expect(problem, fit)
+    slope = np.broadcast_to(expected.slope, problem.level_db.shape)
+    # At a receiver that passes little on a device's own level does not show.
+    seen = np.isfinite(problem.level_db) & (slope > LEAST_SLOPE)
+    rest_db, scale_db = (residual_db(problem, fit) / slope)[seen], (expected.scale_db / slope)[seen]
     device = side.records.device[side.train][seen]
     rest_db = np.clip(rest_db, -4 * scale_db, 4 * scale_db)
     count = np.bincount(device)
@@ -179,8 +183,7 @@ def _log_likelihood(model: Corrected, mine: Records, places_m: np.ndarray) -> np
     values = []
     for node, weight in zip(nodes, weights / weights.sum()):
         moved = replace(problem, gain_db=problem.gain_db + node * spread_db)
-        nll = nll_at(moved, moved.mean(model.solution.coefficients)[0], model.solution.scale_db[problem.group])
-        values.append(np.log(weight) - nll.reshape(cells, links).sum(axis=1))
+        values.append(np.log(weight) - nll(moved, model.solution).reshape(cells, links).sum(axis=1))
     return np.logaddexp.reduce(values, axis=0)
 
 

@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 
 from radiotwin.closeloop.bases import ANY_LEVEL_DB, FittedBase
 from radiotwin.closeloop.records import Records
-from radiotwin.closeloop.regression import Problem, Solution, covariance, mean_db, nll, residual_db, solve
+from radiotwin.closeloop.regression import Expected, Problem, Solution, covariance, expect, nll, residual_db, solve
 from radiotwin.effects.base import Effect, Found, Setting, Term, Variation, View, some
 
 TRIALS = 25  # for each number of a setting, while it is refined
@@ -87,7 +87,7 @@ class Side:
             sum((term.offset_db[rows] for term in terms), np.zeros(len(self.base_db[rows]))),
             np.hstack([np.zeros((len(self.base_db[rows]), 0)), *(term.columns[rows] for term in terms)]),
             np.concatenate([self.base_spread, *(term.spread_db for term in terms)]), self.group[rows],
-            _bend(parts, "receiver", mine, rows), self.dof, _lost(parts, mine))
+            _bend(parts, "receiver", mine, rows), self.dof, _lost(parts, mine), _unsure_db(parts, rows))
 
     @cached_property
     def limit_db(self) -> np.ndarray:
@@ -102,15 +102,16 @@ class Side:
         """Fit to the training links."""
         return solve(self.problem(self.train), start)
 
-    def mean_db(self, solution: Solution) -> np.ndarray:
-        """(n,) expected level of all links [dB]."""
-        return mean_db(self.problem(slice(None)), solution)
+    def expect(self, solution: Solution) -> Expected:
+        """What is expected of all links."""
+        return expect(self.problem(slice(None)), solution)
 
     def view(self, solution: Solution) -> View:
         """The training links as an effect sees them."""
         problem = self.problem(self.train)
-        return View(self.records.select(self.train), residual_db(problem, solution), solution.scale_db[problem.group],
-                    mean_db(problem, solution), self.base.shifted_db,
+        expected = expect(problem, solution)
+        return View(self.records.select(self.train), residual_db(problem, solution), expected.scale_db,
+                    expected.mean_db, self.base.shifted_db,
                     tuple((part.effect.name, part.setting) for part in self.parts))
 
     @property
@@ -173,6 +174,11 @@ def _lost(parts: list[Part], records: Records | None) -> np.ndarray | float:
         if part.effect.stage == "detection":
             kept = kept * (1.0 - part.effect.loses(records, part.setting))
     return 1.0 - kept
+
+
+def _unsure_db(parts: list[Part], rows: np.ndarray) -> np.ndarray | float:
+    """(n,) standard deviation of what the parts add to links of which nothing was learned; 0 where there is none."""
+    return np.sqrt(sum(part.term.unsure_db[rows] ** 2 for part in parts if part.term.unsure_db is not None))
 
 
 def add(side: Side, effect: Effect, solution: Solution, like: Setting | None = None) -> tuple[Side, Solution] | None:
@@ -262,8 +268,7 @@ def _refine_members(side: Side, fitted: Solution, part: Part, variation: Variati
     """Vary the numbers of each member by themselves, on links of its own; a level of its own is all that is fitted
     beside them."""
     numbers, at_receiver = variation.values.copy(), part.effect.stage == "receiver"
-    problem = replace(side.problem(slice(None)), receiver=None)
-    arriving_db = problem.mean(fitted.coefficients)[0] - part.term.offset_db
+    arriving_db = side.problem(slice(None)).arriving(fitted.coefficients)[0] - part.term.offset_db
 
     def changed(records: Records, numbers: np.ndarray) -> Part:
         setting = variation.setting(np.clip(numbers, variation.low, variation.high))

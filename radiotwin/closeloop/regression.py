@@ -5,6 +5,10 @@ and Taylor 1989, 'Robust statistical modeling using the t distribution', JASA 84
 limit" (Tobin 1958) or, where links are lost whatever their level, as one of the two (Deaton and Irish 1984,
 'Statistical models for zero expenditures in household budgets', Journal of Public Economics 23). Solved by Newton steps
 on the exact likelihood: few EM steps would leave a bias of a decibel.
+
+Errors are mostly shadowing, which happens before the receiver. So where a receiver bends levels (noise floor,
+saturation), errors are bent with them: mean and spread of the reading are those of all levels that may arrive (Gauss
+and Hermite), and far below a floor all readings are alike.
 """
 
 from collections.abc import Callable
@@ -14,9 +18,12 @@ import numpy as np
 from scipy.special import gammaln, stdtr
 
 LEAST_SCALE_DB = 0.05
+FIRST_SCALE_DB = 5.0
 ITERATIONS = 40
 TOLERANCE = 1e-3  # nats
 CURVATURE = 1e-6  # least, so that every step is defined
+NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(7)  # of levels that may arrive
+OWN_SHARE = 0.5  # of the error scale, which a receiver's own noise has where it passes nothing on
 
 Bend = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Mean level [dB] -> what becomes of it [dB], and the slope of that."""
@@ -39,6 +46,7 @@ class Problem:
         receiver: what the receiver does to the level that arrives; None = nothing.
         dof: degrees of freedom of the errors.
         lost: (n,) probability that a link is blank whatever its level; or one for all.
+        unsure_db: (n,) standard deviation of what nothing was learned of, beside the error scale; or one for all.
     """
 
     level_db: np.ndarray
@@ -53,11 +61,12 @@ class Problem:
     receiver: Bend | None
     dof: float
     lost: np.ndarray | float = 0.0
+    unsure_db: np.ndarray | float = 0.0
 
-    def mean(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) expected level [dB], and (n, p) its derivative in the coefficients.
+    def arriving(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) expected level before the receiver [dB], and (n, p) its derivative in the coefficients.
 
-        receiver(paths(law) + gains): gains act on all paths, whatever they are.
+        paths(law) + gains: gains act on all paths, whatever they are.
         """
         split = self.law_columns.shape[1]
         level_db = self.law_db + self.law_columns @ coefficients[:split]
@@ -66,11 +75,48 @@ class Problem:
             level_db, slope = self.paths(level_db)
             columns = columns * slope[:, None]
         level_db = level_db + self.gain_db + self.gain_columns @ coefficients[split:]
-        columns = np.hstack([columns, self.gain_columns])
-        if self.receiver is not None:
-            level_db, slope = self.receiver(level_db)
-            columns = columns * slope[:, None]
-        return level_db, columns
+        return level_db, np.hstack([columns, self.gain_columns])
+
+    def expect(self, coefficients: np.ndarray, scale_db: np.ndarray) -> "Expected":
+        """What is read, for error scales (groups,) [dB]."""
+        arriving_db, columns = self.arriving(coefficients)
+        scale = np.hypot(scale_db[self.group], self.unsure_db)
+        if self.receiver is None:
+            return Expected(arriving_db, scale, columns, np.ones(1), np.zeros(1), np.ones(1))
+        mean, square, slope, both = np.zeros((4, len(arriving_db)))
+        for node, weight in zip(NODES, WEIGHTS / WEIGHTS.sum()):
+            level_db, passed = self.receiver(arriving_db + node * scale)
+            moved = level_db - arriving_db  # or squares of large levels would be subtracted
+            mean += weight * moved
+            square += weight * moved**2
+            slope += weight * passed
+            both += weight * moved * (passed - 1)
+        variance = np.maximum(square - mean**2, 0.0)
+        own = (OWN_SHARE * scale_db[self.group]) ** 2
+        share = 1 - own / scale**2  # so that what passes unbent keeps its scale
+        total = own + share * variance
+        growth = share * (both - mean * (slope - 1)) / total
+        return Expected(arriving_db + mean, np.sqrt(total), columns, slope, growth, variance / total)
+
+
+@dataclass(frozen=True, eq=False)
+class Expected:
+    """What is expected of n links.
+
+    Attributes:
+        mean_db, scale_db: (n,) of the reading.
+        columns: (n, p) derivative of the arriving level in the coefficients.
+        slope: (n,) of the mean in the arriving level; or one for all.
+        growth: (n,) of log(scale) in it [1/dB]; or one for all.
+        passed: (n,) share of scale_db² that has come through the receiver; or one for all.
+    """
+
+    mean_db: np.ndarray
+    scale_db: np.ndarray
+    columns: np.ndarray
+    slope: np.ndarray
+    growth: np.ndarray
+    passed: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,25 +134,25 @@ def solve(problem: Problem, start: Solution | None = None) -> Solution:
     if start is not None and len(start.coefficients) == p:
         beta, scale_db = start.coefficients.copy(), start.scale_db.copy()
     else:
-        beta, scale_db = _least_squares(problem), np.full(groups, 5.0)
+        beta, scale_db = _least_squares(problem), np.full(groups, FIRST_SCALE_DB)
     precision = 1.0 / np.square(problem.spread_db)
-    mean, columns = problem.mean(beta)
-    objective = _objective(problem, mean, beta, scale_db, precision)
+    expected = problem.expect(beta, scale_db)
+    objective = _objective(problem, expected, beta, precision)
     for _ in range(ITERATIONS):
         before = objective
-        slope, curvature, _ = _derivatives(problem, mean, scale_db)
-        hessian = (columns.T * curvature) @ columns + np.diag(precision + 1e-9)
-        step = np.linalg.solve(hessian, columns.T @ slope - precision * beta)
+        slope, hessian = _slope_and_hessian(problem, expected, precision)
+        step = np.linalg.solve(hessian, slope - precision * beta)
         size = 1.0
         while size > 1e-3:
-            there = problem.mean(beta + size * step)
-            tried = _objective(problem, there[0], beta + size * step, scale_db, precision)
+            there = problem.expect(beta + size * step, scale_db)
+            tried = _objective(problem, there, beta + size * step, precision)
             if tried <= objective + 1e-9:
-                beta, objective, (mean, columns) = beta + size * step, tried, there
+                beta, objective, expected = beta + size * step, tried, there
                 break
             size *= 0.5
-        scale_db = _scales(problem, mean, scale_db)
-        objective = _objective(problem, mean, beta, scale_db, precision)
+        scale_db = _scales(problem, expected, scale_db)
+        expected = problem.expect(beta, scale_db)
+        objective = _objective(problem, expected, beta, precision)
         if abs(before - objective) < TOLERANCE:
             break
     return Solution(beta, scale_db, objective)
@@ -114,21 +160,19 @@ def solve(problem: Problem, start: Solution | None = None) -> Solution:
 
 def covariance(problem: Problem, solution: Solution) -> np.ndarray:
     """(p, p) of the coefficients, from the curvature at the maximum."""
-    mean, columns = problem.mean(solution.coefficients)
-    _, curvature, _ = _derivatives(problem, mean, solution.scale_db)
-    precision = 1.0 / np.square(problem.spread_db)
-    hessian = (columns.T * curvature) @ columns + np.diag(precision + 1e-9)
-    return np.linalg.inv(hessian)
+    expected = expect(problem, solution)
+    return np.linalg.inv(_slope_and_hessian(problem, expected, 1.0 / np.square(problem.spread_db))[1])
 
 
-def mean_db(problem: Problem, solution: Solution) -> np.ndarray:
-    """(n,) level that is expected before noise and the limit of detection [dB]."""
-    return problem.mean(solution.coefficients)[0]
+def expect(problem: Problem, solution: Solution) -> Expected:
+    """What a solution expects to be read, before noise and the limit of detection."""
+    return problem.expect(solution.coefficients, solution.scale_db)
 
 
 def nll(problem: Problem, solution: Solution) -> np.ndarray:
     """(n,) negative log-likelihood of each link [nats]."""
-    return nll_at(problem, problem.mean(solution.coefficients)[0], solution.scale_db[problem.group])
+    expected = expect(problem, solution)
+    return nll_at(problem, expected.mean_db, expected.scale_db)
 
 
 def detected_db(mean_db: np.ndarray, scale_db: np.ndarray, limit_db: np.ndarray, dof: float) -> np.ndarray:
@@ -149,17 +193,18 @@ def residual_db(problem: Problem, solution: Solution) -> np.ndarray:
     """(n,) measured minus expected [dB]; of a blank level, how much lower than expected it is to be thought: the
     least change of the mean after which it is as likely detected as not, 0 where it already is less likely, times the
     probability that it is blank for its level rather than lost."""
-    mean = mean_db(problem, solution)
-    blank = np.isnan(problem.level_db)
+    expected = expect(problem, solution)
+    mean, blank = expected.mean_db, np.isnan(problem.level_db)
     lack_db = np.minimum(np.where(np.isfinite(problem.limit_db), problem.limit_db, mean) - mean, 0.0)
-    below = (1 - problem.lost) * stdtr(problem.dof, lack_db / solution.scale_db[problem.group])
+    below = (1 - problem.lost) * stdtr(problem.dof, lack_db / expected.scale_db)
     return np.where(blank, lack_db * below / np.maximum(problem.lost + below, 1e-300), problem.level_db - mean)
 
 
 def _least_squares(problem: Problem) -> np.ndarray:
     seen = np.isfinite(problem.level_db)
-    mean, columns = problem.mean(np.zeros(len(problem.spread_db)))
-    precision = np.square(5.0 / problem.spread_db) + 1e-6
+    expected = problem.expect(np.zeros(len(problem.spread_db)), np.full(int(problem.group.max()) + 1, FIRST_SCALE_DB))
+    mean, columns = expected.mean_db, expected.columns * expected.slope[:, None]
+    precision = np.square(FIRST_SCALE_DB / problem.spread_db) + 1e-6
     return np.linalg.solve(columns[seen].T @ columns[seen] + np.diag(precision),
                            columns[seen].T @ (problem.level_db - mean)[seen])
 
@@ -180,16 +225,25 @@ def nll_at(problem: Problem, mean: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return value
 
 
-def _objective(problem: Problem, mean: np.ndarray, beta: np.ndarray, scale_db: np.ndarray,
-               precision: np.ndarray) -> float:
-    value = nll_at(problem, mean, scale_db[problem.group]).sum()
+def _objective(problem: Problem, expected: Expected, beta: np.ndarray, precision: np.ndarray) -> float:
+    value = nll_at(problem, expected.mean_db, expected.scale_db).sum()
     return float(value + 0.5 * np.sum(precision * beta**2))
 
 
-def _derivatives(problem: Problem, mean: np.ndarray, scale_db: np.ndarray):
-    """Slope (n,) of the log-likelihood in the mean, its curvature (n,), and the term (n,) whose sum over a group is 0
-    at the best scale."""
-    scale, dof = scale_db[problem.group], problem.dof
+def _slope_and_hessian(problem: Problem, expected: Expected, precision: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(p,) slope of the log-likelihood in the coefficients, and (p, p) curvature of the posterior."""
+    slope, curvature, spread = _derivatives(problem, expected)
+    growth, dof = expected.growth, problem.dof
+    pull = slope * expected.slope + spread * growth
+    bending = curvature * expected.slope**2 + 2 * dof / (dof + 3) * growth**2  # (Lange et al. 1989, Fisher information)
+    hessian = (expected.columns.T * bending) @ expected.columns + np.diag(precision + 1e-9)
+    return expected.columns.T @ pull, hessian
+
+
+def _derivatives(problem: Problem, expected: Expected):
+    """Slope (n,) of the log-likelihood in the mean, its curvature (n,), and its slope (n,) in the logarithm of the
+    scale."""
+    mean, scale, dof = expected.mean_db, expected.scale_db, problem.dof
     blank = np.isnan(problem.level_db)
     z = np.where(blank, 0.0, (problem.level_db - mean) / scale)
     weight = (dof + 1) / (dof + z * z)
@@ -208,11 +262,12 @@ def _derivatives(problem: Problem, mean: np.ndarray, scale_db: np.ndarray):
     return slope, curvature, spread
 
 
-def _scales(problem: Problem, mean: np.ndarray, scale_db: np.ndarray) -> np.ndarray:
-    """One step towards the best scales."""
-    _, _, spread = _derivatives(problem, mean, scale_db)
-    groups = len(scale_db)
-    detected = np.bincount(problem.group[np.isfinite(problem.level_db)], minlength=groups)
-    total = np.bincount(problem.group, weights=spread, minlength=groups)
+def _scales(problem: Problem, expected: Expected, scale_db: np.ndarray) -> np.ndarray:
+    """One step towards the best scales. Of links of which a receiver passes little on, little is learned."""
+    _, _, spread = _derivatives(problem, expected)
+    groups, seen = len(scale_db), np.isfinite(problem.level_db)
+    passed = np.broadcast_to(expected.passed, seen.shape)
+    detected = np.bincount(problem.group, weights=passed * seen, minlength=groups)
+    total = np.bincount(problem.group, weights=passed * spread, minlength=groups)
     factor = np.clip(1.0 + total / np.maximum(detected, 1), 0.25, 4.0) ** 0.5
     return np.maximum(scale_db * np.where(detected > 1, factor, 1.0), LEAST_SCALE_DB)

@@ -137,7 +137,7 @@ def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed:
 
 def _drivers(model: Model, seed: int) -> list[Driver]:
     mean_db = model.held_out_mean_db()
-    scale_db = model.held_out(lambda side, fit: fit.scale_db[side.group])
+    scale_db = model.held_out(lambda side, fit: side.expect(fit).scale_db)
     return find_drivers(model.whole.records, model.whole.records.level_db - mean_db, scale_db, mean_db, seed)
 
 

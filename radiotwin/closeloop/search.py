@@ -12,7 +12,7 @@ from radiotwin.closeloop.bases import Base
 from radiotwin.closeloop.folds import Folds, evidence_blocks
 from radiotwin.closeloop.model import Side, add, exactly
 from radiotwin.closeloop.records import Records
-from radiotwin.closeloop.regression import Solution, detected_db, nll_at
+from radiotwin.closeloop.regression import Solution, detected_db, expect, nll_at
 from radiotwin.closeloop.shadowing import NAME as SHADOWING
 from radiotwin.closeloop.shadowing import Shadowing
 from radiotwin.effects.base import Effect
@@ -102,16 +102,24 @@ class Model:
     def held_out_nll(self) -> np.ndarray:
         """(n,) negative log-likelihood [nats]; NaN where there is none."""
         shift, left = self.held_out_shadowing
-        return self._once("nll", lambda side, fit: np.where(side.usable, nll_at(
-            side.problem(slice(None)), side.mean_db(fit) + shift * fit.scale_db[side.group],
-            fit.scale_db[side.group] * left), np.nan))
+
+        def of(side: Side, fit: Solution) -> np.ndarray:
+            problem = side.problem(slice(None))
+            expected = expect(problem, fit)
+            mean_db = expected.mean_db + shift * expected.scale_db
+            return np.where(side.usable, nll_at(problem, mean_db, expected.scale_db * left), np.nan)
+        return self._once("nll", of)
 
     def held_out_mean_db(self) -> np.ndarray:
         """(n,) expected level of a link that is detected [dB]; NaN where there is none."""
         shift, left = self.held_out_shadowing
-        return self._once("mean_db", lambda side, fit: np.where(side.usable, detected_db(
-            side.mean_db(fit) + shift * fit.scale_db[side.group], fit.scale_db[side.group] * left,
-            side.limit_db, side.dof), np.nan))
+
+        def of(side: Side, fit: Solution) -> np.ndarray:
+            expected = side.expect(fit)
+            mean_db = expected.mean_db + shift * expected.scale_db
+            scale_db = expected.scale_db * left
+            return np.where(side.usable, detected_db(mean_db, scale_db, side.limit_db, side.dof), np.nan)
+        return self._once("mean_db", of)
 
     def _once(self, name: str, of: Callable[[Side, Solution], np.ndarray]) -> np.ndarray:
         if name not in self._known:

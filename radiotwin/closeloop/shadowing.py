@@ -12,7 +12,7 @@ import numpy as np
 from radiotwin.channel.residual_field import ResidualField
 from radiotwin.closeloop.model import Side
 from radiotwin.closeloop.records import Records
-from radiotwin.closeloop.regression import Solution, residual_db
+from radiotwin.closeloop.regression import Solution, expect, residual_db
 
 NAME = "correlated_shadowing"
 MOST_Z = 4.0  # an outlier counts as this many scales
@@ -38,7 +38,7 @@ class Shadowing:
     def fit(cls, side: Side, solution: Solution, seed: int) -> "Shadowing":
         """Learn from the training links of a side what its base and effects leave over."""
         problem = side.problem(side.train)
-        z = np.clip(residual_db(problem, solution) / solution.scale_db[problem.group], -MOST_Z, MOST_Z)
+        z = np.clip(residual_db(problem, solution) / expect(problem, solution).scale_db, -MOST_Z, MOST_Z)
         sigma = max(float(z.std()), 1e-6)
         shadowing = cls(ResidualField(), sigma, receivers_move(side.records))
         shadowing.field.fit(*shadowing._points(side.records.select(side.train)), (z - z.mean()) / sigma, seed)

@@ -30,6 +30,7 @@ class Term:
         spread_db: (q,) prior standard deviation of each coefficient.
         names: q names of the coefficients.
         extra: (n, …) what `Effect.bend` needs of each link; None = nothing.
+        unsure_db: (n,) standard deviation of what it adds to links of which nothing was learned; None = all are known.
     """
 
     offset_db: np.ndarray
@@ -37,11 +38,13 @@ class Term:
     spread_db: np.ndarray
     names: list[str]
     extra: np.ndarray | None = None
+    unsure_db: np.ndarray | None = None
 
     def select(self, rows: np.ndarray) -> "Term":
         """For the links of a mask or index."""
         return Term(self.offset_db[rows], self.columns[rows], self.spread_db, self.names,
-                    None if self.extra is None else self.extra[rows])
+                    None if self.extra is None else self.extra[rows],
+                    None if self.unsure_db is None else self.unsure_db[rows])
 
     @classmethod
     def of_columns(cls, columns: np.ndarray, spread_db: float, names: list[str]) -> "Term":

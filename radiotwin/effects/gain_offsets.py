@@ -4,6 +4,8 @@ Cable and connector loss, antenna efficiency, transmit power and calibration add
 (ITU-R P.341, 'The concept of transmission loss for radio links').
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from radiotwin.effects.base import Effect, Parameter, Term, View, measured, one_hot
@@ -33,12 +35,17 @@ class _GainOffset(Effect):
         return None
 
     def propose(self, view: View) -> list[dict]:
-        return [{"members": measured(self._index(view.records), LEAST_LINKS)}]
+        index = self._index(view.records)
+        members = measured(index, LEAST_LINKS)
+        offsets_db = [np.average(view.residual_db[index == member], weights=view.weight[index == member])
+                      for member in members]
+        return [{"members": members, "spread_db": float(np.std(offsets_db))}]
 
     def term(self, records, setting, at) -> Term:
-        names = self._names(records)
-        return Term.of_columns(one_hot(self._index(records), setting["members"]), SPREAD_DB,
+        names, index = self._names(records), self._index(records)
+        term = Term.of_columns(one_hot(index, setting["members"]), SPREAD_DB,
                                [names[member] for member in setting["members"]])
+        return replace(term, unsure_db=np.where(np.isin(index, setting["members"]), 0.0, setting["spread_db"]))
 
     def unphysical(self, setting, coefficients) -> str | None:
         most_db = np.abs(coefficients - np.median(coefficients)).max()

@@ -41,7 +41,8 @@ class NoiseFloor(Effect):
         return Term.of_offset(np.zeros(len(records)))
 
     def bend(self, level_db, records, setting, extra):
-        floor = np.full(len(records.receiver_names), -np.inf)
+        # One of which nothing is known has the usual one.
+        floor = np.full(len(records.receiver_names), np.median(list(setting["receivers"].values())))
         for receiver, floor_db in setting["receivers"].items():
             floor[int(receiver)] = floor_db
         return floored(level_db, floor[records.receiver])

@@ -15,6 +15,7 @@ LEAST_SIDE = 20  # links before and after a step
 SPREAD_DB = 10.0
 TIME_CONSTANTS_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
 WARMING = ("warm_up", "warm_up_each_flight")
+MOST_TRIED = 2  # receivers: how much a drift explains shows when all else is fitted again
 CLEARLY = 3.0  # standard deviations
 STEP_PENALTY = 1.0  # times log of the places where it may be
 
@@ -45,16 +46,16 @@ class ReceiverDrift(Effect):
         return self._best(view, [int(receiver) for receiver in setting["receivers"]])
 
     def _best(self, view: View, receivers: list[int]) -> list[dict]:
-        records, best = view.records, (LEAST_NATS, None)
+        records, found = view.records, []
         for receiver in receivers:
             rows = np.flatnonzero((records.receiver == receiver) & np.isfinite(records.time_s))
             candidates = _forms(
                 (records.time_s - records.first_s)[rows], records.time_s[rows], records.time_in_flight_s[rows],
                 records.flight[rows], view.residual_db[rows], view.weight[rows])
             nats, form, number = max(each for each in candidates if each[1] == "step" or not self._steps_only)
-            if nats > best[0]:
-                best = nats, {"receivers": {str(receiver): [form, float(number)]}}
-        return [best[1]] if best[1] else []
+            if nats > LEAST_NATS:
+                found.append((nats, {"receivers": {str(receiver): [form, float(number)]}}))
+        return [setting for _, setting in sorted(found, key=lambda each: -each[0])[:MOST_TRIED]]
 
     def term(self, records, setting, at) -> Term:
         columns, names = [], []

@@ -8,7 +8,19 @@ from scipy.optimize import minimize
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from radiotwin.closeloop.regression import Problem, _derivatives, covariance, mean_db, nll, nll_at, residual_db, solve
+from radiotwin.closeloop.regression import (
+    Expected,
+    Problem,
+    _derivatives,
+    _slope_and_hessian,
+    covariance,
+    expect,
+    nll,
+    nll_at,
+    residual_db,
+    solve,
+)
+from radiotwin.effects.noise_floor import floored
 
 
 def problem(level_db, columns, limit_db=-np.inf, dof=5.0, split=1, paths=None, receiver=None, spread=np.inf):
@@ -101,7 +113,8 @@ def test_derivatives_are_those_of_the_likelihood_also_where_links_are_lost(share
     level_db[::2] = np.nan
     given = replace(problem(level_db, np.ones((300, 1)), -95.0), lost=np.full(300, share))
     mean, scale, step = rng.uniform(-110, -70, 300), 3.0, 1e-3
-    slope, curvature, spread = _derivatives(given, mean, np.array([scale]))
+    one = np.ones(300)
+    slope, curvature, spread = _derivatives(given, Expected(mean, scale * one, one[:, None], one, 0 * one, one))
     around = [nll_at(given, mean + way * step, np.full(300, scale)) for way in (-1, 0, 1)]
     np.testing.assert_allclose(slope, (around[0] - around[2]) / (2 * step), atol=1e-5)
     blank = np.isnan(level_db)
@@ -139,13 +152,52 @@ def test_what_paths_add_and_receivers_compress_is_undone():
     found = solve(given)
     np.testing.assert_allclose(found.coefficients, truth, atol=0.15)
     assert np.sqrt(np.mean(residual_db(given, found) ** 2)) == pytest.approx(0.5, rel=0.1)
-    step = np.zeros(3)
-    for i in range(3):  # the derivative against differences
-        step[:] = 0
-        step[i] = 1e-4
-        slope = (given.mean(found.coefficients + step)[0] - given.mean(found.coefficients - step)[0]) / 2e-4
-        smooth = np.abs(mean_db(given, found) + 72) > 0.01
-        np.testing.assert_allclose(given.mean(found.coefficients)[1][smooth, i], slope[smooth], atol=1e-4)
+
+
+@pytest.mark.parametrize("unsure_db", [0.0, 6.0])
+def test_what_is_read_near_a_floor_is_the_mean_of_what_may_arrive(unsure_db):
+    """Against draws: levels scatter before the receiver adds its floor."""
+    rng = np.random.default_rng(7)
+    arriving_db = np.array([-120.0, -100.0, -92.0, -85.0, -60.0])
+    given = replace(problem(np.zeros(5), arriving_db[:, None], receiver=lambda level: floored(level, -90.0)),
+                    unsure_db=np.full(5, unsure_db))
+    expected = given.expect(np.ones(1), np.array([7.0]))
+    drawn_db = floored(arriving_db + np.hypot(7.0, unsure_db) * rng.normal(size=(200_000, 5)), -90.0)[0]
+    np.testing.assert_allclose(expected.mean_db, drawn_db.mean(axis=0), atol=0.15)
+    assert (np.diff(expected.scale_db) > 0).all() and 3.5 <= expected.scale_db[0] < 4
+    assert expected.scale_db[-1] == pytest.approx(np.hypot(7.0, unsure_db), rel=0.05)
+
+
+def test_slope_and_growth_of_what_is_read_are_those_of_differences():
+    rng = np.random.default_rng(8)
+    columns = np.column_stack([np.ones(200), rng.normal(size=200)])
+    level_db = floored(columns @ [-92.0, 8.0] + rng.normal(0, 6, 200), -95.0)[0]
+    given = problem(level_db, columns, receiver=lambda level: floored(level, -95.0))
+    beta, scale_db, step = np.array([-90.0, 7.0]), np.array([6.0]), 1e-4
+
+    def log_likelihood(numbers):
+        expected = given.expect(numbers, scale_db)
+        return -nll_at(given, expected.mean_db, expected.scale_db).sum()
+    found = _slope_and_hessian(given, given.expect(beta, scale_db), np.zeros(2))[0]
+    steps = step * np.eye(2)
+    numeric = [(log_likelihood(beta + each) - log_likelihood(beta - each)) / (2 * step) for each in steps]
+    np.testing.assert_allclose(found, numeric, rtol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_law_under_a_floor_is_found(seed):
+    """Three links in four lie below the floor of the receiver; a law without it would be half as steep."""
+    rng = np.random.default_rng(seed)
+    columns = np.column_stack([np.ones(4000), rng.uniform(1.5, 3.5, 4000)])
+    arriving_db = columns @ [-20.0, -32.0] + 6.0 * rng.standard_t(5, 4000)
+    level_db = floored(arriving_db, -85.0)[0] + rng.normal(0, 1.0, 4000)
+    given = problem(level_db, columns, receiver=lambda level: floored(level, -85.0))
+    flat = solve(replace(given, receiver=None))
+    found = solve(given)
+    assert found.coefficients[1] == pytest.approx(-32.0, abs=4.0) and flat.coefficients[1] > -22
+    error_db = level_db - expect(given, found).mean_db
+    assert np.sqrt(np.mean(error_db**2)) < np.sqrt(np.mean((level_db - expect(replace(given, receiver=None),
+                                                                              flat).mean_db) ** 2))
 
 
 def test_with_many_degrees_of_freedom_the_errors_are_normal():
