@@ -10,62 +10,84 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-MAX_POINTS = 1500
+MAX_POINTS = 2500  # of a series
+MAX_PAIRS = 36e6  # of all series: their matrices take 8 bytes a pair
 MAX_POINTS_TO_FIT = 300
 SAME_POINT_M = 0.1
+COARSER = 1.5  # times, from one width of cells to the next
 BATCH = 2000
 
 
 @dataclass(frozen=True)
 class _Field:
-    """What one series left over: position_m (p, 3), residual (p,) in sigmas of the law."""
+    """What one series left over at p points.
+
+    Attributes:
+        position_m: (p, 3).
+        residual: (p,) in sigmas of the law, the mean of `count` measurements.
+        kind: (p,) what the measurements of a point have in common.
+        count: (p,).
+    """
 
     position_m: np.ndarray
     residual: np.ndarray
+    kind: np.ndarray
+    count: np.ndarray
 
 
 class ResidualField:
     """A Gaussian process of unit variance for each series of points, such as the receivers' places for each device.
 
-    Correlation a * exp(-r / length), the exponential model of shadowing (Gudmundson 1991, Electronics Letters 27), and
-    a nugget 1 - a for noise and what changes between neighbouring points. `share` a and `length_m` are common to all
-    series and have the highest marginal likelihood on at most MAX_POINTS_TO_FIT points of each.
+    Correlation a * exp(-r / length), the exponential model of shadowing (Gudmundson 1991, Electronics Letters 27), b
+    between measurements of one kind, such as those by one phone, wherever they are, and a nugget 1 - a - b for noise
+    and what changes between neighbouring points. `share` a, `kind_share` b and `length_m` are common to all series and
+    have the highest marginal likelihood on at most MAX_POINTS_TO_FIT points of each. Where points are too many,
+    neighbours become their mean.
     """
 
     def __init__(self) -> None:
-        self.share, self.length_m = 0.5, 50.0
+        self.share, self.kind_share, self.length_m = 0.5, 0.0, 50.0
         self.fields: dict[int, _Field] = {}
 
-    def fit(self, series: np.ndarray, position_m: np.ndarray, residual: np.ndarray, seed: int) -> Self:
+    def fit(self, series: np.ndarray, position_m: np.ndarray, residual: np.ndarray, seed: int,
+            kind: np.ndarray | None = None) -> Self:
         """Learn from points.
 
         Args:
             series: (n,) index of the series that a point belongs to.
             position_m: (n, 3) [m].
             residual: (n,) of unit variance.
-            seed: picks points where there are too many.
+            seed: picks the points that share and length are fitted to.
+            kind: (n,) index of what has an error of its own in each series; None: nothing has.
         """
         rng = np.random.default_rng(seed)
-        self.fields = {}
-        for number in np.unique(series):
+        kind = np.zeros(len(series), dtype=int) if kind is None else kind
+        numbers = np.unique(series)
+        most = int(min(MAX_POINTS, max(np.sqrt(MAX_PAIRS / max(len(numbers), 1)), MAX_POINTS_TO_FIT)))
+        self.fields, some = {}, []
+        for number in numbers:
             mask = series == number
-            self.fields[int(number)] = _thinned(_merged(position_m[mask], residual[mask]), MAX_POINTS, rng)
-        self._fit_correlation([_thinned(field, MAX_POINTS_TO_FIT, rng) for field in self.fields.values()])
+            points = position_m[mask], residual[mask], kind[mask]
+            self.fields[int(number)] = _merged(*points, most)
+            some.append(_some(_merged(*points, len(residual)), rng))
+        self._fit_correlation(some, len(np.unique(kind)) > 1)
         self._factor()
         return self
 
-    def predict(self, series: np.ndarray, position_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def predict(self, series: np.ndarray, position_m: np.ndarray,
+                kind: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Mean (n,) and standard deviation (n,) of the residual; 0 and 1 far from all points and in unknown series.
 
         In batches of BATCH points, so that maps of any size fit.
         """
         mean, sigma = np.zeros(len(series)), np.ones(len(series))
+        kind = np.zeros(len(series), dtype=int) if kind is None else kind
         for number, field in self.fields.items():
             factor, weights = self._solved[number]
             mine = np.flatnonzero(series == number)
             for start in range(0, len(mine), BATCH):
                 rows = mine[start : start + BATCH]
-                cross = self.share * np.exp(-cdist(field.position_m, position_m[rows]) / self.length_m)
+                cross = self._correlation(cdist(field.position_m, position_m[rows]), field.kind, kind[rows])
                 mean[rows] = weights @ cross
                 explained = np.square(solve_triangular(factor, cross, lower=True, overwrite_b=True)).sum(axis=0)
                 sigma[rows] = np.sqrt(np.maximum(1.0 - explained, 0.0))
@@ -77,66 +99,86 @@ class ResidualField:
         for number, field in self.fields.items():
             arrays[f"position_m/{number}"] = field.position_m
             arrays[f"residual/{number}"] = field.residual
-        return arrays, {"devices": list(self.fields), "share": self.share, "length_m": self.length_m}
+            arrays[f"kind/{number}"] = field.kind
+            arrays[f"count/{number}"] = field.count
+        return arrays, {"devices": list(self.fields), "share": self.share, "kind_share": self.kind_share,
+                        "length_m": self.length_m}
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
         """What `state` gave."""
         field = cls()
-        field.share, field.length_m = settings["share"], settings["length_m"]
-        field.fields = {number: _Field(arrays[f"position_m/{number}"], arrays[f"residual/{number}"])
+        field.share, field.kind_share = settings["share"], settings["kind_share"]
+        field.length_m = settings["length_m"]
+        field.fields = {number: _Field(*(arrays[f"{name}/{number}"] for name in
+                                         ("position_m", "residual", "kind", "count")))
                         for number in settings["devices"]}
         field._factor()
         return field
 
-    def _fit_correlation(self, fields: list[_Field]) -> None:
-        """Share and length of highest marginal likelihood (Rasmussen and Williams 2006, equation 5.8)."""
+    def _correlation(self, distance_m: np.ndarray, kind: np.ndarray, other: np.ndarray) -> np.ndarray:
+        correlation = self.share * np.exp(-distance_m / self.length_m)
+        return correlation + self.kind_share * (kind[:, None] == other[None]) if self.kind_share else correlation
+
+    def _covariance(self, field: _Field, distance_m: np.ndarray) -> np.ndarray:
+        covariance = self._correlation(distance_m, field.kind, field.kind)
+        covariance[np.diag_indices(len(covariance))] += (1 - self.share - self.kind_share) / field.count + 1e-8
+        return covariance
+
+    def _fit_correlation(self, fields: list[_Field], kinds: bool) -> None:
+        """Shares and length of highest marginal likelihood (Rasmussen and Williams 2006, equation 5.8)."""
         apart_m = [cdist(field.position_m, field.position_m) for field in fields]
         greatest_m = max(float(distance.max()) for distance in apart_m)
         if greatest_m == 0.0:
             return
 
+        def take(theta: np.ndarray) -> None:
+            of_place, of_kind = np.exp(theta[0]), np.exp(theta[2]) if kinds else 0.0
+            total = 1.0 + of_place + of_kind
+            self.share, self.kind_share = float(of_place / total), float(of_kind / total)
+            self.length_m = float(np.exp(theta[1]))
+
         def objective(theta: np.ndarray) -> float:
-            share, length_m = 1.0 / (1.0 + np.exp(-theta[0])), np.exp(theta[1])
+            take(theta)
             value = 0.0
             for field, distance in zip(fields, apart_m, strict=True):
-                factor = cholesky(_covariance(distance, share, length_m), lower=True, overwrite_a=True)
+                factor = cholesky(self._covariance(field, distance), lower=True, overwrite_a=True)
                 whitened = solve_triangular(factor, field.residual, lower=True)
                 value += 0.5 * whitened @ whitened + np.log(np.diag(factor)).sum()
             return value
 
-        bounds = [(-4.0, 6.0), (np.log(1.0), np.log(max(2.0, 2.0 * greatest_m)))]
-        starts = [np.array([0.0, np.log(part * greatest_m)]) for part in (0.02, 0.2)]
+        number = 2 + kinds
+        bounds = [(-4.0, 6.0), (np.log(1.0), np.log(max(2.0, 2.0 * greatest_m))), (-6.0, 4.0)][:number]
+        starts = [np.array([0.0, np.log(part * greatest_m), -1.0])[:number] for part in (0.02, 0.2)]
         start = min((np.clip(start, *np.transpose(bounds)) for start in starts), key=objective)
-        simplex = start + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.7]])
-        options = {"initial_simplex": simplex, "maxfev": 60, "xatol": 0.05, "fatol": 0.1}
-        theta = minimize(objective, start, method="Nelder-Mead", bounds=bounds, options=options).x
-        self.share, self.length_m = float(1.0 / (1.0 + np.exp(-theta[0]))), float(np.exp(theta[1]))
+        simplex = np.vstack([start, start + np.diag([1.0, 0.7, 1.0])[:number, :number]])
+        options = {"initial_simplex": simplex, "maxfev": 30 * number, "xatol": 0.05, "fatol": 0.1}
+        take(minimize(objective, start, method="Nelder-Mead", bounds=bounds, options=options).x)
 
     def _factor(self) -> None:
         """What predictions need of every series: Cholesky factor (p, p) and weights (p,)."""
         self._solved = {}
         for number, field in self.fields.items():
-            covariance = _covariance(cdist(field.position_m, field.position_m), self.share, self.length_m)
-            factor = cholesky(covariance, lower=True)
+            factor = cholesky(self._covariance(field, cdist(field.position_m, field.position_m)), lower=True)
             self._solved[number] = factor, cho_solve((factor, True), field.residual)
 
 
-def _covariance(distance_m: np.ndarray, share: float, length_m: float) -> np.ndarray:
-    covariance = share * np.exp(-distance_m / length_m)
-    np.fill_diagonal(covariance, 1.0 + 1e-8)
-    return covariance
+def _merged(position_m: np.ndarray, residual: np.ndarray, kind: np.ndarray, most: int) -> _Field:
+    """Repeated visits of one point become their mean; so do neighbours, in cells just wide enough, of more points."""
+    width_m = SAME_POINT_M
+    while True:
+        cells = np.column_stack([np.round(position_m / width_m), kind])
+        _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+        if len(count) <= most or width_m > np.ptp(position_m, axis=0).max():
+            break
+        width_m *= COARSER
+    cell = cell.ravel()
+    means = [np.bincount(cell, values) / count for values in (*position_m.T, residual, kind)]
+    return _Field(np.column_stack(means[:3]), means[3], means[4].round().astype(int), count)
 
 
-def _merged(position_m: np.ndarray, residual: np.ndarray) -> _Field:
-    """Repeated visits of one point become their mean."""
-    _, first, group, count = np.unique(np.round(position_m / SAME_POINT_M), axis=0, return_index=True,
-                                       return_inverse=True, return_counts=True)
-    return _Field(position_m[first], np.bincount(group.ravel(), residual) / count)
-
-
-def _thinned(field: _Field, most: int, rng: np.random.Generator) -> _Field:
-    if len(field.residual) <= most:
+def _some(field: _Field, rng: np.random.Generator) -> _Field:
+    if len(field.residual) <= MAX_POINTS_TO_FIT:
         return field
-    rows = np.sort(rng.choice(len(field.residual), most, replace=False))
-    return _Field(field.position_m[rows], field.residual[rows])
+    rows = np.sort(rng.choice(len(field.residual), MAX_POINTS_TO_FIT, replace=False))
+    return _Field(field.position_m[rows], field.residual[rows], field.kind[rows], field.count[rows])

@@ -70,6 +70,7 @@ def errors(level_db: np.ndarray, mean_db: np.ndarray) -> dict[str, float]:
 def _shadowing(entry: Judged, model: Model, rank: int) -> dict:
     field, sigma = model.shadowing[0].field, model.shadowing[0].sigma
     numbers = {"length_m": (field.length_m, "m"), "share": (field.share, "of the variance"),
+               "receiver_share": (field.kind_share, "of the variance"),
                "sigma_db": (sigma * float(model.fits[0].scale_db.mean()), "dB")}
     return {"name": entry.name, "variant": "", "rank": rank, "setting": {},
             "parameters": {name: {"value": value, "low": np.nan, "high": np.nan, "unit": unit}

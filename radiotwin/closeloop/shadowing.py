@@ -1,8 +1,9 @@
 """`correlated_shadowing`, the last resort: what no named effect explains is interpolated over the ground.
 
 A Gaussian process over the place of the end that moves, one field for each of the ends that do not (the exponential
-model of shadowing, Gudmundson 1991, Electronics Letters 27). It explains nothing: it says that the rest of the error
-has a place. It is no candidate among the effects, because it would fit part of whatever they stand for.
+model of shadowing, Gudmundson 1991, Electronics Letters 27), and beside it an error of each receiver in each field. It
+explains nothing: it says that the rest of the error has a place. It is no candidate among the effects, because it would
+fit part of whatever they stand for.
 """
 
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from radiotwin.closeloop.records import Records
 from radiotwin.closeloop.regression import Solution, expect, residual_db
 
 NAME = "correlated_shadowing"
-MOST_Z = 4.0  # an outlier counts as this many scales
+MOST_Z = 6.0  # an outlier counts as this many scales
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +42,8 @@ class Shadowing:
         z = np.clip(residual_db(problem, solution) / expect(problem, solution).scale_db, -MOST_Z, MOST_Z)
         sigma = max(float(z.std()), 1e-6)
         shadowing = cls(ResidualField(), sigma, receivers_move(side.records))
-        shadowing.field.fit(*shadowing._points(side.records.select(side.train)), (z - z.mean()) / sigma, seed)
+        series, position_m, kind = shadowing._points(side.records.select(side.train))
+        shadowing.field.fit(series, position_m, (z - z.mean()) / sigma, seed, kind)
         return shadowing
 
     def at(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
@@ -64,10 +66,11 @@ class Shadowing:
         return cls(ResidualField.from_state(arrays, state["settings"]), state["sigma"], state["receivers_move"],
                    state["certain"])
 
-    def _points(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
+    def _points(self, records: Records) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Series, position and kind of links. Where two receivers were at one place, their difference shows."""
         if self.receivers_move:
-            return records.device, records.receiver_m
-        return records.receiver, records.device_m[records.device]
+            return records.device, records.receiver_m, records.receiver
+        return records.receiver, records.device_m[records.device], None
 
 
 def receivers_move(records: Records) -> bool:

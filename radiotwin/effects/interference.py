@@ -17,6 +17,7 @@ PLACE_M = 10.0  # places closer together count as one
 HEIGHT_M = 1.5
 REFERENCE_M = 100.0
 AROUND_M = 100.0  # farther from all receivers it would be the same for each of them: a noise floor
+EDGE_M = 10.0
 CELLS = 300
 FINEST_M = 20.0
 QUANTILES = (0.05, 0.2, 0.4, 0.6, 0.8)  # of the levels, for the emitter's
@@ -71,6 +72,12 @@ class Interference(Effect):
             np.array([*setting["place_m"], level_db]), np.array([20.0, 20.0, 3.0]),
             np.array([*within_m[:2], level_db - 40]), np.array([*within_m[2:], level_db + 40]),
             lambda numbers: setting | {"place_m": [float(v) for v in numbers[:2]], "level_db": float(numbers[2])})
+
+    def unphysical(self, setting, coefficients) -> str | None:
+        low, high = np.reshape(setting["within_m"], (2, 2))
+        if (np.minimum(setting["place_m"] - low, high - setting["place_m"]) < EDGE_M).any():
+            return "the emitter would stand at the edge of what is searched, or beyond: its place is not told"
+        return None
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
         values = zip(("x_m", "y_m", f"level_at_{REFERENCE_M:.0f}_m"), (*setting["place_m"], setting["level_db"]),

@@ -9,6 +9,7 @@ import numpy as np
 from radiotwin.effects.base import LEAST_POWER, NEPERS, Effect, Parameter, Term, Variation, View, measured
 
 LEAST_LINKS = 40
+LEAST_RECEIVERS = 3  # of which something is known, to tell what is usual
 COMMON_QUANTILES = (0.03, 0.15)
 QUANTILES = (0.01, 0.05, 0.1, 0.2, 0.35, 0.5)
 
@@ -41,8 +42,10 @@ class NoiseFloor(Effect):
         return Term.of_offset(np.zeros(len(records)))
 
     def bend(self, level_db, records, setting, extra):
-        # One of which nothing is known has the usual one.
-        floor = np.full(len(records.receiver_names), np.median(list(setting["receivers"].values())))
+        floors = list(setting["receivers"].values())
+        # A receiver of which nothing is known has the usual one.
+        usual = np.median(floors) if len(floors) >= LEAST_RECEIVERS else -np.inf
+        floor = np.full(len(records.receiver_names), usual)
         for receiver, floor_db in setting["receivers"].items():
             floor[int(receiver)] = floor_db
         return floored(level_db, floor[records.receiver])

@@ -190,7 +190,7 @@ def test_pictures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_
 
 
 @pytest.mark.parametrize("effect, setting", [
-    (DeviceGainOffset, {"members": [0, 1, 2]}), (ExcessAttenuation, {"scale_height_m": 100.0}),
+    (DeviceGainOffset, {"members": [0, 1, 2], "spread_db": 4.0}), (ExcessAttenuation, {"scale_height_m": 100.0}),
     (BodyShadowing, {"members": [0, 1]}),
     (ReceiverDrift, {"receivers": {"0": ["warm_up_each_flight", 8.0], "1": ["step", 150.0]}}),
     (ReceiverSaturation, {"receivers": {"0": [-85.0, 1.0]}}), (NoiseFloor, {"receivers": {"1": -95.0}}),

@@ -34,6 +34,12 @@ def test_receivers_that_stand_still_cannot_tell(links):
     assert Interference().lacks(links([[0.0, 0, 1.5]], np.vstack([places_m, places_m + (0, 50, 0)]))) is None
 
 
+def test_an_emitter_at_the_edge_of_what_is_searched_has_no_place():
+    setting = {"place_m": [300.0, 80.0], "level_db": -90.0, "within_m": [0.0, 0.0, 300.0, 300.0]}
+    assert "edge" in Interference().unphysical(setting, np.zeros(0))
+    assert Interference().unphysical(setting | {"place_m": [250.0, 80.0]}, np.zeros(0)) is None
+
+
 def test_an_emitter_is_found_where_it_stands(open_ground, loop):
     world = open_ground.fly(21)
     power = heard(world.receiver_m, np.array([330.0, 140.0, 3.0]), -99.0)

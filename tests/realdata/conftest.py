@@ -1,0 +1,55 @@
+"""Real measurements, where they are: the folder RADIOTWIN_DATA, or shared/data beside the checkout."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from radiotwin.measurements import Measurements, read_measurements
+
+DATA = Path(os.environ.get("RADIOTWIN_DATA", Path(__file__).parents[3] / "shared" / "data"))
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if Path(__file__).parent in item.path.parents:
+            item.add_marker(pytest.mark.realdata)
+
+
+@pytest.fixture(scope="session")
+def folder():
+    """Where a set lies; skips where it is not."""
+    def of(name: str) -> Path:
+        if not (DATA / name).is_dir():
+            pytest.skip(f"{DATA / name} is not there: docs/real-data.md says where to get it; name its folder in "
+                        "RADIOTWIN_DATA")
+        return DATA / name
+    return of
+
+
+@pytest.fixture(scope="session")
+def permuted():
+    """Measurements whose levels have changed places within each device."""
+    def of(measurements: Measurements, seed: int) -> Measurements:
+        table, rng = measurements.table.copy(), np.random.default_rng(seed)
+        column = measurements.level_column
+        table[column] = table.groupby("device")[column].transform(lambda levels: rng.permutation(levels.to_numpy()))
+        return Measurements(table, measurements.devices)
+    return of
+
+
+@pytest.fixture(scope="session")
+def duke(folder) -> Measurements:
+    """Every other link of the campus network."""
+    whole = read_measurements(folder("duke_cbrs") / "measurements.csv.gz")
+    return Measurements(whole.table[::2].reset_index(drop=True), whole.devices)
+
+
+@pytest.fixture(scope="session")
+def powder(folder) -> Measurements:
+    """800 of the 5,006 places of hand-held transmitters."""
+    whole = read_measurements(folder("powder_frs") / "measurements.csv.gz")
+    devices = whole.devices.sample(800, random_state=0)
+    kept = whole.table["device"].isin(devices["device"])
+    return Measurements(whole.table[kept].reset_index(drop=True), devices.reset_index(drop=True))

@@ -1,0 +1,64 @@
+"""Receivers that nobody calibrated, on days that are held out: gains, floors and what changed between days."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.closeloop.locate import Corrected, locate, whole_area
+from radiotwin.closeloop.run import close_loop
+from radiotwin.closeloop.search import rmse_db
+
+DAYS = ("2022-04-25", "2022-07-05", "2022-07-06", "2022-07-11")  # on the fifth half of the receivers were others
+CHANGED = "ebc-nuc1-b210"  # 19 dB less after April
+DEVICES_A_DAY = 25
+
+
+@pytest.fixture(scope="module")
+def loop(powder):
+    return close_loop(powder, None, "log-distance", 0, lambda text: None, "flight")
+
+
+def day_mean_db(loop, model) -> float:
+    names = loop.records.flight_names
+    return float(np.mean([rmse_db(model, loop.records.flight == names.index(day)) for day in DAYS]))
+
+
+def test_gains_floors_and_the_step_of_one_receiver_are_named(loop):
+    named = {part.effect.name: part.setting for part in loop.after.whole.parts}
+    assert {"receiver_gain_offset", "noise_floor_censoring", "receiver_drift"} <= set(named)
+    (receiver, (form, when_s)), = named["receiver_drift"]["receivers"].items()
+    assert loop.records.receiver_names[int(receiver)] == CHANGED and form == "step"
+    assert pd.Timestamp("2022-04-26").timestamp() < when_s < pd.Timestamp("2022-07-06").timestamp()
+
+
+def test_floors_are_those_of_readings_without_a_transmitter(loop, folder):
+    """Which the fit has never read."""
+    noise_db = pd.read_csv(folder("powder_frs") / "noise_only.csv").groupby("rx_id")["noise_db"].median()
+    floors_db = next(part.setting["receivers"] for part in loop.after.whole.parts
+                     if part.effect.name == "noise_floor_censoring")
+    names = [loop.records.receiver_names[int(receiver)] for receiver in floors_db]
+    off_db = [floor - noise_db[name] for name, floor in zip(names, floors_db.values()) if name in noise_db]
+    assert len(off_db) >= 25 and np.median(np.abs(off_db)) <= 3.0
+
+
+def test_the_error_on_days_that_are_held_out(loop):
+    assert day_mean_db(loop, loop.before) == pytest.approx(9.6, abs=0.4)
+    assert day_mean_db(loop, loop.after) < day_mean_db(loop, loop.before) - 1.4
+
+
+def test_transmitters_of_days_that_are_held_out_are_found_better(loop):
+    def medians_m(model) -> np.ndarray:
+        off_m = []
+        for number, (side, fit) in enumerate(zip(model.folds, model.fits[1:])):
+            day, corrected = loop.records.select(model.index == number), Corrected.of(side, fit)
+            devices = np.random.default_rng(0).permutation(np.unique(day.device))[:DEVICES_A_DAY]
+            asked = day.select(np.isin(day.device, devices))
+            off_m += [np.hypot(*(loop.records.device_m[place.device, :2] - (place.x_m, place.y_m)))
+                      for place in locate(corrected, asked, whole_area(corrected, asked))]
+        return np.median(off_m)
+    assert medians_m(loop.after) < 0.9 * medians_m(loop.before)
+
+
+def test_of_permuted_levels_nothing_is_named(powder, permuted):
+    loop = close_loop(permuted(powder, 0), None, "log-distance", 0, lambda text: None, "flight")
+    assert not [part for part in loop.after.whole.parts if part.effect.explains]
