@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from radiotwin.closeloop.locate import Corrected, calibrated_temper, locate
+from radiotwin.closeloop.locate import Corrected, calibrated_temper, locate, whole_area
 from radiotwin.closeloop.report import make_report
 from radiotwin.closeloop.run import Loop, close_loop
 from radiotwin.closeloop.search import Model, rmse_db
@@ -28,7 +28,6 @@ from radiotwin.files import atomic_path
 from radiotwin.measurements import Measurements, read_measurements
 
 AZIMUTHS_DEG = {"A": 212, "B": 212, "C": 30, "D": 30, "E": 216, "F": 216}  # clockwise from north
-AROUND_M = 300.0
 DEVICES_A_DAY = 150
 
 
@@ -133,9 +132,9 @@ def _located(loop: Loop, model: Model) -> dict:
     """Held-out devices found by models of the other days, and the regions calibrated on those."""
     records = loop.records
     device_m = records.device_m[:, :2]
-    area_m = tuple(np.column_stack([device_m.min(axis=0) - AROUND_M, device_m.max(axis=0) + AROUND_M]).ravel())
     models = [Corrected.of(side, fit) for side, fit in zip(model.folds, model.fits[1:])]
     days = [records.select(model.index == number) for number in range(len(models))]
+    area_m = whole_area(models[0], records)
     rng, result, every = np.random.default_rng(0), {}, []
     for number, (corrected, day) in enumerate(zip(models, days)):
         others = [i for i in range(len(models)) if i != number]
