@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import minimize, minimize_scalar
 
 from radiotwin.closeloop.bases import ANY_LEVEL_DB, FittedBase
 from radiotwin.closeloop.records import Records
@@ -19,7 +19,7 @@ MEMBER_REFINED_ON = 1500  # of each member
 MOST_FITS = 2  # of proposals of one effect
 WORTH_REFINING_NATS = 5.0
 LEAST_RISE_NATS = 1e-3
-VERY_LOW_DB = -200.0  # where whatever a receiver does to a level shows
+EXTREMES_DB = (-200.0, 100.0)  # levels at which whatever a receiver does to them shows
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,38 +274,45 @@ def _refine_members(side: Side, fitted: Solution, part: Part, variation: Variati
         setting = variation.setting(np.clip(numbers, variation.low, variation.high))
         return Part(part.effect, setting, part.effect.term(records, setting, side.base.shifted_db))
 
-    def level_db(records: Records, numbers: np.ndarray) -> np.ndarray:
+    def done_db(records: Records, numbers: np.ndarray) -> np.ndarray:
         there = changed(records, numbers)
         if not at_receiver:
             return there.term.offset_db
-        return part.effect.bend(np.full(len(records), VERY_LOW_DB), records, there.setting, there.term.extra)[0]
+        return sum(part.effect.bend(np.full(len(records), level_db), records, there.setting, there.term.extra)[0]
+                   for level_db in EXTREMES_DB)
 
     for member in variation.members:
         moved = numbers.copy()
         moved[member] += variation.steps[member]
         rows = np.flatnonzero(side.train)
         trained = side.records.select(rows)
-        rows = some(rows[level_db(trained, moved) != level_db(trained, numbers)], MEMBER_REFINED_ON)
+        rows = some(rows[done_db(trained, moved) != done_db(trained, numbers)], MEMBER_REFINED_ON)
         if not len(rows):
             continue
+        latest = None
         mine, others = side.records.select(rows), [replace(p, term=p.term.select(rows)) for p in side.parts[:-1]]
         alone = replace(side.with_parts([]).problem(rows), law_columns=np.ones((len(rows), 1)),
                         spread_db=np.full(1, ANY_LEVEL_DB))
 
         def objective(values: np.ndarray) -> float:
+            nonlocal latest
             tried, inside = numbers.copy(), np.clip(values, variation.low[member], variation.high[member])
             tried[member] = inside
             there = changed(mine, tried)
             receiver = _bend([*others, there], "receiver", mine, slice(None))
             outside = np.abs((values - inside) / variation.steps[member]).sum()
-            return solve(replace(alone, law_db=arriving_db[rows] + there.term.offset_db, receiver=receiver)
-                         ).objective + 10.0 * outside
+            latest = solve(replace(alone, law_db=arriving_db[rows] + there.term.offset_db, receiver=receiver), latest)
+            return latest.objective + 10.0 * outside
 
         numbers[member] = _descend(objective, numbers[member], variation.steps[member])
     return _better(side, fitted, part, variation, numbers)
 
 
 def _descend(objective: Callable[[np.ndarray], float], values: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    if len(values) == 1:
+        around = (values[0] - steps[0], values[0] + steps[0])
+        return minimize_scalar(lambda value: objective(np.array([value])), around, method="brent",
+                               options={"xtol": 1e-3, "maxiter": TRIALS}).x[None]
     simplex = np.vstack([values, values + np.diag(steps)])
     options = {"initial_simplex": simplex, "maxfev": TRIALS * len(simplex), "xatol": 1e-2, "fatol": 0.1}
     return minimize(objective, values, method="Nelder-Mead", options=options).x

@@ -63,7 +63,8 @@ class ReceiverSaturation(Effect):
                                   for receiver, (level, smooth) in zip(receivers, np.reshape(numbers, (-1, 2)))}}
         times = len(receivers)
         return Variation(values, np.tile([3.0, 0.4], times), np.tile([-250.0, np.log(0.4)], times),
-                         np.tile([50.0, np.log(8.0)], times), again)
+                         np.tile([50.0, np.log(8.0)], times), again,
+                         list(np.arange(len(values)).reshape(times, -1)))
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
         result = {}

@@ -13,6 +13,7 @@ import numpy as np
 from radiotwin.closeloop.paths import free_space, rays_of, through_antenna_db
 from radiotwin.closeloop.records import Records
 from radiotwin.effects.base import Effect, Parameter, Remembered, Term, Variation, View, measured, one_hot, some
+from radiotwin.effects.position_errors import site_of
 
 LEAST_LINKS = 100
 LEAST_NATS = 4.0
@@ -48,7 +49,7 @@ def sector_pattern_db(azimuth_deg: np.ndarray, elevation_deg: np.ndarray, patter
 
 
 class SectorAntenna(Effect):
-    """A device's sector antenna that nobody declared; one step finds one device's."""
+    """A device's sector antenna that nobody declared; one step finds one device's, or all of a mast's."""
 
     name = "antenna_pattern"
     variant = "sector antenna of a device"
@@ -62,15 +63,33 @@ class SectorAntenna(Effect):
         return None if _placed(records) else f"no device of known position has {LEAST_LINKS} links"
 
     def propose(self, view: View) -> list[dict]:
-        records, best = view.records, (LEAST_NATS, None)
         known = {int(device) for devices in view.done(self.name, "devices") for device in devices}
-        for device in sorted(set(_placed(records)) - known):
-            every = np.flatnonzero(records.device == device)
+        found = self._patterns(view, sorted(set(_placed(view.records)) - known))
+        if not found:
+            return []
+        best = max(found, key=lambda device: found[device][1])
+        # Sectors of one mast have the evidence of all of them.
+        others = set(site_of(view.records, best)) & set(found)
+        return [{"devices": {str(device): found[device][0] for device in sorted(mast)}}
+                for mast in ([others, {best}] if len(others) > 1 else [{best}])]
+
+    def propose_like(self, view: View, setting: dict) -> list[dict]:
+        # Whether these devices have such antennas is the question, and not whether any has.
+        found = self._patterns(view, [int(device) for device in setting["devices"]])
+        return [{"devices": {str(device): pattern for device, (pattern, _) in found.items()}}] if found else []
+
+    def _patterns(self, view: View, devices: list[int]) -> dict[int, tuple[list[float], float]]:
+        """Device -> its best pattern, and what it gains [nats], where that is enough."""
+        found = {}
+        for device in devices:
+            every = np.flatnonzero(view.records.device == device)
             rows = some(every, ENOUGH_LINKS)
-            pattern, nats = _best_pattern(_Rays.of(records.select(rows)), view, rows)
-            if nats * len(every) / len(rows) > best[0]:
-                best = nats * len(every) / len(rows), {"devices": {str(device): pattern}}
-        return [best[1]] if best[1] else []
+            if not len(rows):
+                continue
+            pattern, nats = _best_pattern(_Rays.of(view.records.select(rows)), view, rows)
+            if nats * len(every) / len(rows) > LEAST_NATS:
+                found[device] = pattern, nats * len(every) / len(rows)
+        return found
 
     def term(self, records, setting, at) -> Term:
         offset_db = np.zeros(len(records))
