@@ -1,63 +1,19 @@
-"""Commands that make a world and measure in it: build-scene, trace, survey."""
+"""Commands that measure in a world: trace, survey."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from radiotwin.cli.console import console, say, show_warnings_plainly
+from radiotwin.cli.console import say, show_warnings_plainly
 from radiotwin.errors import BadInput
 
 SceneFolder = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder, as `build-scene` makes it.")]
 
 
 def add_commands(app: typer.Typer) -> None:
-    app.command("build-scene")(build_scene)
     app.command("trace")(trace)
     app.command("survey")(survey)
-
-
-def build_scene(
-    source: Annotated[str, typer.Argument(
-        metavar="CITY", help="A Mitsuba or Sionna RT XML file, or sionna:NAME (munich, etoile, …), or preset:NAME "
-                             "(rbm, rdm, small).")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Scene folder to write [scenes/NAME].")] = None,
-    check: Annotated[bool, typer.Option("--check", help="Report only; exit status 2 if tracing would fail.")] = False,
-    frequency_hz: Annotated[float | None, typer.Option(help="Frequency of the scene's radio [2.4e9].")] = None,
-    material: Annotated[list[str] | None, typer.Option(
-        metavar="NAME=ITU", help="Take the file's material NAME for an ITU material; may be repeated.")] = None,
-    scale: Annotated[float | None, typer.Option(help="Factor from the file's unit to metres (feet: 0.3048).")] = None,
-    up: Annotated[str | None, typer.Option(help="Axis of the file that points up: x, y or z.")] = None,
-    bbox: Annotated[str | None, typer.Option(
-        metavar="XMIN,YMIN,XMAX,YMAX", help="Keep only this part of the city [m].")] = None,
-    devices: Annotated[int | None, typer.Option(min=0, help="Devices to place on free ground [0].")] = None,
-    uavs: Annotated[int | None, typer.Option(min=0, help="UAVs to place near the middle [3].")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the placement [0].")] = None,
-) -> None:
-    """Turn a city model into a scene folder, and report what is in it and what is wrong with it."""
-    from radiotwin.scene.build import BuildOptions
-    from radiotwin.scene.build import build_scene as build
-    from radiotwin.scene.presets import build_preset_scene
-    from radiotwin.scene.report import print_report
-    from radiotwin.scene.sources import scene_name
-
-    show_warnings_plainly()
-    given = {"frequency_hz": frequency_hz, "materials": _pairs(material or []) or None, "scale": scale, "up": up,
-             "bbox": _box(bbox), "devices": devices, "uavs": uavs, "seed": seed}
-    given = {name: value for name, value in given.items() if value is not None}
-    if source.startswith("preset:"):
-        if given:
-            raise BadInput(f"{source} is built as it is published; the option for {', '.join(given)} cannot be used "
-                           "with it. Build it without, then change scene.toml")
-        name = source.removeprefix("preset:")
-        report = build_preset_scene(name, out or Path("scenes") / name, check_only=check)
-    else:
-        report = build(source, out or Path("scenes") / scene_name(source), BuildOptions(**given), check_only=check)
-    print_report(report, console)
-    if report.folder:
-        say(f"wrote {report.folder}: scene.toml, city.xml, meshes/, preview.png")
-    if report.tracing_would_fail:
-        raise typer.Exit(2)
 
 
 def trace(
@@ -139,23 +95,3 @@ def read_truth(scene, truth: str):
                            "--truth segmented")
         return RadioMap.read(path)
     return RadioMap.read(truth)
-
-
-def _pairs(texts: list[str]) -> dict[str, str]:
-    pairs = {}
-    for text in texts:
-        name, equals, itu = text.partition("=")
-        if not (name and equals and itu):
-            raise BadInput(f"--material {text!r} is not NAME=ITU; for example --material Roof=itu_metal")
-        pairs[name] = itu
-    return pairs
-
-
-def _box(text: str | None) -> tuple[float, float, float, float] | None:
-    if text is None:
-        return None
-    try:
-        x_min, y_min, x_max, y_max = (float(part) for part in text.split(","))
-    except ValueError:
-        raise BadInput(f"--bbox {text!r} is not four numbers; give XMIN,YMIN,XMAX,YMAX in metres") from None
-    return x_min, y_min, x_max, y_max

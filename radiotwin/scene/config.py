@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
+from radiotwin.geodesy import local_crs
 from radiotwin.tables import Number, Origin, Table
 
 SCHEMA = "radiotwin.scene/1"
@@ -111,6 +112,7 @@ class SceneConfig(Table):
     extent: Extent
     lattice: LatticeConfig
     origin: Origin | None = None
+    crs: str | None = Field(None, description="of the local frame in the words of PROJ, for other programs")
     devices: list[DeviceConfig] = []
     uavs: list[UavConfig] = []
     mission: MissionConfig = MissionConfig()
@@ -124,6 +126,9 @@ class SceneConfig(Table):
             double = {name for name in names if names.count(name) > 1}
             if double:
                 raise ValueError(f"{kind} {sorted(double)[0]!r} is declared twice; every name must be unique")
+        if self.crs is not None and (self.origin is None or self.crs != local_crs(self.origin)):
+            raise ValueError("crs is not that of the local frame about [origin]; remove it, or write "
+                             + (f"crs = \"{local_crs(self.origin)}\"" if self.origin else "an [origin]"))
         self._check_size()
         for device in self.devices:
             x_min_m, x_max_m, y_min_m, y_max_m = self.extent.bounds
