@@ -1,7 +1,8 @@
 """The local frame on the globe: x east, y north [m] in the plane that is azimuthal equidistant about an origin.
 
-On the WGS84 ellipsoid, with heights left as they are: distance and bearing from the origin are exact, and the ground stays
-at one z, as a flat city map has it; in a tangent plane (topocentric) the ground 10 km away would lie 8 m below zero.
+On the WGS84 ellipsoid, with heights left as they are: distance and bearing from the origin are exact, and the ground
+stays at one z, as a flat city map has it; in a tangent plane (topocentric) the ground 10 km away would lie 8 m below
+zero.
 """
 
 import numpy as np

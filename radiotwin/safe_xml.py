@@ -1,7 +1,7 @@
-"""XML of strangers: read piece by piece, with entities that a file declares refused, so that none can grow or reach out.
+"""XML of strangers: entities that a file declares are refused, so that none can grow or reach out.
 
-A few lines of entity declarations can stand for gigabytes of text ("billion laughs"), or for another file of this machine.
-No city or map needs one.
+A few lines of entity declarations can stand for gigabytes of text ("billion laughs"), or for another file of this
+machine. No city or map needs one.
 """
 
 from collections.abc import Callable
@@ -21,8 +21,8 @@ def parse_elements(path: Path, start: Callable[[str, dict[str, str], int], None]
     parser = expat.ParserCreate()
 
     def refuse(name, *_) -> None:
-        raise BadInput(f"{path}, line {parser.CurrentLineNumber}: declares the entity {name!r}, which can stand for any "
-                       "amount of text or for another file; remove the <!DOCTYPE …> with its entities")
+        raise BadInput(f"{path}, line {parser.CurrentLineNumber}: declares the entity {name!r}, which can stand for "
+                       "any amount of text or for another file; remove the <!DOCTYPE …> with its entities")
 
     parser.StartElementHandler = lambda tag, attributes: start(tag, attributes, parser.CurrentLineNumber)
     parser.EndElementHandler = end

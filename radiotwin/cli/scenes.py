@@ -15,8 +15,8 @@ def add_commands(app: typer.Typer) -> None:
 
 def build_scene(
     source: Annotated[str, typer.Argument(
-        metavar="CITY", help="A map (.osm, .osm.pbf, .geojson, .gpkg), a Mitsuba or Sionna RT XML file, sionna:NAME (munich, "
-                             "etoile, …), or preset:NAME (rbm, rdm, small).")],
+        metavar="CITY", help="A map (.osm, .osm.pbf, .geojson, .gpkg), a Mitsuba or Sionna RT XML file, sionna:NAME "
+                             "(munich, etoile, …), or preset:NAME (rbm, rdm, small).")],
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Scene folder to write [scenes/NAME].")] = None,
     check: Annotated[bool, typer.Option("--check", help="Report only; exit status 2 if tracing would fail.")] = False,
     frequency_hz: Annotated[float | None, typer.Option(help="Frequency of the scene's radio [2.4e9].")] = None,
@@ -26,14 +26,14 @@ def build_scene(
     scale: Annotated[float | None, typer.Option(help="Factor from the file's unit to metres (feet: 0.3048).")] = None,
     up: Annotated[str | None, typer.Option(help="Axis of the file that points up: x, y or z.")] = None,
     bbox: Annotated[str | None, typer.Option(
-        metavar="A,B,C,D", help="Keep only this part: XMIN,YMIN,XMAX,YMAX [m], or of a map SOUTH,WEST,NORTH,EAST [degrees].")
-        ] = None,
+        metavar="A,B,C,D", help="Keep only this part: XMIN,YMIN,XMAX,YMAX [m]; of a map S,W,N,E [degrees].")] = None,
     height_default: Annotated[float | None, typer.Option(
         metavar="M", help="Height of a map's buildings that do not say theirs [10].")] = None,
     material_table: Annotated[Path | None, typer.Option(
         metavar="FILE.toml", help="What a map's tags are made of, where it differs from the standard table.")] = None,
     overpass: Annotated[bool, typer.Option(
-        "--overpass", help="Download CITY, an .osm file that does not exist yet, for --bbox first; needs a network.")] = False,
+        "--overpass", help="Download CITY, an .osm file that does not exist yet, for --bbox first; needs a network.")
+        ] = False,
     devices: Annotated[int | None, typer.Option(min=0, help="Devices to place on free ground [0].")] = None,
     uavs: Annotated[int | None, typer.Option(min=0, help="UAVs to place near the middle [3].")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of the placement [0].")] = None,
@@ -52,7 +52,8 @@ def build_scene(
         report = _build_from_map(source, out, common, pairs, numbers, of_maps, check)
     else:
         _refuse(of_maps, f"{source} is not a map (.osm, .osm.pbf, .geojson, .gpkg)")
-        report = _build_from_city(source, out, common | of_cities | _given(materials=pairs or None, bbox=numbers), check)
+        options = common | of_cities | _given(materials=pairs or None, bbox=numbers)
+        report = _build_from_city(source, out, options, check)
     print_report(report, console)
     if report.folder:
         say(f"wrote {report.folder}: {', '.join(_content(report.folder))}")
@@ -68,14 +69,15 @@ def _build_from_city(source: str, out: Path | None, options: dict, check: bool):
 
     if source.startswith("preset:"):
         if options:
-            raise BadInput(f"{source} is built as it is published; the option for {', '.join(options)} cannot be used with it. "
-                           "Build it without, then change scene.toml")
+            raise BadInput(f"{source} is built as it is published; the option for {', '.join(options)} cannot be used "
+                           "with it. Build it without, then change scene.toml")
         name = source.removeprefix("preset:")
         return build_preset_scene(name, out or Path("scenes") / name, check_only=check)
     return build(source, out or Path("scenes") / scene_name(source), BuildOptions(**options), check_only=check)
 
 
-def _build_from_map(source: str, out: Path | None, common: dict, pairs: dict[str, str], bbox_deg, of_maps: dict, check: bool):
+def _build_from_map(source: str, out: Path | None, common: dict, pairs: dict[str, str], bbox_deg, of_maps: dict,
+                    check: bool):
     from radiotwin.footprints import MapOptions, build_scene_from_map, map_name, read_material_table, with_pairs
     from radiotwin.footprints.material_table import STANDARD
     from radiotwin.footprints.overpass import download_osm
@@ -89,7 +91,8 @@ def _build_from_map(source: str, out: Path | None, common: dict, pairs: dict[str
             raise BadInput("--overpass downloads an area; give it with --bbox SOUTH,WEST,NORTH,EAST")
         download_osm(Path(source), bbox_deg)
         say(f"wrote {source} (© OpenStreetMap contributors, ODbL)")
-    return build_scene_from_map(source, out or Path("scenes") / map_name(source), options, BuildOptions(**common), check)
+    out = out or Path("scenes") / map_name(source)
+    return build_scene_from_map(source, out, options, BuildOptions(**common), check)
 
 
 def _given(**options) -> dict:

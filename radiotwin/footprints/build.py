@@ -58,17 +58,18 @@ class MapOptions:
     def check(self) -> None:
         """Raise BadInput for a value that cannot be."""
         if not 0 < self.default_height_m <= 1000:
-            raise BadInput(f"a default height of {self.default_height_m:g} m is not possible; allowed is more than 0 to 1000 m")
+            raise BadInput(f"a default height of {self.default_height_m:g} m is not possible; give more than 0 and at "
+                           "most 1000 m")
         if self.bbox_deg is not None:
             south, west, north, east = self.bbox_deg
             if not (-90 <= south < north <= 90 and -180 <= west < east <= 180):
-                raise BadInput(f"bbox {self.bbox_deg} is not possible; give SOUTH,WEST,NORTH,EAST in degrees, the south below "
-                               "the north and the west below the east")
+                raise BadInput(f"bbox {self.bbox_deg} is not possible; give SOUTH,WEST,NORTH,EAST in degrees, the "
+                               "south below the north and the west below the east")
 
 
 def map_suffix(source: Path | str) -> str | None:
     """The suffix in `READERS` of a file name, or None where it is no map."""
-    return next((suffix for suffix in sorted(READERS, key=len, reverse=True) if str(source).lower().endswith(suffix)), None)
+    return next((suffix for suffix in READERS if str(source).lower().endswith(suffix)), None)
 
 
 def map_name(source: Path | str) -> str:
@@ -100,7 +101,8 @@ def build_scene_from_map(source: Path | str, out_folder: Path | str, map_options
     if not check_only:
         check_target(out_folder)
         if path.resolve().is_relative_to(out_folder.resolve()):
-            raise BadInput(f"{source} lies in {out_folder}, which the new scene would replace; choose another output folder")
+            raise BadInput(f"{source} lies in {out_folder}, which the new scene would replace; choose another output "
+                           "folder")
     if not path.is_file():
         raise BadInput(f"{path} is not a file; give a map ({', '.join(READERS)})")
     found = READERS[map_suffix(path)](path)
@@ -130,11 +132,15 @@ def build_scene_from_map(source: Path | str, out_folder: Path | str, map_options
 def _within(features: list[Feature], bbox_deg, path: Path) -> list[Feature]:
     """Features that reach into the box."""
     if not features:
-        raise BadInput(f"{path} holds no buildings (closed ways or multipolygons with the tag building or building:part; in "
-                       "GeoJSON and GeoPackage polygons)")
+        raise BadInput(f"{path} holds no buildings (closed ways or multipolygons with the tag building or "
+                       "building:part; in GeoJSON and GeoPackage polygons)")
     low_high = np.array([feature.area.bounds for feature in features])  # an empty area has NaN
+    for feature, bounds in zip(features, low_high):
+        if (np.abs(bounds) > (180, 90, 180, 90)).any():
+            raise BadInput(f"{path}: {feature.name} lies at {bounds[0]:g}, {bounds[1]:g}, which is no longitude and "
+                           "latitude in degrees; export the map in EPSG:4326, or with the name of its system")
     if bbox_deg is None:
-        return [feature for feature, bounds in zip(features, low_high) if np.isfinite(bounds).all()]
+        return features
     south, west, north, east = bbox_deg
     box = shapely.box(west, south, east, north)
     kept = [feature for feature, (x0, y0, x1, y1) in zip(features, low_high)
@@ -143,8 +149,8 @@ def _within(features: list[Feature], bbox_deg, path: Path) -> list[Feature]:
     if not kept:
         west_, south_ = np.nanmin(low_high[:, :2], axis=0)
         east_, north_ = np.nanmax(low_high[:, 2:], axis=0)
-        raise BadInput(f"{path}: no building reaches into the bbox {south:g},{west:g},{north:g},{east:g}; the file's lie in "
-                       f"{south_:.5f},{west_:.5f},{north_:.5f},{east_:.5f} (south,west,north,east)")
+        raise BadInput(f"{path}: no building reaches into the bbox {south:g},{west:g},{north:g},{east:g}; the file's "
+                       f"lie in {south_:.5f},{west_:.5f},{north_:.5f},{east_:.5f} (south,west,north,east)")
     return kept
 
 
@@ -152,6 +158,7 @@ def _origin(features: list[Feature], bbox_deg) -> Origin:
     """The middle of the box, or of the buildings."""
     if bbox_deg is None:
         bounds = np.array([feature.area.bounds for feature in features])
+        bounds = bounds[np.isfinite(bounds).all(axis=1)] if np.isfinite(bounds).any() else np.zeros((1, 4))
         (west, south), (east, north) = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
     else:
         south, west, north, east = bbox_deg
@@ -169,8 +176,8 @@ def _bounds(prisms: list[Prism], origin: Origin, bbox_deg) -> tuple[float, float
         x_m, y_m = bounds[:, [0, 2]], bounds[:, [1, 3]]
     box = float(np.min(x_m)), float(np.max(x_m)), float(np.min(y_m)), float(np.max(y_m))
     if not np.isfinite(box).all() or max(box[1] - box[0], box[3] - box[2]) > WIDEST_M:
-        raise BadInput(f"the area is {max(box[1] - box[0], box[3] - box[2]) / 1000:.0f} km wide, {WIDEST_M / 1000:g} km are "
-                       "allowed; choose a part with --bbox SOUTH,WEST,NORTH,EAST")
+        raise BadInput(f"the area is {max(box[1] - box[0], box[3] - box[2]) / 1000:.0f} km wide, {WIDEST_M / 1000:g} "
+                       "km are allowed; choose a part with --bbox SOUTH,WEST,NORTH,EAST")
     return box
 
 
@@ -180,11 +187,12 @@ def _overlaps(prisms: list[Prism]) -> list[Problem]:
         return []
     names = [f"{a.name} and {b.name}: {shared_m2:.0f} m²"
              for a, b, shared_m2 in sorted(overlaps, key=lambda found: -found[2])]
-    return [Problem("warning", "", f"{len(overlaps)} pair(s) of buildings stand in one another: united ({listed(names)})")]
+    return [Problem("warning", "", f"{len(overlaps)} pair(s) of buildings stand in one another: what they share is "
+                    f"built once ({listed(names)})")]
 
 
-def _city(prisms: list[Prism], extent_m: tuple[float, float, float, float], table: MaterialTable, problems: list[Problem]
-          ) -> tuple[ImportedCity, dict[int, str]]:
+def _city(prisms: list[Prism], extent_m: tuple[float, float, float, float], table: MaterialTable,
+          problems: list[Problem]) -> tuple[ImportedCity, dict[int, str]]:
     """The city with its ground, and prism -> shape."""
     bounds = np.array([prism.area.bounds for prism in prisms])
     x0, y0 = np.minimum(bounds[:, :2].min(axis=0), extent_m[::2]) - GROUND_MARGIN_M

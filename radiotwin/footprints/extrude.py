@@ -66,7 +66,8 @@ def _unite(prisms: Sequence[Prism], members: np.ndarray) -> list[Block]:
     for material, indices in by_material.items():
         solids = [extrude(prisms[i].area, prisms[i].height.bottom_m, prisms[i].height.top_m) for i in indices]
         mesh = solids[0] if len(solids) == 1 else trimesh.boolean.union(solids, engine="manifold")
-        around = [_inflated(prisms[i]) for i in before if any(prisms[i].area.intersects(prisms[k].area) for k in indices)]
+        around = [_inflated(prisms[i]) for i in before
+                  if any(prisms[i].area.intersects(prisms[k].area) for k in indices)]
         if around:
             mesh = trimesh.boolean.difference([mesh, *around], engine="manifold")
         if len(mesh.faces):

@@ -1,7 +1,8 @@
 """GeoJSON and GeoPackage: areas with the columns of a table for tags.
 
-Where a file has a column `building` or `building:part`, as exports of OpenStreetMap do, only what is built counts; else every
-polygon is a building. `_` may stand for the `:` of a tag, and case does not matter. GDAL's `other_tags` are taken apart.
+Where a file has a column `building` or `building:part`, as exports of OpenStreetMap do, only what is built counts; else
+every polygon is a building. `_` may stand for the `:` of a tag, and case does not matter. GDAL's `other_tags` are taken
+apart.
 """
 
 import json
@@ -57,8 +58,8 @@ def read_geopackage(path: Path) -> MapFile:
     try:
         import pyogrio
     except ImportError:
-        raise BadInput(f"{path}: GeoPackages are read with the package pyogrio, which is not installed; install it with "
-                       "`pip install 'radiotwin[gis]'`, or export the layer as GeoJSON") from None
+        raise BadInput(f"{path}: GeoPackages are read with the package pyogrio, which is not installed; install it "
+                       "with `pip install 'radiotwin[gis]'`, or export the layer as GeoJSON") from None
     if not path.is_file():
         raise BadInput(f"{path} does not exist; give a GeoPackage")
     found = MapFile([])
@@ -93,8 +94,8 @@ def _polygons(path: Path, number: int, geometry: Mapping):
         return shapely.MultiPolygon([(polygon[0], [ring for ring in polygon[1:] if len(ring) > 3])
                                      for polygon in polygons if polygon and len(polygon[0]) > 3])
     except (TypeError, ValueError, IndexError, OverflowError):
-        raise BadInput(f"{path}: feature {number} has coordinates that are not rings of finite numbers; export the map again"
-                       ) from None
+        raise BadInput(f"{path}: feature {number} has coordinates that are not rings of finite numbers; export the map "
+                       "again") from None
 
 
 def _crs_name(path: Path, data: Mapping) -> str:
@@ -104,7 +105,8 @@ def _crs_name(path: Path, data: Mapping) -> str:
     try:
         return str(crs["properties"]["name"])
     except (TypeError, KeyError):
-        raise BadInput(f"{path}: its crs is {crs!r}, which names no system; remove it (longitude, latitude) or name one") from None
+        raise BadInput(f"{path}: its crs is {crs!r}, which names no system; remove it (longitude, latitude) or name one"
+                       ) from None
 
 
 def _features(path: Path, rows: Iterable[tuple[str, Mapping, object]], crs: str | None) -> MapFile:
@@ -120,8 +122,8 @@ def _features(path: Path, rows: Iterable[tuple[str, Mapping, object]], crs: str 
         features.append(Feature(name, tags if marked else tags | {"building": "yes"}, area))
     problems = []
     if unusable:
-        problems.append(Problem("warning", "", f"{len(unusable)} building(s) are points or lines, without an area: left out "
-                                f"({listed(unusable)})"))
+        problems.append(Problem("warning", "", f"{len(unusable)} building(s) are points or lines, without an area: "
+                                f"left out ({listed(unusable)})"))
     return MapFile(_to_degrees(path, features, crs), problems)
 
 
@@ -146,12 +148,13 @@ def _to_degrees(path: Path, features: list[Feature], crs: str | None) -> list[Fe
     from pyproj.exceptions import CRSError
 
     if crs is None:
-        raise BadInput(f"{path} does not say in which coordinate reference system it is; assign one (in QGIS: Layer CRS) and "
-                       "export it again")
+        raise BadInput(f"{path} does not say in which coordinate reference system it is; assign one (in QGIS: Layer "
+                       "CRS) and export it again")
     try:
         transformer = Transformer.from_crs(CRS(crs), "EPSG:4326", always_xy=True)
     except CRSError as error:
-        raise BadInput(f"{path}: its coordinate reference system {crs!r} is unknown ({error}); export it in EPSG:4326") from None
+        raise BadInput(f"{path}: its coordinate reference system {crs!r} is unknown ({error}); export it in EPSG:4326"
+                       ) from None
     areas = [shapely.transform(feature.area, lambda places: np.column_stack(transformer.transform(*places.T)))
              for feature in features]
     return [Feature(feature.name, feature.tags, area) for feature, area in zip(features, areas)]

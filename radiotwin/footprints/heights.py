@@ -14,8 +14,8 @@ LEVEL_M = 3.0  # a usual storey
 FOOT_M, INCH_M = 0.3048, 0.0254
 TALLEST_M = 1000.0  # the tallest building that exists has 828 m
 _METRES = re.compile(r"([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*(?:m|meters?|metres?)?", re.IGNORECASE)
-_FEET = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*(?:'|′|’|ft\.?|feet|foot)\s*(?:(\d+(?:\.\d*)?)\s*(?:\"|″|”|''|in\.?|inch(?:es)?)?)?",
-                   re.IGNORECASE)
+_FEET = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*(?:'|′|’|ft\.?|feet|foot)\s*"
+                   r"(?:(\d+(?:\.\d*)?)\s*(?:\"|″|”|''|in\.?|inch(?:es)?)?)?", re.IGNORECASE)
 
 
 def parse_length_m(text: str) -> float:

@@ -44,7 +44,8 @@ STANDARD = MaterialTable(
     default="concrete", ground="asphalt_concrete",
     by_tag={
         KEY: {
-            "concrete": "concrete", "reinforced_concrete": "concrete", "cement_block": "concrete", "sandstone": "concrete",
+            "concrete": "concrete", "reinforced_concrete": "concrete", "cement_block": "concrete",
+            "sandstone": "concrete",
             "brick": "brick", "bricks": "brick", "clay": "brick", "masonry": "brick", "plastered_brick": "brick",
             "wood": "wood", "timber_framing": "wood", "log": "wood",
             "glass": "glass", "mirror": "glass",
@@ -56,7 +57,7 @@ STANDARD = MaterialTable(
 
 
 def read_material_table(path: Path | str) -> MaterialTable:
-    """The standard table with what a TOML file says otherwise: `default`, `ground`, and tables named after keys of tags.
+    """The standard table with what a TOML file says otherwise: `default`, `ground`, tables named after keys of tags.
 
     Raises:
         BadInput: no such file, not TOML, or a material that is not in ITU-R P.2040.
@@ -69,20 +70,22 @@ def read_material_table(path: Path | str) -> MaterialTable:
     except tomllib.TOMLDecodeError as error:
         raise BadInput(f"{path} is not valid TOML: {error}") from None
     own = {name: data.pop(name) for name in ("default", "ground") if name in data}
-    for place, name in [*own.items(), *((f"[{key!r}] {value}", name) for key, values in data.items()
-                                        for value, name in (values.items() if isinstance(values, dict) else [("", values)]))]:
+    for key, values in data.items():
+        if not isinstance(values, dict):
+            raise BadInput(f"{path}: {key} = {values!r} stands alone; write it under the key of its tag, for example "
+                           f'["{KEY}"]')
+    named = [*own.items(), *((f"[{key}] {value}", name)
+                             for key, values in data.items() for value, name in values.items())]
+    for place, name in named:
         if not isinstance(name, str):
-            raise BadInput(f"{path}: {place} = {name!r}; allowed is the name of an ITU material, or a table [\"{KEY}\"]")
+            raise BadInput(f"{path}: {place} = {name!r}; allowed is the name of an ITU material")
         try:
             itu_material(name)
         except BadInput as error:
             raise BadInput(f"{path}: {place}: {error}") from None
-    bare = [key for key, values in data.items() if not isinstance(values, dict)]
-    if bare:
-        raise BadInput(f"{path}: {bare[0]} stands alone; write it under the key of its tag, for example [\"{KEY}\"]")
-    merged = {key: dict(STANDARD.by_tag.get(key, {})) | {value.lower(): name for value, name in values.items()}
+    by_tag = {key: dict(STANDARD.by_tag.get(key, {})) | {value.lower(): name for value, name in values.items()}
               for key, values in data.items()}
-    return replace(STANDARD, **own, by_tag=merged | {key: values for key, values in STANDARD.by_tag.items() if key not in data})
+    return replace(STANDARD, **own, by_tag=by_tag | {k: v for k, v in STANDARD.by_tag.items() if k not in data})
 
 
 def with_pairs(table: MaterialTable, pairs: Mapping[str, str]) -> MaterialTable:

@@ -71,16 +71,16 @@ def assemble(elements: OsmElements) -> MapFile:
             ways.append(Feature(f"way/{number}", way.tags, _polygon(way.nodes, elements)))
     problems = []
     if cut:
-        problems.append(Problem("warning", "", f"{len(cut)} building(s) lack nodes or ways, as where an extract was cut off: "
-                                f"left out ({listed(cut)}); take a larger extract"))
+        problems.append(Problem("warning", "", f"{len(cut)} building(s) lack nodes or ways, as where an extract was "
+                                f"cut off: left out ({listed(cut)}); take a larger extract"))
     if unclosed:
-        problems.append(Problem("warning", "", f"{len(unclosed)} building(s) have an outline that is not closed: left out "
-                                f"({listed(unclosed)})"))
+        problems.append(Problem("warning", "", f"{len(unclosed)} building(s) have an outline that is not closed: left "
+                                f"out ({listed(unclosed)})"))
     return MapFile(ways + features, problems)
 
 
 def _relation_tags(relation: Relation, elements: OsmElements) -> dict[str, str] | None:
-    """Tags of a building; None where the relation is none. Tags of the outer ways, where old maps have them, count, too."""
+    """Tags of a building; None where the relation is none. Old maps have them at the outer ways."""
     if relation.tags.get("type") != "multipolygon":
         return None
     outer = [elements.ways[way].tags for way, role in relation.members if role != "inner" and way in elements.ways]

@@ -21,7 +21,8 @@ def read_osm_pbf(path: Path) -> OsmElements:
         import osmium
     except ImportError:
         raise BadInput(f"{path}: .osm.pbf is read with the package osmium, which is not installed; install it with "
-                       "`pip install 'radiotwin[gis]'`, or convert the file: `osmium cat area.osm.pbf -o area.osm`") from None
+                       "`pip install 'radiotwin[gis]'`, or convert the file: `osmium cat area.osm.pbf -o area.osm`"
+                       ) from None
     if not path.is_file():
         raise BadInput(f"{path} does not exist; give a map in OpenStreetMap's PBF format")
     file = osmium.io.File(str(path), "pbf")

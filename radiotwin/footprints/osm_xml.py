@@ -29,8 +29,8 @@ class _Reader:
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
         self.depth += 1
         if self.depth == 1 and tag != "osm":
-            raise BadInput(f"{self.path}, line {line}: the file begins with <{tag}>, not <osm>; give a map in OpenStreetMap's "
-                           "XML, as its export, Overpass ([out:xml]) or JOSM make it")
+            raise BadInput(f"{self.path}, line {line}: the file begins with <{tag}>, not <osm>; give a map in "
+                           "OpenStreetMap's XML, as its export, Overpass ([out:xml]) or JOSM make it")
         if self.depth == 2:
             self.open = None
             if attributes.get("action") != "delete" and attributes.get("visible") != "false":
@@ -43,8 +43,8 @@ class _Reader:
 
     def _element(self, tag: str, attributes: dict[str, str], line: int) -> None:
         if tag == "node":
-            latitude, longitude = (self._degrees(attributes, name, most, line) for name, most in (("lat", 90), ("lon", 180)))
-            self.elements.places[self._integer(attributes, "id", line)] = longitude, latitude
+            place = self._degrees(attributes, "lon", 180, line), self._degrees(attributes, "lat", 90, line)
+            self.elements.places[self._integer(attributes, "id", line)] = place
         elif tag == "way":
             self.open = self.elements.ways[self._integer(attributes, "id", line)] = Way([])
         elif tag == "relation":
@@ -62,8 +62,8 @@ class _Reader:
         try:
             return int(attributes[name])
         except (KeyError, ValueError):
-            raise BadInput(f"{self.path}, line {line}: {name}={attributes.get(name)!r} is not a whole number; export the map "
-                           "again") from None
+            raise BadInput(f"{self.path}, line {line}: {name}={attributes.get(name)!r} is not a whole number; export "
+                           "the map again") from None
 
     def _degrees(self, attributes: dict[str, str], name: str, most: float, line: int) -> float:
         try:
@@ -71,6 +71,6 @@ class _Reader:
         except (KeyError, ValueError):
             value = math.nan
         if not -most <= value <= most:
-            raise BadInput(f"{self.path}, line {line}: a node has {name}={attributes.get(name)!r}; allowed is -{most} to {most} "
-                           "degrees; export the map again")
+            raise BadInput(f"{self.path}, line {line}: a node has {name}={attributes.get(name)!r}; allowed is -{most} "
+                           f"to {most} degrees; export the map again")
         return value

@@ -38,8 +38,8 @@ def download_osm(path: Path, bbox_deg: tuple[float, float, float, float], server
     south, west, north, east = bbox_deg
     area_m2, _ = Geod(ellps="WGS84").polygon_area_perimeter([west, east, east, west], [south, south, north, north])
     if abs(area_m2) > MOST_KM2 * 1e6:
-        raise BadInput(f"--overpass: {abs(area_m2) / 1e6:.0f} km² are too much for a public server, {MOST_KM2:g} km² are "
-                       "allowed; make --bbox smaller, or download an extract (.osm.pbf)")
+        raise BadInput(f"--overpass: {abs(area_m2) / 1e6:.0f} km² are too much for a public server, {MOST_KM2:g} km² "
+                       "are allowed; make --bbox smaller, or download an extract (.osm.pbf)")
     box = ",".join(f"{value:.7f}" for value in bbox_deg)
     kinds = "".join(f'{kind}["{key}"]({box});' for kind in ("way", "relation") for key in ("building", "building:part"))
     query = f"[out:xml][timeout:{TIMEOUT_S}];({kinds});(._;>;);out body;"
@@ -51,5 +51,5 @@ def download_osm(path: Path, bbox_deg: tuple[float, float, float, float], server
                 shutil.copyfileobj(answer, file)
     except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
         reason = getattr(error, "reason", error)
-        raise RunFailed(f"--overpass needs a network, and {server} did not answer ({reason}); try again later, or download an "
-                        "extract and give the file") from None
+        raise RunFailed(f"--overpass needs a network, and {server} did not answer ({reason}); try again later, or "
+                        "download an extract and give the file") from None

@@ -81,14 +81,14 @@ class _Notes:
     _KINDS = {
         "invalid": ("fixed", "outline(s) cut or touched themselves: taken apart"),
         "no area": ("warning", "building(s) have no area: left out"),
-        "sliver": ("warning", f"sliver(s), under {SLIVER_AREA_M2:g} m² or narrower than {SLIVER_WIDTH_M:g} m: left out"),
-        "height": ("warning", "building(s) have a height, a level or a bottom that cannot be; the next tag, or the default, was "
-                              "taken"),
+        "sliver": ("warning", f"sliver(s), under {SLIVER_AREA_M2:g} m² or {SLIVER_WIDTH_M:g} m wide: left out"),
+        "height": ("warning", "building(s) have a height, a level or a bottom that cannot be; the next tag, or the "
+                              "default, was taken"),
         "upside down": ("warning", "building(s) begin (min_height) no lower than they end: left out"),
-        "material": ("warning", "building(s) have a building:material that the table does not know; the default was taken. "
-                                "Name it in --material-table or with --material NAME=ITU"),
-        "rest": ("warning", f"outline(s) are covered to less than {WHOLE:.0%} by their parts: the rest stands at the outline's "
-                            "own height"),
+        "material": ("warning", "building(s) have a building:material that the table does not know; the default was "
+                                "taken. Name it in --material-table or with --material NAME=ITU"),
+        "rest": ("warning", f"outline(s) are covered to less than {WHOLE:.0%} by their parts: the rest stands at the "
+                            "outline's own height"),
     }
 
     def __init__(self):

@@ -11,6 +11,7 @@ from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import SceneConfig, read_config
 from radiotwin.scene.lattice import Lattice
+from radiotwin.scene.own_files import require_within
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,8 @@ class Scene:
     def content_hash(self) -> str:
         """SHA-256 over what decides a gain map: geometry, materials, frequency, sensitivity and device positions."""
         digest = hashlib.sha256()
-        for path in (self.xml_path, *sorted(self.folder.glob("meshes/*"))):
+        for path in (self.xml_path, *sorted(path for path in self.folder.glob("meshes/*") if path.is_file())):
+            require_within(self.folder, path, str(self.folder))
             digest.update(path.name.encode() + b"\0" + path.read_bytes())
         radio = self.config.radio
         digest.update(f"{radio.frequency_hz!r},{radio.tx_power_dbm!r},{radio.sensitivity_dbm!r};".encode())

@@ -121,7 +121,8 @@ def build_scene(
         x_min, y_min, x_max, y_max = (float(v) for v in np.array(options.bbox) + np.tile(city.moved_m[:2], 2))
         extent = Extent(x_min_m=x_min, x_max_m=x_max, y_min_m=y_min, y_max_m=y_max)
     known = _provenance(city, str(source), options)
-    return finish_scene(city, Declared(str(source), scene_name(source), extent, None, known), out_folder, options, check_only)
+    declared = Declared(str(source), scene_name(source), extent, None, known)
+    return finish_scene(city, declared, out_folder, options, check_only)
 
 
 @dataclass(frozen=True)
