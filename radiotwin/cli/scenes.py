@@ -9,8 +9,12 @@ from radiotwin.cli.console import console, say, show_warnings_plainly
 from radiotwin.errors import BadInput
 
 
+SceneFolder = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder, as `build-scene` makes it.")]
+
+
 def add_commands(app: typer.Typer) -> None:
     app.command("build-scene")(build_scene)
+    app.command("export-scene")(export_scene)
 
 
 def build_scene(
@@ -59,6 +63,21 @@ def build_scene(
         say(f"wrote {report.folder}: {', '.join(_content(report.folder))}")
     if report.tracing_would_fail:
         raise typer.Exit(2)
+
+
+def export_scene(
+    folder: SceneFolder,
+    out: Annotated[Path, typer.Option(
+        "--out", "-o", help="A folder (city.xml and meshes/*.ply for sionna.rt.load_scene, devices.csv), or NAME.glb, "
+                            "NAME.gltf (y up), NAME.obj (z up).")],
+) -> None:
+    """Write a scene's city in the form that other programs read."""
+    from radiotwin.scene import Scene
+    from radiotwin.scene.export import export_scene as export
+
+    scene = Scene.load(folder)
+    export(scene, out)
+    say(f"wrote {out}" + (f": {', '.join(_content(out))}" if out.is_dir() else ""))
 
 
 def _build_from_city(source: str, out: Path | None, options: dict, check: bool):

@@ -6,9 +6,8 @@ from typing import Annotated
 import typer
 
 from radiotwin.cli.console import say, show_warnings_plainly
+from radiotwin.cli.scenes import SceneFolder
 from radiotwin.errors import BadInput
-
-SceneFolder = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder, as `build-scene` makes it.")]
 
 
 def add_commands(app: typer.Typer) -> None:
