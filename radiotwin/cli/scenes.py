@@ -8,7 +8,6 @@ import typer
 from radiotwin.cli.console import console, say, show_warnings_plainly
 from radiotwin.errors import BadInput
 
-
 SceneFolder = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder, as `build-scene` makes it.")]
 
 

@@ -23,8 +23,8 @@ def same_meshes(shapes, others):
 
 
 def read_model(path):
-    """Meshes and names of materials by the name of the shape, z up; glTF by trimesh, OBJ (whose objects trimesh joins by
-    material) line by line."""
+    """Meshes and names of materials by the name of the shape, z up; glTF by trimesh, OBJ (whose objects trimesh joins
+    by material) line by line."""
     if path.suffix == ".obj":
         return read_obj_objects(path)
     model = trimesh.load(path, process=False)
