@@ -1,4 +1,4 @@
-"""Commands that measure in a world: trace, survey."""
+"""Commands that measure in a world: trace, gains, survey."""
 
 from pathlib import Path
 from typing import Annotated
@@ -12,37 +12,29 @@ from radiotwin.errors import BadInput
 
 def add_commands(app: typer.Typer) -> None:
     app.command("trace")(trace)
+    app.command("gains")(gains)
     app.command("survey")(survey)
 
 
 def trace(
     folder: SceneFolder,
     out: Annotated[Path | None, typer.Option(
-        "--out", "-o", help="Radio map [SCENE/truth.nc, with --devices truth-A-B.nc]; with --points a CSV file "
-                            "[gains.csv].")] = None,
+        "--out", "-o", help="Radio map [SCENE/truth.nc, with --devices truth-A-B.nc].")] = None,
     quality: Annotated[str, typer.Option(help="fast, default or high.")] = "default",
     solver: Annotated[str, typer.Option(help="paths (gain at points) or map (mean over lattice cells).")] = "paths",
     combining: Annotated[str, typer.Option(help="power (sum of the paths' powers) or coherent (of their fields).")
                          ] = "power",
     devices: Annotated[str | None, typer.Option(metavar="A,B,…", help="Only these devices.")] = None,
-    points: Annotated[Path | None, typer.Option(
-        help="CSV file with x_m, y_m, z_m: gains at these points, not over the lattice.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the rays.")] = 1,
 ) -> None:
     """Ray-trace the truth with Sionna RT. A killed run goes on where it was; a finished one is not done again."""
     from radiotwin.scene import Scene
-    from radiotwin.trace import SolverSettings, read_points, trace_map, trace_points
+    from radiotwin.trace import SolverSettings, trace_map
 
     show_warnings_plainly()
     scene = Scene.load(folder)
     settings = SolverSettings.of_quality(quality, solver=solver, combining=combining, seed=seed)
     names = devices.split(",") if devices else None
-    if points is not None:
-        out = out or Path("gains.csv")
-        table = trace_points(scene, read_points(points), settings, out, names)
-        detected = int(table["gain_db"].notna().sum())
-        say(f"wrote {out}: {len(table)} links, {detected} detected")
-        return
     out = out or folder / ("-".join(["truth", *(names or [])])[:100] + ".nc")
     facts = trace_map(scene, settings, out, names).dataset.attrs
     say(f"wrote {out}: {facts['links']} links, {facts['links_detected']} detected, {facts['links_below_sensitivity']} "
@@ -51,6 +43,31 @@ def trace(
     if "noise_floor_db" in facts:
         say(f"numerical noise: {facts['noise_floor_db']:.2f} dB RMS against ten times the rays; nine links in ten are "
             f"within {facts['noise_floor_p90_db']:.2f} dB")
+
+
+def gains(
+    folder: SceneFolder,
+    points: Annotated[Path, typer.Option(
+        help="CSV file with x_m, y_m, z_m; or latitude_deg, longitude_deg, z_m, where the scene has an origin.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Table (.csv, .csv.gz), a row a link.")] = Path("gains.csv"),
+    devices: Annotated[str | None, typer.Option(metavar="A,B,…", help="Only these devices.")] = None,
+    combining: Annotated[str, typer.Option("--sum", help="power (of the paths' powers) or coherent (of their fields).")
+                         ] = "power",
+    quality: Annotated[str, typer.Option(help="fast, default or high.")] = "default",
+    seed: Annotated[int, typer.Option(min=0, help="Of the rays.")] = 1,
+) -> None:
+    """Ray-trace gains at any points; an empty gain has a reason: no path, below sensitivity, …."""
+    from radiotwin.scene import Scene
+    from radiotwin.trace import SolverSettings, read_points, trace_points
+
+    show_warnings_plainly()
+    scene = Scene.load(folder)
+    settings = SolverSettings.of_quality(quality, combining=combining, seed=seed)
+    points_m = read_points(points, scene.config.origin)
+    table = trace_points(scene, points_m, settings, out, devices.split(",") if devices else None)
+    reasons = table.loc[table["reason"] != "", "reason"].value_counts()
+    say(f"wrote {out}: {len(table)} links, {len(table) - reasons.sum()} with a gain"
+        + "".join(f", {count} {reason}" for reason, count in reasons.items()))
 
 
 def survey(

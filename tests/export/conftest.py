@@ -20,5 +20,5 @@ def radio_map():
     rng = np.random.default_rng(0)
     gain_db = rng.uniform(-120, -60, (2, 2, 3, 4)).astype(np.float32)
     gain_db[1, 0, 2, 3] = np.nan
-    return RadioMap.build(["d0", "d1"], Lattice.over(0, 60, 0, 40, 20, [50, 60]), gain_db, gain_db > -80, gain_db * 0 + 3,
-                          {"source": "test", "frequency_hz": 2.4e9})
+    return RadioMap.build(["d0", "d1"], Lattice.over(0, 60, 0, 40, 20, [50, 60]), gain_db, gain_db > -80,
+                          gain_db * 0 + 3, {"source": "test", "frequency_hz": 2.4e9})
