@@ -86,7 +86,7 @@ def _solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
 
 
 def _mesh(solid: Manifold) -> trimesh.Trimesh:
-    """With corners that lie together made one and triangles without area dropped, unless that would open the mesh: where
+    """With corners that lie together made one and triangles without area dropped, unless that opens the mesh: where
     a solid touches itself along an upright edge, its two sides need corners of their own."""
     found = solid.to_mesh64()
     vertices, faces, _ = clean(found.vert_properties[:, :3], found.tri_verts.astype(np.int64))
