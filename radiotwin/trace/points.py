@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from radiotwin.antennas import Antenna
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path, require_writable
 from radiotwin.geodesy import to_local
@@ -23,14 +24,16 @@ REASONS = ["below the ground", "inside a building", "within a wavelength", "no p
 MOST_DEG = {"latitude_deg": 90, "longitude_deg": 180}
 
 
-def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settings: SolverSettings) -> np.ndarray:
-    """Gains between positions in a scene's city.
+def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settings: SolverSettings,
+                antennas: list[Antenna | None] | None = None) -> np.ndarray:
+    """Gains between positions in a scene's city. Receivers have the antenna of the scene's UAVs.
 
     Args:
         scene: city and frequency.
         device_m: (k, 3) positions of transmitters [m].
         points_m: (n, 3) positions of receivers [m].
         settings: with solver `paths`.
+        antennas: of the k transmitters; None: isotropic.
 
     Returns:
         (k, n) gain [dB]; NaN where there is no path.
@@ -44,9 +47,9 @@ def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settin
     solver = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings)
     gain_db = np.full((len(device_m), len(points_m)), np.nan)
     with progress("tracing", total=gain_db.size) as advance:
-        for row, one_m in enumerate(device_m):
+        for row, (one_m, antenna) in enumerate(zip(device_m, antennas or [None] * len(device_m))):
             for part in solver.batches(len(points_m)):
-                gain_db[row, part] = solver.solve(one_m, points_m[part])
+                gain_db[row, part] = solver.solve(one_m, points_m[part], (antenna, scene.uav_antenna))
                 advance(part.stop - part.start)
     return gain_db
 
@@ -77,7 +80,8 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings, o
     index = device_indices(scene, devices)
     inside = scene.city.inside(points_m)
     wavelength_m = SPEED_OF_LIGHT_M_S / scene.config.radio.frequency_hz
-    gain_db = trace_gains(scene, scene.device_m[index], points_m, settings)
+    antennas = [scene.device_antennas[device] for device in index]
+    gain_db = trace_gains(scene, scene.device_m[index], points_m, settings, antennas)
     tables = []
     for row, device in enumerate(index):
         near = np.linalg.norm(points_m - scene.device_m[device], axis=1) < wavelength_m
