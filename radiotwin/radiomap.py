@@ -8,13 +8,23 @@ import xarray as xr
 
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
+from radiotwin.geodesy import local_crs
 from radiotwin.scene.lattice import Lattice
+from radiotwin.tables import Origin
 
 DIMS = ("device", "z", "y", "x")
 _UNITS = {"x": "m", "y": "m", "z": "m", "gain_db": "dB", "sigma_db": "dB"}
 _NAMES = {
     "x": "east", "y": "north", "z": "height above the ground datum", "gain_db": "channel gain (NaN: not detected)",
     "sigma_db": "standard deviation of the gain", "los": "line of sight by the 3D map",
+}
+CONVENTIONS = "CF-1.11"
+GRID_MAPPING = "crs"
+_CF = {
+    "x": {"axis": "X", "standard_name": "projection_x_coordinate"},
+    "y": {"axis": "Y", "standard_name": "projection_y_coordinate"},
+    "z": {"axis": "Z", "standard_name": "height", "positive": "up"},
+    "los": {"flag_values": np.array([0, 1], dtype=np.int8), "flag_meanings": "no_line_of_sight line_of_sight"},
 }
 
 
@@ -68,13 +78,17 @@ class RadioMap:
         if problem:
             raise BadInput(f"{path} is not a radio map: {problem}; `radiotwin trace` or `radiotwin map` makes one")
         dataset["los"] = dataset["los"].astype(bool)
-        return cls(dataset)
+        return cls(_without_conventions(dataset))
 
     def write(self, path: Path | str) -> None:
-        """Write NetCDF-4, compressed; whole or not at all."""
+        """Write NetCDF-4 after the CF conventions [1], compressed; whole or not at all.
+
+        [1] https://cfconventions.org, version 1.11
+        """
         encoding = {name: {"zlib": True, "complevel": 4} for name in self.dataset.data_vars}
+        encoding |= {axis: {"_FillValue": None} for axis in "xyz"}
         with atomic_path(path) as temporary:
-            self.dataset.to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
+            _with_conventions(self.dataset).to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
 
     @property
     def devices(self) -> list[str]:
@@ -93,6 +107,36 @@ class RadioMap:
     def los(self) -> np.ndarray:
         """(device, z, y, x) bool"""
         return self.dataset["los"].values
+
+
+def _with_conventions(dataset: xr.Dataset) -> xr.Dataset:
+    """What other programs need to place and name the values: axes, and the grid mapping where the origin is known."""
+    dataset = dataset.copy().assign_attrs(Conventions=CONVENTIONS)
+    for name, attributes in _CF.items():
+        if name in dataset.variables:
+            dataset[name] = dataset[name].assign_attrs(attributes)
+    origin = [dataset.attrs.get(f"origin_{name}_deg") for name in ("latitude", "longitude")]
+    if None in origin:
+        return dataset
+    from pyproj import CRS
+
+    crs = CRS(local_crs(Origin(latitude_deg=float(origin[0]), longitude_deg=float(origin[1]))))
+    dataset[GRID_MAPPING] = xr.Variable((), np.int32(0), crs.to_cf())
+    for name in dataset.data_vars:
+        if name != GRID_MAPPING:
+            dataset[name] = dataset[name].assign_attrs(grid_mapping=GRID_MAPPING)
+    return dataset
+
+
+def _without_conventions(dataset: xr.Dataset) -> xr.Dataset:
+    """The dataset as `RadioMap.build` makes it."""
+    dataset = dataset.drop_vars(GRID_MAPPING, errors="ignore")
+    dataset.attrs.pop("Conventions", None)
+    for name in dataset.variables:
+        for key in ("grid_mapping", *_CF.get(name, ())):
+            dataset[name].attrs.pop(key, None)
+            dataset[name].encoding.pop(key, None)
+    return dataset
 
 
 def _problem(dataset: xr.Dataset) -> str | None:

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from radiotwin.cli.console import print_rows, say, show_warnings_plainly
+from radiotwin.errors import BadInput
 
 MeasurementFile = Annotated[Path, typer.Argument(
     metavar="MEASUREMENTS", help="measurements.csv, .csv.gz or .parquet; devices.csv lies beside it.")]
@@ -56,22 +57,42 @@ def _note(device) -> str:
 
 
 def map_(
-    twin: Annotated[Path, typer.Argument(metavar="TWIN", help="Folder of a twin, as `fit` makes it.")],
+    twin: Annotated[Path, typer.Argument(metavar="TWIN", help="Folder of a twin, as `fit` makes it, or a radio map "
+                                                              "(.nc), as `trace` makes it.")],
     scene: SceneOption,
     out: Annotated[Path | None, typer.Option(
-        "--out", "-o", help="Radio map: .nc (all), .csv (a row a link) or .png (a picture) [TWIN.nc].")] = None,
+        "--out", "-o", help="Radio map: .nc (all), .csv (a row a link), .npz (NumPy), .tif (GeoTIFF), .kmz (Google "
+                            "Earth) or .png (a picture of the lowest altitude) [TWIN.nc].")] = None,
+    devices: Annotated[str | None, typer.Option(metavar="A,B,…", help="Only these devices.")] = None,
+    altitudes: Annotated[str | None, typer.Option(
+        metavar="Z,…", help="Only these of the lattice's altitudes [m].")] = None,
 ) -> None:
-    """Predict the gain of every device over the scene's lattice."""
-    from radiotwin.export import EXPORTERS, check_format
+    """Predict the gain of every device over the scene's lattice, or write a radio map in another form."""
+    from radiotwin.export import EXPORTERS, check_format, select
+    from radiotwin.radiomap import RadioMap
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin
 
+    show_warnings_plainly()
+    is_map = twin.suffix == ".nc"
+    if out is None and is_map:
+        raise BadInput(f"{twin} is a radio map already; say with --out in which form it is to be written")
     out = out or twin.resolve().with_suffix(".nc")
-    check_format(out)
     world = Scene.load(scene)
-    radio_map = Twin.load(twin).radio_map(world)
+    check_format(out, world)
+    radio_map = RadioMap.read(twin) if is_map else Twin.load(twin).radio_map(world)
+    radio_map = select(radio_map, devices.split(",") if devices else None, _altitudes(altitudes))
     EXPORTERS[out.suffix](radio_map, world, out)
     say(f"wrote {out}: {len(radio_map.devices)} devices on {radio_map.lattice.shape} positions (z, y, x)")
+
+
+def _altitudes(text: str | None) -> list[float] | None:
+    if text is None:
+        return None
+    try:
+        return [float(part) for part in text.split(",")]
+    except ValueError:
+        raise BadInput(f"--altitudes {text!r} are not numbers; give metres, as 50,60") from None
 
 
 def compare(

@@ -1,93 +1,40 @@
-"""Commands that make a world and measure in it: build-scene, trace, survey."""
+"""Commands that measure in a world: trace, gains, survey."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from radiotwin.cli.console import console, say, show_warnings_plainly
+from radiotwin.cli.console import say, show_warnings_plainly
+from radiotwin.cli.scenes import SceneFolder
 from radiotwin.errors import BadInput
-
-SceneFolder = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder, as `build-scene` makes it.")]
 
 
 def add_commands(app: typer.Typer) -> None:
-    app.command("build-scene")(build_scene)
     app.command("trace")(trace)
+    app.command("gains")(gains)
     app.command("survey")(survey)
-
-
-def build_scene(
-    source: Annotated[str, typer.Argument(
-        metavar="CITY", help="A Mitsuba or Sionna RT XML file, or sionna:NAME (munich, etoile, …), or preset:NAME "
-                             "(rbm, rdm, small).")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Scene folder to write [scenes/NAME].")] = None,
-    check: Annotated[bool, typer.Option("--check", help="Report only; exit status 2 if tracing would fail.")] = False,
-    frequency_hz: Annotated[float | None, typer.Option(help="Frequency of the scene's radio [2.4e9].")] = None,
-    material: Annotated[list[str] | None, typer.Option(
-        metavar="NAME=ITU", help="Take the file's material NAME for an ITU material; may be repeated.")] = None,
-    scale: Annotated[float | None, typer.Option(help="Factor from the file's unit to metres (feet: 0.3048).")] = None,
-    up: Annotated[str | None, typer.Option(help="Axis of the file that points up: x, y or z.")] = None,
-    bbox: Annotated[str | None, typer.Option(
-        metavar="XMIN,YMIN,XMAX,YMAX", help="Keep only this part of the city [m].")] = None,
-    devices: Annotated[int | None, typer.Option(min=0, help="Devices to place on free ground [0].")] = None,
-    uavs: Annotated[int | None, typer.Option(min=0, help="UAVs to place near the middle [3].")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Of the placement [0].")] = None,
-) -> None:
-    """Turn a city model into a scene folder, and report what is in it and what is wrong with it."""
-    from radiotwin.scene.build import BuildOptions
-    from radiotwin.scene.build import build_scene as build
-    from radiotwin.scene.presets import build_preset_scene
-    from radiotwin.scene.report import print_report
-    from radiotwin.scene.sources import scene_name
-
-    show_warnings_plainly()
-    given = {"frequency_hz": frequency_hz, "materials": _pairs(material or []) or None, "scale": scale, "up": up,
-             "bbox": _box(bbox), "devices": devices, "uavs": uavs, "seed": seed}
-    given = {name: value for name, value in given.items() if value is not None}
-    if source.startswith("preset:"):
-        if given:
-            raise BadInput(f"{source} is built as it is published; the option for {', '.join(given)} cannot be used "
-                           "with it. Build it without, then change scene.toml")
-        name = source.removeprefix("preset:")
-        report = build_preset_scene(name, out or Path("scenes") / name, check_only=check)
-    else:
-        report = build(source, out or Path("scenes") / scene_name(source), BuildOptions(**given), check_only=check)
-    print_report(report, console)
-    if report.folder:
-        say(f"wrote {report.folder}: scene.toml, city.xml, meshes/, preview.png")
-    if report.tracing_would_fail:
-        raise typer.Exit(2)
 
 
 def trace(
     folder: SceneFolder,
     out: Annotated[Path | None, typer.Option(
-        "--out", "-o", help="Radio map [SCENE/truth.nc, with --devices truth-A-B.nc]; with --points a CSV file "
-                            "[gains.csv].")] = None,
+        "--out", "-o", help="Radio map [SCENE/truth.nc, with --devices truth-A-B.nc].")] = None,
     quality: Annotated[str, typer.Option(help="fast, default or high.")] = "default",
     solver: Annotated[str, typer.Option(help="paths (gain at points) or map (mean over lattice cells).")] = "paths",
     combining: Annotated[str, typer.Option(help="power (sum of the paths' powers) or coherent (of their fields).")
                          ] = "power",
     devices: Annotated[str | None, typer.Option(metavar="A,B,…", help="Only these devices.")] = None,
-    points: Annotated[Path | None, typer.Option(
-        help="CSV file with x_m, y_m, z_m: gains at these points, not over the lattice.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the rays.")] = 1,
 ) -> None:
     """Ray-trace the truth with Sionna RT. A killed run goes on where it was; a finished one is not done again."""
     from radiotwin.scene import Scene
-    from radiotwin.trace import SolverSettings, read_points, trace_map, trace_points
+    from radiotwin.trace import SolverSettings, trace_map
 
     show_warnings_plainly()
     scene = Scene.load(folder)
     settings = SolverSettings.of_quality(quality, solver=solver, combining=combining, seed=seed)
     names = devices.split(",") if devices else None
-    if points is not None:
-        out = out or Path("gains.csv")
-        table = trace_points(scene, read_points(points), settings, out, names)
-        detected = int(table["gain_db"].notna().sum())
-        say(f"wrote {out}: {len(table)} links, {detected} detected")
-        return
     out = out or folder / ("-".join(["truth", *(names or [])])[:100] + ".nc")
     facts = trace_map(scene, settings, out, names).dataset.attrs
     say(f"wrote {out}: {facts['links']} links, {facts['links_detected']} detected, {facts['links_below_sensitivity']} "
@@ -96,6 +43,31 @@ def trace(
     if "noise_floor_db" in facts:
         say(f"numerical noise: {facts['noise_floor_db']:.2f} dB RMS against ten times the rays; nine links in ten are "
             f"within {facts['noise_floor_p90_db']:.2f} dB")
+
+
+def gains(
+    folder: SceneFolder,
+    points: Annotated[Path, typer.Option(
+        help="CSV file with x_m, y_m, z_m; or latitude_deg, longitude_deg, z_m, where the scene has an origin.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Table (.csv, .csv.gz), a row a link.")] = Path("gains.csv"),
+    devices: Annotated[str | None, typer.Option(metavar="A,B,…", help="Only these devices.")] = None,
+    combining: Annotated[str, typer.Option("--sum", help="power (of the paths' powers) or coherent (of their fields).")
+                         ] = "power",
+    quality: Annotated[str, typer.Option(help="fast, default or high.")] = "default",
+    seed: Annotated[int, typer.Option(min=0, help="Of the rays.")] = 1,
+) -> None:
+    """Ray-trace gains at any points; an empty gain has a reason: no path, below sensitivity, …."""
+    from radiotwin.scene import Scene
+    from radiotwin.trace import SolverSettings, read_points, trace_points
+
+    show_warnings_plainly()
+    scene = Scene.load(folder)
+    settings = SolverSettings.of_quality(quality, combining=combining, seed=seed)
+    points_m = read_points(points, scene.config.origin)
+    table = trace_points(scene, points_m, settings, out, devices.split(",") if devices else None)
+    reasons = table.loc[table["reason"] != "", "reason"].value_counts()
+    say(f"wrote {out}: {len(table)} links, {len(table) - reasons.sum()} with a gain"
+        + "".join(f", {count} {reason}" for reason, count in reasons.items()))
 
 
 def survey(
@@ -139,23 +111,3 @@ def read_truth(scene, truth: str):
                            "--truth segmented")
         return RadioMap.read(path)
     return RadioMap.read(truth)
-
-
-def _pairs(texts: list[str]) -> dict[str, str]:
-    pairs = {}
-    for text in texts:
-        name, equals, itu = text.partition("=")
-        if not (name and equals and itu):
-            raise BadInput(f"--material {text!r} is not NAME=ITU; for example --material Roof=itu_metal")
-        pairs[name] = itu
-    return pairs
-
-
-def _box(text: str | None) -> tuple[float, float, float, float] | None:
-    if text is None:
-        return None
-    try:
-        x_min, y_min, x_max, y_max = (float(part) for part in text.split(","))
-    except ValueError:
-        raise BadInput(f"--bbox {text!r} is not four numbers; give XMIN,YMIN,XMAX,YMAX in metres") from None
-    return x_min, y_min, x_max, y_max

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
+from radiotwin.geodesy import to_local
 from radiotwin.importing.settings import POSITION
 from radiotwin.tables import Origin
 
@@ -15,10 +16,7 @@ DECIMALS = 7  # of a found origin [degrees]: a centimetre
 
 @dataclass(frozen=True)
 class Frame:
-    """The plane that is azimuthal equidistant about the origin on the WGS84 ellipsoid; heights stay heights.
-
-    Distance and bearing from the origin are exact and the ground stays at one z, as a flat city map has it; in a
-    tangent plane (topocentric) the ground 10 km away would lie 8 m below zero.
+    """The local frame about an origin (see `radiotwin.geodesy`); heights stay heights.
 
     Attributes:
         origin: None where all positions are local already.
@@ -32,13 +30,10 @@ class Frame:
         ground_m = 0.0 if self.origin is None else self.origin.altitude_m
         above_m = positions["height"].fillna(positions["z"]).fillna(positions["altitude"] - ground_m)
         if self.origin is not None:
-            from pyproj import Proj
-
-            plane = Proj(proj="aeqd", lat_0=self.origin.latitude_deg, lon_0=self.origin.longitude_deg, ellps="WGS84")
             known = positions[["latitude", "longitude"]].notna().all(axis=1).to_numpy()
             x_m, y_m = x_m.copy(), y_m.copy()
-            x_m[known], y_m[known] = plane(positions["longitude"][known].to_numpy(dtype=float),
-                                           positions["latitude"][known].to_numpy(dtype=float))
+            x_m[known], y_m[known] = to_local(self.origin, positions["longitude"][known].to_numpy(dtype=float),
+                                              positions["latitude"][known].to_numpy(dtype=float))
         return np.column_stack([x_m, y_m, above_m.to_numpy(dtype=float)])
 
 

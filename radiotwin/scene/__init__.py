@@ -7,10 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
+from radiotwin.antennas import Antenna, Pattern, read_pattern
 from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import SceneConfig, read_config
 from radiotwin.scene.lattice import Lattice
+from radiotwin.scene.own_files import require_within
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +39,7 @@ class Scene:
             raise BadInput(f"{folder} is not a folder; give a scene folder, as `radiotwin build-scene` makes it")
         scene = cls(folder, read_config(folder / "scene.toml"))
         scene.check_devices()
+        scene.device_antennas, scene.uav_antenna  # read now: a broken file is said before any work
         return scene
 
     @property
@@ -61,6 +64,22 @@ class Scene:
     def blocked(self) -> np.ndarray:
         """(nz, ny, nx) bool: lattice positions inside a building, where no UAV can be."""
         return self.city.inside(self.lattice.positions_m).reshape(self.lattice.shape)
+
+    @cached_property
+    def device_antennas(self) -> list[Antenna | None]:
+        """Antenna of each declared device; None: isotropic."""
+        return [None if device.antenna is None else
+                Antenna(self._pattern(device.antenna), device.azimuth_deg or 0.0, device.tilt_deg or 0.0)
+                for device in self.config.devices]
+
+    @cached_property
+    def uav_antenna(self) -> Antenna | None:
+        """Antenna of all UAVs, the mean over the headings that they may have; None: isotropic."""
+        names = {uav.antenna for uav in self.config.uavs} - {None}
+        return Antenna(self._pattern(names.pop()).around()) if names else None
+
+    def _pattern(self, name: str) -> Pattern:
+        return read_pattern(require_within(self.folder, self.folder / name, str(self.folder / "scene.toml")))
 
     def check_devices(self) -> None:
         """Raise BadInput when a device is inside a building, or a UAV starts or ends in one."""
@@ -91,12 +110,17 @@ class Scene:
                            "`radiotwin trace` again")
 
     def content_hash(self) -> str:
-        """SHA-256 over what decides a gain map: geometry, materials, frequency, sensitivity and device positions."""
+        """SHA-256 over what decides a gain map: geometry, materials, frequency, sensitivity, devices and antennas."""
         digest = hashlib.sha256()
-        for path in (self.xml_path, *sorted(self.folder.glob("meshes/*"))):
+        for path in (self.xml_path, *sorted(path for path in self.folder.glob("meshes/*") if path.is_file())):
+            require_within(self.folder, path, str(self.folder))
             digest.update(path.name.encode() + b"\0" + path.read_bytes())
         radio = self.config.radio
         digest.update(f"{radio.frequency_hz!r},{radio.tx_power_dbm!r},{radio.sensitivity_dbm!r};".encode())
         for device in self.config.devices:
             digest.update(f"{device.device},{device.x_m!r},{device.y_m!r},{device.z_m!r};".encode())
+        for antenna in (*self.device_antennas, self.uav_antenna):
+            if antenna is not None:
+                digest.update(f"{antenna.azimuth_deg!r},{antenna.tilt_deg!r};".encode())
+                digest.update(np.ascontiguousarray(antenna.pattern.gain_dbi).tobytes())
         return digest.hexdigest()

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import trimesh
 
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder
+from radiotwin.geodesy import local_crs
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import Extent, LatticeConfig, SceneConfig, parse_config, write_config
@@ -31,8 +33,9 @@ from radiotwin.scene.problems import Problem
 from radiotwin.scene.report import BuildReport, MaterialUse
 from radiotwin.scene.sources import find_source, scene_name
 from radiotwin.scene.writer import CityShape, write_city
+from radiotwin.tables import Origin
 
-SCENE_FILES = {"scene.toml", "city.xml", "meshes", "preview.png"}
+SCENE_FILES = {"scene.toml", "city.xml", "meshes", "preview.png", "buildings.csv"}
 
 
 @dataclass(frozen=True)
@@ -113,15 +116,64 @@ def build_scene(
         raise BadInput("\n".join([f"{source}: tracing would fail:", *errors]))
     if errors:
         return _report_on_errors(str(source), city, options.frequency_hz)
+    extent = None
+    if options.bbox is not None:
+        x_min, y_min, x_max, y_max = (float(v) for v in np.array(options.bbox) + np.tile(city.moved_m[:2], 2))
+        extent = Extent(x_min_m=x_min, x_max_m=x_max, y_min_m=y_min, y_max_m=y_max)
+    known = _provenance(city, str(source), options)
+    declared = Declared(str(source), scene_name(source), extent, None, known)
+    return finish_scene(city, declared, out_folder, options, check_only)
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What a scene says besides its geometry.
+
+    Attributes:
+        source, name: where the city comes from, and what it is called.
+        extent: of the lattice; None: chosen around the buildings.
+        origin: WGS84 position of the frame's origin, where it is known.
+        provenance: for `scene.toml`.
+        facts: more lines for the report.
+    """
+
+    source: str
+    name: str
+    extent: Extent | None
+    origin: Origin | None
+    provenance: dict[str, str]
+    facts: tuple[tuple[str, str], ...] = ()
+
+
+def finish_scene(
+    city: ImportedCity,
+    declared: Declared,
+    out_folder: Path,
+    options: BuildOptions,
+    check_only: bool,
+    buildings: pd.DataFrame | None = None,
+) -> BuildReport:
+    """Write the scene folder of a city without errors, and report on it.
+
+    Args:
+        city: in the scene's frame; its problems grow.
+        declared: see there.
+        out_folder: scene folder to write; a scene that is already in it is replaced.
+        options: frequency, devices, UAVs and seed.
+        check_only: write nothing.
+        buildings: a table of them, for `buildings.csv`.
+    """
     shapes, material_problems = _city_shapes(city, options.frequency_hz)
     city.problems.extend(material_problems)
-    plan = _plan(city, scene_name(source), str(source), options)
+    plan = _plan(city, declared, options)
     if not check_only:
         with atomic_folder(out_folder) as folder:
             write_city(folder, shapes)
             write_config(plan.config, folder / "scene.toml")
+            if buildings is not None:
+                buildings.to_csv(folder / "buildings.csv", index=False)
             draw_preview(Scene.load(folder), folder / "preview.png")
-    return _report(city, shapes, plan, str(source), None if check_only else out_folder)
+    return _report(city, shapes, plan, declared, None if check_only else out_folder)
 
 
 def check_target(folder: Path) -> None:
@@ -174,15 +226,13 @@ class _Plan:
     tallest: str
 
 
-def _plan(city: ImportedCity, name: str, source: str, options: BuildOptions) -> _Plan:
+def _plan(city: ImportedCity, declared: Declared, options: BuildOptions) -> _Plan:
     surfaces, solid = city.surfaces, ~city.ground
-    if options.bbox is None:
+    if declared.extent is None:
         bounds = building_bounds(surfaces, solid)
         extent = choose_extent(bounds)
     else:
-        x_min, y_min, x_max, y_max = np.array(options.bbox) + np.tile(city.moved_m[:2], 2)
-        bounds = x_min, x_max, y_min, y_max
-        extent = Extent(x_min_m=x_min, x_max_m=x_max, y_min_m=y_min, y_max_m=y_max)
+        bounds, extent = declared.extent.bounds, declared.extent
     buildings = CityMap(surfaces.vertices, surfaces.faces[solid]) if solid.any() else None
     ground = CityMap(surfaces.vertices, surfaces.faces[city.ground]) if city.ground.any() else None
     tops_m, heights_m = building_tops(surfaces, solid, ground)
@@ -190,14 +240,16 @@ def _plan(city: ImportedCity, name: str, source: str, options: BuildOptions) -> 
     lattice = LatticeConfig(step_m=choose_step(bounds), altitudes_m=choose_altitudes(tops_m[heights_m > 0]))
     grid = BuiltGrid.over(extent, buildings)
     config = {
-        "name": name,
+        "name": declared.name,
         "radio": {"frequency_hz": options.frequency_hz},
         "extent": extent,
         "lattice": lattice,
         "devices": place_devices(options.devices, grid, ground, np.random.default_rng(options.seed)),
         "uavs": place_uavs(options.uavs, extent, lattice, buildings),
-        "provenance": _provenance(city, source, options),
+        "provenance": declared.provenance,
     }
+    if declared.origin is not None:
+        config |= {"origin": declared.origin, "crs": local_crs(declared.origin)}
     return _Plan(
         parse_config(config, Path("scene.toml")),
         grid.fraction,
@@ -224,17 +276,17 @@ def _kind(name: str, itu: str | None) -> str:
 
 
 def _report(
-    city: ImportedCity, shapes: list[CityShape], plan: _Plan, source: str, folder: Path | None
+    city: ImportedCity, shapes: list[CityShape], plan: _Plan, declared: Declared, folder: Path | None
 ) -> BuildReport:
     frequency_hz = plan.config.radio.frequency_hz
     uses = []
-    declared = dict(zip((shape.material for shape in shapes), city.materials))
+    as_declared = dict(zip((shape.material for shape in shapes), city.materials))
     for material, count in Counter(shape.material for shape in shapes).most_common():
-        origin = declared[material]
-        kind = _kind(material.name, origin.itu)
-        uses.append(MaterialUse(material.name, kind, count, *constants(origin, frequency_hz)))
+        before = as_declared[material]
+        kind = _kind(material.name, before.itu)
+        uses.append(MaterialUse(material.name, kind, count, *constants(before, frequency_hz)))
     return BuildReport(
-        source,
+        declared.source,
         folder,
         frequency_hz,
         len(shapes),
@@ -248,6 +300,7 @@ def _report(
         len(plan.config.uavs),
         tuple(uses),
         _by_severity(city.problems),
+        declared.facts,
     )
 
 

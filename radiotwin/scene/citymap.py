@@ -6,12 +6,12 @@ of 10 km, and surfaces closer together than `SKIN_M` count as one.
 [1] Wald et al., "Embree: a kernel framework for efficient CPU ray tracing", ACM TOG 33(4), 2014.
 """
 
-import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
 
 from radiotwin.errors import BadInput, RunFailed
+from radiotwin.scene.mitsuba_xml import scene_meshes
 from radiotwin.scene.ply import read_ply
 
 SKIN_M = 0.01
@@ -51,18 +51,14 @@ class CityMap:
         """Read the meshes that a scene folder's `city.xml` names (PLY shapes, as `build-scene` writes them).
 
         Raises:
-            BadInput: no such file, malformed XML, or a mesh that cannot be read.
+            BadInput: no such file, malformed XML, a mesh that cannot be read, or one outside of the folder.
         """
         xml_path = Path(xml_path)
-        try:
-            root = ElementTree.parse(xml_path).getroot()
-        except FileNotFoundError:
-            raise BadInput(f"{xml_path} does not exist; `radiotwin build-scene` makes a scene folder") from None
-        except ElementTree.ParseError as error:
-            raise BadInput(f"{xml_path} is not well-formed XML: {error}") from None
+        if not xml_path.is_file():
+            raise BadInput(f"{xml_path} does not exist; `radiotwin build-scene` makes a scene folder")
         vertices, faces, count = [], [], 0
-        for name in root.findall("./shape/string[@name='filename']"):
-            corners, polygons = read_ply(xml_path.parent / name.get("value", ""))
+        for path in scene_meshes(xml_path):
+            corners, polygons = read_ply(path)
             vertices.append(corners)
             faces += [triangles + count for triangles in polygons]
             count += len(corners)

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
+from radiotwin.geodesy import local_crs
 from radiotwin.tables import Number, Origin, Table
 
 SCHEMA = "radiotwin.scene/1"
@@ -82,6 +83,16 @@ class DeviceConfig(Table):
     y_m: Number
     z_m: Number = Field(1.5, gt=0)
     role: Literal["anchor", "unknown"] = "unknown"
+    antenna: str | None = Field(None, description="file in the scene folder; None: isotropic")
+    azimuth_deg: Number | None = Field(None, ge=-360, le=360, description="clockwise from north [0]")
+    tilt_deg: Number | None = Field(None, ge=-90, le=90, description="above zero the antenna looks up [0]")
+
+    @model_validator(mode="after")
+    def _isotropic_looks_nowhere(self):
+        if self.antenna is None and (self.azimuth_deg is not None or self.tilt_deg is not None):
+            raise ValueError("azimuth_deg and tilt_deg belong to an antenna; name its file: antenna = "
+                             '"antennas/NAME.msi"')
+        return self
 
 
 class UavConfig(Table):
@@ -94,6 +105,7 @@ class UavConfig(Table):
     terminal_x_m: Number
     terminal_y_m: Number
     battery: Number = Field(gt=0, le=100_000)
+    antenna: str | None = Field(None, description="file in the scene folder; None: isotropic")
 
 
 class MissionConfig(Table):
@@ -111,6 +123,7 @@ class SceneConfig(Table):
     extent: Extent
     lattice: LatticeConfig
     origin: Origin | None = None
+    crs: str | None = Field(None, description="of the local frame in the words of PROJ, for other programs")
     devices: list[DeviceConfig] = []
     uavs: list[UavConfig] = []
     mission: MissionConfig = MissionConfig()
@@ -124,7 +137,12 @@ class SceneConfig(Table):
             double = {name for name in names if names.count(name) > 1}
             if double:
                 raise ValueError(f"{kind} {sorted(double)[0]!r} is declared twice; every name must be unique")
+        if self.crs is not None and (self.origin is None or self.crs != local_crs(self.origin)):
+            raise ValueError("crs is not that of the local frame about [origin]; remove it, or write "
+                             + (f"crs = \"{local_crs(self.origin)}\"" if self.origin else "an [origin]"))
         self._check_size()
+        if len({uav.antenna for uav in self.uavs}) > 1:
+            raise ValueError("uavs have different antennas; one radio map serves all of them, so give all the same")
         for device in self.devices:
             x_min_m, x_max_m, y_min_m, y_max_m = self.extent.bounds
             if not (x_min_m <= device.x_m <= x_max_m and y_min_m <= device.y_m <= y_max_m):

@@ -8,11 +8,12 @@ integrators say nothing about radio and are passed over.
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.parsers import expat
 
 import numpy as np
 
 from radiotwin.errors import BadInput
+from radiotwin.safe_xml import parse_elements
+from radiotwin.scene.own_files import require_within
 
 INCLUDE_DEPTH = 15  # as Mitsuba
 
@@ -46,10 +47,12 @@ class Node:
         return _numbers(self, text, (1,))[0]
 
     def walk(self) -> Iterator["Node"]:
-        """This element and all below it, in the file's order."""
-        yield self
-        for child in self.children:
-            yield from child.walk()
+        """This element and all below it, in the file's order, however deep."""
+        waiting = [self]
+        while waiting:
+            node = waiting.pop()
+            yield node
+            waiting += reversed(node.children)
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +87,8 @@ def read_mitsuba_xml(path: Path | str) -> DeclaredCity:
         path: of the XML file; mesh files are looked for relative to the file that names them.
 
     Raises:
-        BadInput: no such file, malformed XML, not a scene, or a value that is no number; with file and line.
+        BadInput: no such file, malformed XML, not a scene, a value that is no number, or a file outside of the
+            folder that `path` lies in; with file and line.
     """
     return _Reader(Path(path)).city
 
@@ -150,8 +154,8 @@ class _Reader:
         name = name.replace("\\", "/")
         for folder in (node.file.parent, *self.folders):
             if (folder / name).is_file():
-                return folder / name
-        return node.file.parent / name
+                return require_within(self.folders[0], folder / name, node.place)
+        return require_within(self.folders[0], node.file.parent / name, node.place)
 
     def _read_shape(self, node: Node) -> None:
         kind = node.attributes.get("type", "")
@@ -175,33 +179,37 @@ def parse_xml(path: Path) -> Node:
     """Parse one file into elements with line numbers.
 
     Raises:
-        BadInput: no such file, or malformed XML, with line and column.
+        BadInput: no such file, malformed XML (with line and column), or one that declares entities.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise BadInput(
-            f"{path} cannot be read ({error.strerror}); give the path of a scene's XML file"
-        ) from None
-    parser = expat.ParserCreate()
     top = Node("", {}, path, 0)
     open_nodes = [top]
 
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        node = Node(tag, attributes, path, parser.CurrentLineNumber)
+    def start(tag: str, attributes: dict[str, str], line: int) -> None:
+        node = Node(tag, attributes, path, line)
         open_nodes[-1].children.append(node)
         open_nodes.append(node)
 
-    parser.StartElementHandler = start
-    parser.EndElementHandler = lambda tag: open_nodes.pop()
-    try:
-        parser.Parse(data, True)
-    except expat.ExpatError as error:
-        raise BadInput(
-            f"{path}, line {error.lineno}, column {error.offset + 1}: malformed XML "
-            f"({expat.ErrorString(error.code)}); correct or export the file again"
-        ) from None
+    parse_elements(path, start, lambda tag: open_nodes.pop())
     return top.children[0]
+
+
+def scene_meshes(xml_path: Path) -> list[Path]:
+    """Mesh files that the `city.xml` of a scene folder names, in its order.
+
+    Raises:
+        BadInput: no such file, malformed XML, or one that reads other files than those in its folder.
+    """
+    meshes = []
+    for node in parse_xml(xml_path).walk():
+        if node.tag in ("include", "path"):
+            raise BadInput(f"{node.place}: <{node.tag}> is not allowed in a scene folder; build the scene with "
+                           "`radiotwin build-scene`")
+        named = node.attributes.get("filename")
+        if node.attributes.get("name") == "filename":
+            named = node.attributes.get("value", "")
+        if named is not None:
+            meshes.append(require_within(xml_path.parent, xml_path.parent / named, node.place))
+    return meshes
 
 
 def _numbers(node: Node, text: str, counts: tuple[int, ...]) -> np.ndarray:

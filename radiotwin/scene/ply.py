@@ -66,6 +66,8 @@ def read_ply(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
             declare them.
     """
     try:
+        if path.exists() and not path.is_file():  # a pipe would be waited for without end
+            raise OSError(0, "it is not an ordinary file")
         data = path.read_bytes()
     except OSError as error:
         raise BadInput(f"{path} cannot be read: {error.strerror}; export the mesh again") from None
@@ -111,7 +113,7 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
             match words:
                 case ["format", kind, _]:
                     order = _ORDERS[kind]
-                case ["element", name, count]:
+                case ["element", name, count] if int(count) >= 0:
                     elements.append(_Element(name, int(count)))
                 case ["property", "list", length_kind, kind, name]:
                     elements[-1].properties.append((name, _TYPES[kind], _TYPES[length_kind]))
@@ -128,6 +130,10 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
             ) from None
     if order is None:
         raise BadInput(f"{path}: the PLY header has no format line; export the mesh again")
+    # Every row takes at least a byte: what a header promises is held against the file before anything is reserved
+    for element in elements:
+        if element.count and not element.properties or element.count > len(data) - start:
+            raise _truncated(path, element, 0)
     return order, elements, start
 
 
@@ -194,6 +200,8 @@ def _read_uniform(data: bytes, start: int, order: str, element: _Element) -> tup
             at += np.dtype(length_kind).itemsize + size * lengths[name]
         else:
             at += size
+        if at > len(data) or min(lengths.values(), default=0) < 0:
+            return None
     dtype = element.dtype(order, lengths)
     if start + dtype.itemsize * element.count > len(data):
         return None

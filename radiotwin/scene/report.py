@@ -51,6 +51,7 @@ class BuildReport:
         devices, uavs: how many were placed.
         materials: in use.
         problems: errors first.
+        facts: more lines, as (what, finding).
     """
 
     source: str
@@ -67,6 +68,7 @@ class BuildReport:
     uavs: int
     materials: tuple[MaterialUse, ...]
     problems: tuple[Problem, ...]
+    facts: tuple[tuple[str, str], ...] = ()
 
     @property
     def tracing_would_fail(self) -> bool:
@@ -87,6 +89,8 @@ def print_report(report: BuildReport, console: Console) -> None:
         altitudes = ", ".join(f"{altitude:g}" for altitude in report.altitudes_m)
         facts.add_row("lattice altitudes", altitudes + " m   (from 10 m above 95 % of the roofs)")
         facts.add_row("devices, UAVs", f"{report.devices}, {report.uavs}")
+    for what, finding in report.facts:
+        facts.add_row(what, escape(finding))
     console.print(facts)
     if report.materials:
         console.print(_material_table(report))

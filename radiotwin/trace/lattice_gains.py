@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from radiotwin.errors import BadInput
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
 from radiotwin.trace.batches import BatchStore
@@ -77,29 +78,32 @@ def _solve(scene: Scene, settings: SolverSettings, store: BatchStore, work: list
         solve = _open(scene, settings)
         with progress(description, total=sum(len(part) for _, _, part in missing)) as advance:
             for name, device, part in missing:
-                known[name] = solve(scene.device_m[device], scene.lattice.positions_m[part], advance)
+                known[name] = solve(device, scene.lattice.positions_m[part], advance)
                 store.put(name, known[name])
     return [known[name] for name, _, _ in work]
 
 
 def _open(scene: Scene, settings: SolverSettings) -> Callable[..., np.ndarray]:
-    """A function of device, positions and progress that gives gains by the solver that is asked for."""
+    """A function of a device's row, positions and progress that gives gains by the solver that is asked for."""
     frequency_hz = scene.config.radio.frequency_hz
     if settings.solver == "paths":
         paths = PathGains(scene.xml_path, frequency_hz, settings)
 
-        def by_paths(device_m, points_m, advance):
-            gain_db = []
-            for part_db in paths.gains(device_m, points_m):
+        def by_paths(device, points_m, advance):
+            gain_db, antennas = [], (scene.device_antennas[device], scene.uav_antenna)
+            for part_db in paths.gains(scene.device_m[device], points_m, antennas):
                 gain_db.append(part_db)
                 advance(len(part_db))
             return np.concatenate(gain_db)
 
         return by_paths
+    if any(antenna is not None for antenna in (*scene.device_antennas, scene.uav_antenna)):
+        raise BadInput(f"{scene.folder / 'scene.toml'} declares antennas, which the solver 'map' does not know; use "
+                       "the solver 'paths'")
     cells = CellGains(scene.xml_path, frequency_hz, settings, scene.lattice)
 
-    def by_cells(device_m, points_m, advance):
-        gain_db = cells.solve(device_m, points_m[0, 2])
+    def by_cells(device, points_m, advance):
+        gain_db = cells.solve(scene.device_m[device], points_m[0, 2])
         advance(len(gain_db))
         return gain_db
 

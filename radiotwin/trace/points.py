@@ -5,25 +5,35 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from radiotwin.antennas import Antenna
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path, require_writable
+from radiotwin.geodesy import to_local
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
+from radiotwin.tables import Origin
+from radiotwin.trace.gates import SPEED_OF_LIGHT_M_S
 from radiotwin.trace.run import device_indices
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import PathGains
 
 COLUMNS = ["x_m", "y_m", "z_m"]
+GEOGRAPHIC = ["latitude_deg", "longitude_deg", "z_m"]
+# Within a wavelength there is no far field, and Sionna RT loses the direct path at a centimetre.
+REASONS = ["below the ground", "inside a building", "within a wavelength", "no path", "below sensitivity"]
+MOST_DEG = {"latitude_deg": 90, "longitude_deg": 180}
 
 
-def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settings: SolverSettings) -> np.ndarray:
-    """Gains between positions in a scene's city.
+def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settings: SolverSettings,
+                antennas: list[Antenna | None] | None = None) -> np.ndarray:
+    """Gains between positions in a scene's city. Receivers have the antenna of the scene's UAVs.
 
     Args:
         scene: city and frequency.
         device_m: (k, 3) positions of transmitters [m].
         points_m: (n, 3) positions of receivers [m].
         settings: with solver `paths`.
+        antennas: of the k transmitters; None: isotropic.
 
     Returns:
         (k, n) gain [dB]; NaN where there is no path.
@@ -37,9 +47,9 @@ def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settin
     solver = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings)
     gain_db = np.full((len(device_m), len(points_m)), np.nan)
     with progress("tracing", total=gain_db.size) as advance:
-        for row, one_m in enumerate(device_m):
+        for row, (one_m, antenna) in enumerate(zip(device_m, antennas or [None] * len(device_m))):
             for part in solver.batches(len(points_m)):
-                gain_db[row, part] = solver.solve(one_m, points_m[part])
+                gain_db[row, part] = solver.solve(one_m, points_m[part], (antenna, scene.uav_antenna))
                 advance(part.stop - part.start)
     return gain_db
 
@@ -56,8 +66,8 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings, o
         devices: names; all devices of the scene by default.
 
     Returns:
-        One row a link: device, x_m, y_m, z_m, gain_db (NaN = not detected), los, and reason: empty, or why nothing
-        is detected ('no path', 'below sensitivity', 'inside a building').
+        One row a link: device, x_m, y_m, z_m, gain_db (NaN = not detected), los, and reason: empty, or why there
+        is no gain, one of `REASONS`.
 
     Raises:
         BadInput: an unknown device, settings for another solver, or an output that cannot be written.
@@ -69,11 +79,14 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings, o
         require_writable(out_path)
     index = device_indices(scene, devices)
     inside = scene.city.inside(points_m)
-    gain_db = trace_gains(scene, scene.device_m[index], points_m, settings)
+    wavelength_m = SPEED_OF_LIGHT_M_S / scene.config.radio.frequency_hz
+    antennas = [scene.device_antennas[device] for device in index]
+    gain_db = trace_gains(scene, scene.device_m[index], points_m, settings, antennas)
     tables = []
     for row, device in enumerate(index):
-        reason = np.select([inside, np.isnan(gain_db[row]), gain_db[row] < scene.config.gain_limit_db],
-                           ["inside a building", "no path", "below sensitivity"], default="")
+        near = np.linalg.norm(points_m - scene.device_m[device], axis=1) < wavelength_m
+        reason = np.select([inside & (points_m[:, 2] < 0), inside, near, np.isnan(gain_db[row]),
+                            gain_db[row] < scene.config.gain_limit_db], REASONS, default="")
         tables.append(pd.DataFrame({
             "device": scene.config.devices[device].device, "x_m": points_m[:, 0], "y_m": points_m[:, 1],
             "z_m": points_m[:, 2], "gain_db": np.where(reason == "", gain_db[row], np.nan),
@@ -85,14 +98,19 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings, o
     return table
 
 
-def read_points(path: Path | str) -> np.ndarray:
-    """Read points from a CSV file with the columns x_m, y_m and z_m; others are ignored.
+def read_points(path: Path | str, origin: Origin | None = None) -> np.ndarray:
+    """Read points from a CSV file; columns other than those of the position are ignored.
+
+    Args:
+        path: file with the columns x_m, y_m and z_m, or latitude_deg, longitude_deg and z_m (above the ground datum).
+        origin: of the local frame, which latitude and longitude need.
 
     Returns:
         (n, 3) positions [m].
 
     Raises:
-        BadInput: no such file, a missing column, no rows, or a cell that is not a finite number.
+        BadInput: no such file, a missing column, no rows, a cell that is not a finite number, or latitudes where
+            there is no origin.
     """
     path = Path(path)
     if not path.is_file():
@@ -101,16 +119,29 @@ def read_points(path: Path | str) -> np.ndarray:
         raw = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True)
     except (ValueError, OSError, EOFError) as error:  # pandas' own are ValueErrors
         raise BadInput(f"{path} cannot be read as CSV: {error}") from None
-    missing = [name for name in COLUMNS if name not in raw]
+    geographic = "x_m" not in raw and GEOGRAPHIC[0] in raw
+    wanted = GEOGRAPHIC if geographic else COLUMNS
+    missing = [name for name in wanted if name not in raw]
     if missing:
-        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {COLUMNS}, it has {list(raw.columns)}")
+        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {wanted}, it has {list(raw.columns)}")
     if raw.empty:
         raise BadInput(f"{path}: has no rows; it needs at least one point")
-    points_m = np.empty((len(raw), 3))
-    for axis, name in enumerate(COLUMNS):
-        points_m[:, axis] = pd.to_numeric(raw[name].str.strip(), errors="coerce")
-        bad = ~np.isfinite(points_m[:, axis])
-        if bad.any():
-            row = int(np.flatnonzero(bad)[0])
-            raise BadInput(f"{path}: row {row + 2}, column {name}: {raw[name][row]!r} is not a finite number [m]")
-    return points_m
+    if geographic and origin is None:
+        raise BadInput(f"{path} gives latitude and longitude, and the scene has no [origin] in scene.toml; add one, or "
+                       "give x_m and y_m")
+    points = np.column_stack([_numbers(path, raw, name) for name in wanted])
+    if geographic:
+        points[:, :2] = np.column_stack(to_local(origin, points[:, 1], points[:, 0]))
+    return points
+
+
+def _numbers(path: Path, raw: pd.DataFrame, name: str) -> np.ndarray:
+    """(n,) finite numbers of a column; degrees within their range."""
+    values = pd.to_numeric(raw[name].str.strip(), errors="coerce").to_numpy(dtype=float)
+    most = MOST_DEG.get(name, np.inf)
+    bad = ~np.isfinite(values) | (np.abs(values) > most)
+    if bad.any():
+        row = int(np.flatnonzero(bad)[0])
+        allowed = "a finite number [m]" if np.isinf(most) else f"a number from -{most} to {most} [degrees]"
+        raise BadInput(f"{path}: row {row + 2}, column {name}: {raw[name][row]!r} is not {allowed}")
+    return values

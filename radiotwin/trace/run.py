@@ -54,8 +54,10 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
     inside = scene.blocked.ravel()
     distance_m = np.linalg.norm(device_m[:, None, :] - positions_m[None], axis=2)
     frequency_hz = scene.config.radio.frequency_hz
+    direct_dbi, peak_dbi = antenna_gains(scene, index)
     figures = check_gains(raw_db[:, ~inside].ravel(), los[:, ~inside].ravel(), distance_m[:, ~inside].ravel(),
-                          frequency_hz, settings.solver, settings.combining)
+                          frequency_hz, settings.solver, settings.combining, direct_dbi[:, ~inside].ravel(),
+                          np.broadcast_to(peak_dbi, raw_db.shape)[:, ~inside].ravel())
     limit_db = scene.config.gain_limit_db
     gain_db, counts = _censor(raw_db, inside, limit_db)
     rows, columns, finer_db = solve_finer(scene, settings, store, index)
@@ -70,6 +72,20 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
                     **library_versions(), "radiotwin_version": version("radiotwin")})
     radio_map.write(out_path)
     return radio_map
+
+
+def antenna_gains(scene: Scene, index: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """What both ends' antennas add along the straight line, (devices, positions), and at most, (devices, 1) [dB]."""
+    way_m = scene.lattice.positions_m[None] - scene.device_m[index][:, None]
+    direct_dbi, peak_dbi = np.zeros(way_m.shape[:2]), np.zeros((len(index), 1))
+    for row, antenna in enumerate(scene.device_antennas[device] for device in index):
+        if antenna is not None:
+            direct_dbi[row] += antenna.gain_dbi(way_m[row])
+            peak_dbi[row] += antenna.pattern.peak_dbi
+    if scene.uav_antenna is not None:
+        direct_dbi += scene.uav_antenna.gain_dbi(-way_m)
+        peak_dbi += scene.uav_antenna.pattern.peak_dbi
+    return direct_dbi, peak_dbi
 
 
 def _finished(path: Path, trace_hash: str, devices: list[str]) -> RadioMap | None:

@@ -6,12 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
+from radiotwin.antennas import Antenna
 from radiotwin.trace.settings import DIFFRACTION_PROBABILITY, TABLE_SIZE, SolverSettings
 from radiotwin.trace.sionna_scene import candidate_search, import_sionna, load_city
 
 # Dr.Jit keeps freed memory for the next call, which takes the same sizes again but for the paths themselves.
 # Given back after every call, 40 % of the time goes into asking the system for it anew; never, it may pile up.
 CALLS_BETWEEN_FLUSHES = 10
+
+Antennas = tuple[Antenna | None, Antenna | None]
 
 
 class PathGains:
@@ -47,12 +50,15 @@ class PathGains:
         step = self.settings.batch_receivers
         return [slice(start, min(start + step, n)) for start in range(0, n, step)]
 
-    def solve(self, device_m: np.ndarray, points_m: np.ndarray) -> np.ndarray:
+    def solve(self, device_m: np.ndarray, points_m: np.ndarray, antennas: Antennas = (None, None)) -> np.ndarray:
         """Gains of one batch.
 
         Args:
             device_m: (3,) position [m].
             points_m: (n, 3) positions [m], n at most `settings.batch_receivers`.
+            antennas: of the device and of the receivers; None: isotropic. Rays are launched all around whatever the
+                antennas; each path then has their gains in the directions in which it leaves and arrives, and stays
+                vertically polarised, as a pattern of levels says nothing else.
 
         Returns:
             (n,) gain [dB]; NaN where there is no path.
@@ -70,7 +76,7 @@ class PathGains:
                 self._city, max_depth=settings.max_depth, samples_per_src=settings.samples_per_src,
                 max_num_paths_per_src=settings.max_num_paths_per_src, refraction=settings.refraction,
                 diffraction=settings.diffraction, seed=settings.seed)
-        power = self._combine(paths)[: len(points_m)]
+        power = self._combine(paths, antennas)[: len(points_m)]
         del paths
         self._calls += 1
         if self._calls % CALLS_BETWEEN_FLUSHES == 0:
@@ -78,15 +84,20 @@ class PathGains:
         with np.errstate(divide="ignore"):
             return np.where(power > 0, 10 * np.log10(power), np.nan)
 
-    def gains(self, device_m: np.ndarray, points_m: np.ndarray) -> Iterator[np.ndarray]:
+    def gains(self, device_m: np.ndarray, points_m: np.ndarray, antennas: Antennas = (None, None)
+              ) -> Iterator[np.ndarray]:
         """Gains [dB] at (n, 3) points, batch by batch."""
         for part in self.batches(len(points_m)):
-            yield self.solve(device_m, points_m[part])
+            yield self.solve(device_m, points_m[part], antennas)
 
-    def _combine(self, paths) -> np.ndarray:
+    def _combine(self, paths, antennas: Antennas) -> np.ndarray:
         """(batch_receivers,) received over transmitted power."""
         real, imaginary = (np.array(part, dtype=float).reshape(self.settings.batch_receivers, -1) for part in paths.a)
         field = real + 1j * imaginary
+        for antenna, zenith, azimuth in zip(antennas, (paths.theta_t, paths.theta_r), (paths.phi_t, paths.phi_r)):
+            if antenna is not None:
+                zenith, azimuth = (np.array(angle, dtype=float).reshape(field.shape) for angle in (zenith, azimuth))
+                field *= 10 ** (antenna.gain_dbi(_rays(zenith, azimuth)) / 20)
         if self.settings.combining == "power":
             return _exact_sums(np.abs(field) ** 2)
         # Sionna's coefficients leave out the phase of the delay, which is -1 where there is no path.
@@ -94,6 +105,11 @@ class PathGains:
         phase = -2 * np.pi * float(self._city.frequency[0]) * delay_s
         field *= np.exp(1j * phase)
         return _exact_sums(field.real) ** 2 + _exact_sums(field.imag) ** 2
+
+
+def _rays(zenith: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
+    """(..., 3) unit vectors east, north, up of Sionna's angles [rad], the azimuth counter-clockwise from east."""
+    return np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], axis=-1)
 
 
 def _exact_sums(values: np.ndarray) -> np.ndarray:

@@ -31,16 +31,16 @@ def law(monkeypatch, small_scene):
         def batches(self, n):
             return [slice(start, min(start + self.step, n)) for start in range(0, n, self.step)]
 
-        def solve(self, device_m, points_m):
+        def solve(self, device_m, points_m, antennas=(None, None)):
             Law.calls += 1
             distance_m = np.linalg.norm(points_m - device_m, axis=1)
             los = small_scene.city.line_of_sight(device_m[None], points_m)
             gain_db = 20 * np.log10(self.wavelength_m / (4 * np.pi * distance_m)) - 25 * ~los + Law.offset_db
             return np.where(~los & (distance_m > 250), np.nan, gain_db)
 
-        def gains(self, device_m, points_m):
+        def gains(self, device_m, points_m, antennas=(None, None)):
             for part in self.batches(len(points_m)):
-                yield self.solve(device_m, points_m[part])
+                yield self.solve(device_m, points_m[part], antennas)
 
     monkeypatch.setattr("radiotwin.trace.lattice_gains.PathGains", Law)
     monkeypatch.setattr("radiotwin.trace.points.PathGains", Law)

@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
+from radiotwin.tables import Origin
 from radiotwin.trace import SolverSettings, read_points, trace_gains, trace_points
 
 SETTINGS = SolverSettings(batch_receivers=4)
@@ -75,3 +76,26 @@ def test_unknown_format_is_refused_before_the_work(small_scene, law, tmp_path):
 def test_points_need_the_paths(small_scene):
     with pytest.raises(BadInput, match="averages over lattice cells"):
         trace_gains(small_scene, np.ones((1, 3)), np.ones((1, 3)), SolverSettings(solver="map"))
+
+
+@pytest.mark.filterwarnings("ignore:divide by zero")
+def test_points_that_no_gain_is_for(small_scene, law):
+    """Rationale: within a wavelength of a device a number would be wrong, and below the ground none has a meaning."""
+    x_m, y_m, z_m = small_scene.device_m[0]
+    points_m = np.array([[x_m, y_m, z_m], [x_m + 0.1, y_m, z_m], [x_m + 0.2, y_m, z_m], [x_m, y_m, -0.5]])
+    table = trace_points(small_scene, points_m, SETTINGS, devices=["d0"])
+    assert table["reason"].tolist() == ["within a wavelength", "within a wavelength", "", "below the ground"]
+    assert table["gain_db"].notna().tolist() == [False, False, True, False]
+
+
+def test_points_in_degrees(tmp_path):
+    origin = Origin(latitude_deg=47.5, longitude_deg=8.7)
+    path = write(tmp_path / "points.csv", "longitude_deg,latitude_deg,z_m\n8.7,47.5,3\n8.7,47.501,4\n")
+    points_m = read_points(path, origin)
+    assert points_m == pytest.approx(np.array([[0, 0, 3], [0, 111.19, 4]]), abs=0.02)
+    with pytest.raises(BadInput, match=r"the scene has no \[origin\]"):
+        read_points(path)
+    with pytest.raises(BadInput, match="row 3, column latitude_deg: '91' is not a number from -90 to 90"):
+        read_points(write(tmp_path / "far.csv", "latitude_deg,longitude_deg,z_m\n1,1,1\n91,0,1\n"), origin)
+    with pytest.raises(BadInput, match="column 'longitude_deg' is missing"):
+        read_points(write(tmp_path / "half.csv", "latitude_deg,z_m\n1,1\n"), origin)

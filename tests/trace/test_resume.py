@@ -26,10 +26,10 @@ from radiotwin.trace import SolverSettings, solver, trace_map
 folder, log = sys.argv[1:]
 solve = solver.PathGains.solve
 
-def noted(self, device_m, points_m):
+def noted(self, device_m, points_m, antennas=(None, None)):
     with open(log, "a") as file:
         file.write("started\\n")
-    return solve(self, device_m, points_m)
+    return solve(self, device_m, points_m, antennas)
 
 solver.PathGains.solve = noted
 trace_map(Scene.load(folder), SolverSettings(samples_per_src=3_000, batch_receivers=40, max_num_paths_per_src=20_000),

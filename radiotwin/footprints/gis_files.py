@@ -1,0 +1,160 @@
+"""GeoJSON and GeoPackage: areas with the columns of a table for tags.
+
+Where a file has a column `building` or `building:part`, as exports of OpenStreetMap do, only what is built counts; else
+every polygon is a building. `_` may stand for the `:` of a tag, and case does not matter. GDAL's `other_tags` are taken
+apart.
+"""
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+import shapely
+
+from radiotwin.errors import BadInput
+from radiotwin.footprints.features import Feature, MapFile, is_building
+from radiotwin.scene.problems import Problem, listed
+
+WGS84 = ("EPSG:4326", "OGC:CRS84", "urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:EPSG::4326")
+_ALIASES = {key.replace(":", "_"): key for key in ("building:part", "building:levels", "building:min_level",
+                                                   "building:material")}
+_OTHER_TAGS = re.compile(r'"((?:[^"\\]|\\.)*)"\s*=>\s*"((?:[^"\\]|\\.)*)"')
+
+
+def read_geojson(path: Path) -> MapFile:
+    """Read the polygons of a GeoJSON file (RFC 7946: longitude, latitude); an older `crs` member is heeded.
+
+    Raises:
+        BadInput: no such file, not GeoJSON, or coordinates that are no numbers; with the feature's number.
+    """
+    try:
+        data = json.loads(path.read_bytes())
+    except OSError as error:
+        raise BadInput(f"{path} cannot be read ({error.strerror}); give a GeoJSON file") from None
+    except (ValueError, RecursionError) as error:
+        raise BadInput(f"{path} is not valid JSON ({error}); export the map again") from None
+    features = data.get("features") if isinstance(data, dict) else None
+    if not isinstance(features, list):
+        raise BadInput(f"{path} is not a GeoJSON FeatureCollection; export polygons as GeoJSON")
+    rows = []
+    for number, feature in enumerate(features, start=1):
+        geometry, tags = (feature.get(key) or {} for key in ("geometry", "properties")) if isinstance(
+            feature, dict) else (None, None)
+        if not isinstance(geometry, dict) or not isinstance(tags, dict):
+            raise BadInput(f"{path}: feature {number} is not a GeoJSON feature; export the map again")
+        name = str(feature.get("id") or tags.get("@id") or f"feature {number}")
+        rows.append((name, tags, _polygons(path, number, geometry)))
+    return _features(path, rows, _crs_name(path, data))
+
+
+def read_geopackage(path: Path) -> MapFile:
+    """Read the polygons of all layers of a GeoPackage, in any coordinate reference system.
+
+    Raises:
+        BadInput: pyogrio is not installed, no such file, or not a GeoPackage.
+    """
+    try:
+        import pyogrio
+    except ImportError:
+        raise BadInput(f"{path}: GeoPackages are read with the package pyogrio, which is not installed; install it "
+                       "with `pip install 'radiotwin[gis]'`, or export the layer as GeoJSON") from None
+    if not path.is_file():
+        raise BadInput(f"{path} does not exist; give a GeoPackage")
+    found = MapFile([])
+    try:
+        for layer, kind in pyogrio.list_layers(path):
+            if kind is None or "Polygon" not in kind and kind not in ("Unknown", "Geometry", "GeometryCollection"):
+                continue
+            meta, _, shapes, columns = pyogrio.raw.read(path, layer=layer)
+            shapes = shapely.from_wkb(shapes)
+            names = [str(name) for name in meta["fields"]]
+            rows = [(f"{layer} {number}", dict(zip(names, values)), shape) for number, (shape, *values) in enumerate(
+                zip(shapes, *columns), start=1)]
+            part = _features(path, rows, meta["crs"])
+            found.features += part.features
+            found.problems += part.problems
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, shapely.errors.GEOSException) as error:
+        raise BadInput(f"{path} is not a readable GeoPackage ({error}); export it again") from None
+    return found
+
+
+def _polygons(path: Path, number: int, geometry: Mapping):
+    """The polygons of a GeoJSON geometry; None where it has none."""
+    kind, rings = geometry.get("type"), geometry.get("coordinates")
+    if kind not in ("Polygon", "MultiPolygon"):
+        return None
+    try:
+        polygons = [[np.array([place[:2] for place in ring], dtype=float) for ring in polygon]
+                    for polygon in ([rings] if kind == "Polygon" else rings)]
+        if not all(np.isfinite(ring).all() and ring.ndim == 2 for polygon in polygons for ring in polygon):
+            raise ValueError
+        # A ring needs four points; GeoJSON's own rule, and what is shorter has no area anyway
+        return shapely.MultiPolygon([(polygon[0], [ring for ring in polygon[1:] if len(ring) > 3])
+                                     for polygon in polygons if polygon and len(polygon[0]) > 3])
+    except (TypeError, ValueError, IndexError, OverflowError):
+        raise BadInput(f"{path}: feature {number} has coordinates that are not rings of finite numbers; export the map "
+                       "again") from None
+
+
+def _crs_name(path: Path, data: Mapping) -> str:
+    crs = data.get("crs")
+    if crs is None:
+        return WGS84[0]
+    try:
+        return str(crs["properties"]["name"])
+    except (TypeError, KeyError):
+        raise BadInput(f"{path}: its crs is {crs!r}, which names no system; remove it (longitude, latitude) or name one"
+                       ) from None
+
+
+def _features(path: Path, rows: Iterable[tuple[str, Mapping, object]], crs: str | None) -> MapFile:
+    rows = [(name, _tags(properties), area) for name, properties, area in rows]
+    marked = any("building" in tags or "building:part" in tags for _, tags, _ in rows)
+    features, unusable = [], []
+    for name, tags, area in rows:
+        if marked and not is_building(tags):
+            continue
+        if area is None or area.geom_type not in ("Polygon", "MultiPolygon", "GeometryCollection"):
+            unusable.append(name)
+            continue
+        features.append(Feature(name, tags if marked else tags | {"building": "yes"}, area))
+    problems = []
+    if unusable:
+        problems.append(Problem("warning", "", f"{len(unusable)} building(s) are points or lines, without an area: "
+                                f"left out ({listed(unusable)})"))
+    return MapFile(_to_degrees(path, features, crs), problems)
+
+
+def _tags(properties: Mapping) -> dict[str, str]:
+    """Columns as tags; empty cells are none."""
+    tags = {}
+    for key, value in properties.items():
+        if value is None or (isinstance(value, float) and not np.isfinite(value)):
+            continue
+        key = str(key).lower()
+        if key == "other_tags":
+            tags |= dict(_OTHER_TAGS.findall(str(value)))
+        else:
+            tags[_ALIASES.get(key, key)] = f"{value:g}" if isinstance(value, float | np.floating) else str(value)
+    return tags
+
+
+def _to_degrees(path: Path, features: list[Feature], crs: str | None) -> list[Feature]:
+    if not features or crs in WGS84:
+        return features
+    from pyproj import CRS, Transformer
+    from pyproj.exceptions import CRSError
+
+    if crs is None:
+        raise BadInput(f"{path} does not say in which coordinate reference system it is; assign one (in QGIS: Layer "
+                       "CRS) and export it again")
+    try:
+        transformer = Transformer.from_crs(CRS(crs), "EPSG:4326", always_xy=True)
+    except CRSError as error:
+        raise BadInput(f"{path}: its coordinate reference system {crs!r} is unknown ({error}); export it in EPSG:4326"
+                       ) from None
+    areas = [shapely.transform(feature.area, lambda places: np.column_stack(transformer.transform(*places.T)))
+             for feature in features]
+    return [Feature(feature.name, feature.tags, area) for feature, area in zip(features, areas)]

@@ -1,0 +1,55 @@
+"""Buildings of an area from OpenStreetMap's data base, over the network (Overpass API [1]).
+
+[1] https://wiki.openstreetmap.org/wiki/Overpass_API
+"""
+
+import shutil
+import urllib.error
+import urllib.parse
+import urllib.request
+from pathlib import Path
+
+from radiotwin.errors import BadInput, RunFailed
+from radiotwin.files import atomic_path
+
+SERVER = "https://overpass-api.de/api/interpreter"
+TIMEOUT_S = 180
+MOST_KM2 = 100.0  # what a public server is fairly asked for at once
+
+
+def download_osm(path: Path, bbox_deg: tuple[float, float, float, float], server: str = SERVER) -> None:
+    """Write the buildings of an area as an `.osm` file.
+
+    Args:
+        path: `.osm` file that does not exist yet.
+        bbox_deg: south, west, north, east [degrees].
+        server: address of an Overpass interpreter.
+
+    Raises:
+        BadInput: the file exists, is not called `.osm`, or the area is too large.
+        RunFailed: no network, or the server refuses.
+    """
+    from pyproj import Geod
+
+    if path.suffix.lower() != ".osm":
+        raise BadInput(f"--overpass writes {path}, which is not called .osm; choose such a name")
+    if path.exists():
+        raise BadInput(f"{path} exists already; leave --overpass out to build from it, or choose another name")
+    south, west, north, east = bbox_deg
+    area_m2, _ = Geod(ellps="WGS84").polygon_area_perimeter([west, east, east, west], [south, south, north, north])
+    if abs(area_m2) > MOST_KM2 * 1e6:
+        raise BadInput(f"--overpass: {abs(area_m2) / 1e6:.0f} km² are too much for a public server, {MOST_KM2:g} km² "
+                       "are allowed; make --bbox smaller, or download an extract (.osm.pbf)")
+    box = ",".join(f"{value:.7f}" for value in bbox_deg)
+    kinds = "".join(f'{kind}["{key}"]({box});' for kind in ("way", "relation") for key in ("building", "building:part"))
+    query = f"[out:xml][timeout:{TIMEOUT_S}];({kinds});(._;>;);out body;"
+    request = urllib.request.Request(server, urllib.parse.urlencode({"data": query}).encode(),
+                                     {"User-Agent": "radiotwin (https://pypi.org/project/radiotwin)"})
+    try:
+        with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer, atomic_path(path) as temporary:
+            with open(temporary, "wb") as file:
+                shutil.copyfileobj(answer, file)
+    except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
+        reason = getattr(error, "reason", error)
+        raise RunFailed(f"--overpass needs a network, and {server} did not answer ({reason}); try again later, or "
+                        "download an extract and give the file") from None

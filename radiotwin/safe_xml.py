@@ -1,0 +1,38 @@
+"""XML of strangers: entities that a file declares are refused, so that none can grow or reach out.
+
+A few lines of entity declarations can stand for gigabytes of text ("billion laughs"), or for another file of this
+machine. No city or map needs one.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from xml.parsers import expat
+
+from radiotwin.errors import BadInput
+
+
+def parse_elements(path: Path, start: Callable[[str, dict[str, str], int], None],
+                   end: Callable[[str], None] = lambda tag: None) -> None:
+    """Call `start(tag, attributes, line)` and `end(tag)` for every element of a file, in its order.
+
+    Raises:
+        BadInput: no such file, malformed XML (with line and column), or one that declares entities.
+    """
+    parser = expat.ParserCreate()
+
+    def refuse(name, *_) -> None:
+        raise BadInput(f"{path}, line {parser.CurrentLineNumber}: declares the entity {name!r}, which can stand for "
+                       "any amount of text or for another file; remove the <!DOCTYPE …> with its entities")
+
+    parser.StartElementHandler = lambda tag, attributes: start(tag, attributes, parser.CurrentLineNumber)
+    parser.EndElementHandler = end
+    parser.EntityDeclHandler = refuse
+    parser.SetParamEntityParsing(expat.XML_PARAM_ENTITY_PARSING_NEVER)
+    try:
+        with open(path, "rb") as file:
+            parser.ParseFile(file)
+    except OSError as error:
+        raise BadInput(f"{path} cannot be read ({error.strerror}); give the path of an XML file") from None
+    except expat.ExpatError as error:
+        raise BadInput(f"{path}, line {error.lineno}, column {error.offset + 1}: malformed XML "
+                       f"({expat.ErrorString(error.code)}); correct or export the file again") from None

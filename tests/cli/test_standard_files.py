@@ -1,0 +1,86 @@
+"""What leaves the package, through the real command line: scenes, maps, gains at points; and bad requests."""
+
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+
+
+@pytest.fixture
+def folder(small_scene, tmp_path):
+    """A folder with a scene that has an origin, and a radio map of it."""
+    shutil.copytree(small_scene.folder, tmp_path / "scene", ignore=shutil.ignore_patterns("cache"))
+    toml = tmp_path / "scene" / "scene.toml"
+    origin = "[origin]\nlatitude_deg = 47.5\nlongitude_deg = 8.7\n[mission]"
+    toml.write_text(toml.read_text().replace("[mission]", origin))
+    lattice = small_scene.lattice
+    gain_db = -60 - np.arange(2 * np.prod(lattice.shape)) / 100
+    radio_map = RadioMap.build(["d0", "d1"], lattice, gain_db, gain_db > -70, attributes={"source": "test"})
+    radio_map.write(tmp_path / "map.nc")
+    return tmp_path
+
+
+@pytest.mark.parametrize("out", ["out", "city.glb", "city.gltf", "city.obj"])
+def test_scenes_out(run_here, folder, out):
+    result = run_here(f"export-scene scene -o {out}", cwd=folder)
+    assert result.returncode == 0 and f"wrote {out}" in result.stdout, result.stderr
+    assert (folder / out).exists()
+
+
+@pytest.mark.parametrize("suffix", ["nc", "csv", "npz", "tif", "kmz", "png"])
+def test_maps_out(run_here, folder, suffix):
+    result = run_here(f"map map.nc --scene scene -o part.{suffix} --devices d1 --altitudes 60", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    assert f"wrote part.{suffix}: 1 devices on (1, 16, 16) positions" in result.stdout
+    assert (folder / f"part.{suffix}").stat().st_size > 500
+
+
+@pytest.mark.llvm
+def test_gains_at_points(run_here, folder):
+    (folder / "points.csv").write_text("x_m,y_m,z_m\n80,60,30\n80,40,1.5\n80,60,-3\n80,60,200\n")
+    base = "gains scene --points points.csv --devices d0 --quality fast"
+    for way in ("power", "coherent"):
+        result = run_here(f"{base} --sum {way} -o {way}.csv", cwd=folder)
+        assert result.returncode == 0, result.stderr
+        assert "4 links, 2 with a gain" in result.stdout and "1 below the ground" in result.stdout
+    power, coherent = (pd.read_csv(folder / f"{way}.csv", keep_default_na=False) for way in ("power", "coherent"))
+    assert power["reason"].tolist() == ["", "within a wavelength", "below the ground", ""]
+    scene = Scene.load(folder / "scene")
+    distance_m = np.linalg.norm(np.array([[80, 60, 30], [80, 60, 200]]) - scene.device_m[0], axis=1)
+    free_db = 20 * np.log10(299_792_458 / (4 * np.pi * 2.4e9 * distance_m))
+    gain_db = power.loc[[0, 3], "gain_db"].astype(float).to_numpy()
+    assert (gain_db > free_db - 0.1).all() and (gain_db < free_db + 6).all()  # with the ground and walls
+    assert (coherent["gain_db"] != power["gain_db"])[[0, 3]].all()
+
+
+BAD = {
+    "export-scene scene -o city.stl": "unknown format '.stl'", "export-scene scene -o scene": "holds preview.png",
+    "export-scene none -o out": "none is not a folder", "map map.nc --scene scene": "say with --out in which form",
+    "map map.nc --scene scene -o a.xls": "unknown format '.xls'",
+    "map map.nc --scene scene -o a.tif --devices d9": "device 'd9' is not in the map",
+    "map map.nc --scene scene -o a.tif --altitudes 61": "altitude 61 m is not in the map",
+    "map map.nc --scene scene -o a.tif --altitudes high": "--altitudes 'high' are not numbers",
+    "map scene/city.nc --scene scene -o a.tif": "does not exist",
+    "map map.nc --scene scene -o none/../map.nc/a.tif": "cannot write",
+    "gains scene --points none.csv": "none.csv does not exist",
+    "gains scene --points map.nc": "cannot be read as CSV|missing",
+    "gains scene --points p.csv --sum loud": "combining = 'loud' is unknown",
+    "gains scene --points p.csv --quality best": "quality 'best' is unknown",
+    "gains scene --points p.csv --devices d9": "device 'd9' is not in",
+    "gains scene --points p.csv -o gains.xlsx": "unknown format; allowed are .csv and .csv.gz",
+}
+
+
+@pytest.mark.parametrize("words", BAD)
+def test_bad_requests(run_here, folder, words):
+    import re
+
+    (folder / "p.csv").write_text("x_m,y_m,z_m\n1,2,3\n")
+    before = sorted(folder.rglob("*"))
+    result = run_here(words, cwd=folder)
+    assert result.returncode == 2 and re.search(BAD[words], result.stderr), result.stderr
+    assert result.stderr.count("radiotwin:") == 1 and sorted(folder.rglob("*")) == before

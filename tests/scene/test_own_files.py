@@ -1,0 +1,96 @@
+"""A scene may read files of its own folder only."""
+
+import os
+import shutil
+
+import pytest
+
+from radiotwin.errors import BadInput
+from radiotwin.scene import Scene
+from radiotwin.scene.build import build_scene
+from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
+from radiotwin.scene.ply import read_ply
+
+
+def with_mesh(city, name, to):
+    """The file, its first mesh named `name`, which stands for the link or path `to`."""
+    path = city.write()
+    path.write_text(path.read_text().replace('value="mesh0.ply"', f'value="{name}"'))
+    return path
+
+
+@pytest.fixture
+def outside(town, tmp_path):
+    shutil.copy(town.write().parent / "mesh0.ply", tmp_path / "secret.ply")
+    return tmp_path / "secret.ply"
+
+
+@pytest.mark.parametrize("name", ["../secret.ply", "a/../../secret.ply", "{absolute}", "link.ply", "folder/secret.ply"])
+def test_no_way_leads_out_of_a_foreign_city(town, outside, tmp_path, name):
+    (town.folder / "link.ply").symlink_to(outside)
+    (town.folder / "folder").symlink_to(tmp_path)
+    path = with_mesh(town, name.format(absolute=outside), outside)
+    with pytest.raises(BadInput, match=r"line \d+: .*leads out of"):
+        build_scene(path, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_includes_and_folders_stay_inside(town, outside, tmp_path):
+    (tmp_path / "part.xml").write_text("<scene/>")
+    town.add_xml('<include filename="../part.xml"/>')
+    with pytest.raises(BadInput, match="leads out of"):
+        read_mitsuba_xml(town.write())
+    town.shapes[-1] = '<path value=".."/><shape type="ply"><string name="filename" value="secret.ply"/></shape>'
+    with pytest.raises(BadInput, match="leads out of"):
+        read_mitsuba_xml(town.write())
+
+
+def test_links_within_the_folder_are_fine(town, tmp_path):
+    (town.folder / "link.ply").symlink_to(town.folder / "mesh0.ply")
+    assert not build_scene(with_mesh(town, "link.ply", None), tmp_path / "out").tracing_would_fail
+
+
+@pytest.mark.parametrize("spoil", ["../x.ply", "include", "link", "listed link"])
+def test_no_way_leads_out_of_a_scene_folder(small_scene, tmp_path, spoil):
+    folder = tmp_path / "scene"
+    shutil.copytree(small_scene.folder, folder, ignore=shutil.ignore_patterns("cache"))
+    mesh = folder / "meshes" / "ground.ply"
+    text = (folder / "city.xml").read_text()
+    if spoil == "../x.ply":
+        shutil.copy(mesh, tmp_path / "x.ply")
+        text = text.replace("meshes/ground.ply", "../x.ply")
+    elif spoil == "include":
+        (tmp_path / "more.xml").write_text("<scene/>")
+        text = text.replace("</scene>", '<include filename="../more.xml"/></scene>')
+    else:
+        target = shutil.move(mesh, tmp_path / "x.ply")
+        if spoil == "link":
+            mesh.symlink_to(target)
+        else:
+            (folder / "meshes" / "zero").symlink_to("/dev/urandom")
+        if spoil == "listed link":
+            shutil.copy(target, mesh)
+    (folder / "city.xml").write_text(text)
+    if spoil == "listed link":  # a file that nothing names, and that never ends, is not read
+        assert Scene.load(folder).content_hash() == small_scene.content_hash()
+        return
+    with pytest.raises(BadInput, match="leads out of|not allowed"):
+        Scene.load(folder)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "a.ply")
+    with pytest.raises(BadInput, match="not an ordinary file"):
+        read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize("lines", [
+    "element vertex 10000000\nproperty float x\nproperty float y\nproperty float z",
+    "element vertex 1000000000000", "element vertex 3\nproperty list uint double x",
+    "element vertex -1\nproperty float x"])
+def test_headers_that_promise_too_much(tmp_path, form, lines):
+    body = b"\n1 2 3\n" if form == "ascii" else b"\xff" * 40
+    (tmp_path / "a.ply").write_bytes(f"ply\nformat {form} 1.0\n{lines}\nend_header\n".encode() + body)
+    with pytest.raises(BadInput, match="truncated|not a PLY header line|no vertex|text where a number"):
+        read_ply(tmp_path / "a.ply")
