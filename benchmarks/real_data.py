@@ -53,14 +53,14 @@ def main() -> None:
 
 def duke_cbrs(data: Path) -> dict:
     """LTE on a campus, held out in blocks of 60 m: which way do the sectors look?"""
-    loop = _close(read_measurements(data / "duke_cbrs" / "measurements.csv.gz"), "block")
+    loop, summary = _close(read_measurements(data / "duke_cbrs" / "measurements.csv.gz"), "block")
     found_deg = {}
     for part in loop.after.whole.parts:
         if isinstance(part.effect, SectorAntenna):
             for device, pattern in part.setting["devices"].items():
                 found_deg[loop.records.device_names[int(device)]] = pattern[0] % 360
     off_deg = {name: (value - AZIMUTHS_DEG[name] + 180) % 360 - 180 for name, value in found_deg.items()}
-    return _summary(loop) | {
+    return summary | {
         "azimuth_deg": {name: round(value, 1) for name, value in sorted(found_deg.items())},
         "azimuth_error_deg": {name: round(value, 1) for name, value in sorted(off_deg.items())},
         "named_turned_by_180_db": round(_turned_rmse_db(loop.search.explained), 2)}
@@ -69,12 +69,12 @@ def duke_cbrs(data: Path) -> dict:
 def powder_frs(data: Path) -> dict:
     """Hand-held transmitters heard by many receivers, held out by day: floors, and where transmitters are."""
     folder = data / "powder_frs"
-    loop = _close(read_measurements(folder / "measurements.csv.gz"), "flight")
+    loop, summary = _close(read_measurements(folder / "measurements.csv.gz"), "flight")
     noise_db = pd.read_csv(folder / "noise_only.csv").groupby("rx_id")["noise_db"].median()
     floors_db = {name.split("[")[1][:-1]: parameter.value for parameters in loop.parameters()
                  for name, parameter in parameters.items() if name.startswith("floor[")}
     off_db = [floor - noise_db[name] for name, floor in floors_db.items() if name in noise_db]
-    return _summary(loop) | {
+    return summary | {
         "by_day_db": {name: {when: round(rmse_db(model, loop.records.flight == day), 2) for when, model in
                              (("before", loop.before), ("after", loop.after))}
                       for day, name in enumerate(loop.records.flight_names)},
@@ -90,7 +90,7 @@ def _shuffled(name: str, hold_out: str) -> Callable[[Path], dict]:
         table, rng = measurements.table.copy(), np.random.default_rng(0)
         column = measurements.level_column
         table[column] = table.groupby("device")[column].transform(lambda levels: rng.permutation(levels.to_numpy()))
-        return _summary(_close(Measurements(table, measurements.devices), hold_out))
+        return _close(Measurements(table, measurements.devices), hold_out)[1]
     return study
 
 
@@ -98,8 +98,11 @@ STUDIES = {"duke_cbrs": duke_cbrs, "powder_frs": powder_frs, "duke_cbrs_shuffled
            "powder_frs_shuffled": _shuffled("powder_frs", "flight")}
 
 
-def _close(measurements: Measurements, hold_out: str) -> Loop:
-    return close_loop(measurements, None, "log-distance", 0, lambda text: None, hold_out)
+def _close(measurements: Measurements, hold_out: str) -> tuple[Loop, dict]:
+    """The loop, and what it took."""
+    started = time.process_time()
+    loop = close_loop(measurements, None, "log-distance", 0, lambda text: None, hold_out)
+    return loop, _summary(loop) | {"loop_cpu_s": round(time.process_time() - started)}
 
 
 def _summary(loop: Loop) -> dict:
