@@ -48,8 +48,8 @@ def duke(folder) -> Measurements:
 
 @pytest.fixture(scope="session")
 def powder(folder) -> Measurements:
-    """800 of the 5,006 places of hand-held transmitters."""
+    """500 of the 5,006 places of hand-held transmitters."""
     whole = read_measurements(folder("powder_frs") / "measurements.csv.gz")
-    devices = whole.devices.sample(800, random_state=0)
+    devices = whole.devices.sample(500, random_state=0)
     kept = whole.table["device"].isin(devices["device"])
     return Measurements(whole.table[kept].reset_index(drop=True), devices.reset_index(drop=True))

@@ -26,9 +26,9 @@ def day_mean_db(loop, model) -> float:
 def test_gains_floors_and_the_step_of_one_receiver_are_named(loop):
     parts = loop.after.whole.parts
     assert {"receiver_gain_offset", "noise_floor_censoring"} <= {part.effect.name for part in parts}
-    drifts = {loop.records.receiver_names[int(receiver)]: drift for part in parts if part.effect.name == "receiver_drift"
-              for receiver, drift in part.setting["receivers"].items()}
-    form, when_s = drifts[CHANGED]
+    form, when_s = next(drift for part in parts if part.effect.name == "receiver_drift"
+                        for receiver, drift in part.setting["receivers"].items()
+                        if loop.records.receiver_names[int(receiver)] == CHANGED)
     assert form == "step"
     assert pd.Timestamp("2022-04-26").timestamp() < when_s < pd.Timestamp("2022-07-06").timestamp()
 
