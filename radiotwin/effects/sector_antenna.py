@@ -73,11 +73,6 @@ class SectorAntenna(Effect):
         return [{"devices": {str(device): found[device][0] for device in sorted(mast)}}
                 for mast in ([others, {best}] if len(others) > 1 else [{best}])]
 
-    def propose_like(self, view: View, setting: dict) -> list[dict]:
-        # Whether these devices have such antennas is the question, and not whether any has.
-        found = self._patterns(view, [int(device) for device in setting["devices"]])
-        return [{"devices": {str(device): pattern for device, (pattern, _) in found.items()}}] if found else []
-
     def _patterns(self, view: View, devices: list[int]) -> dict[int, tuple[list[float], float]]:
         """Device -> its best pattern, and what it gains [nats], where that is enough."""
         found = {}
