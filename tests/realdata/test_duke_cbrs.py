@@ -28,11 +28,11 @@ def test_antennas_are_named_first_and_look_where_they_do(loop):
     assert set(off_deg) == set(AZIMUTHS_DEG) and max(off_deg.values()) <= 20
 
 
-def test_named_effects_take_a_quarter_of_the_error_and_interpolation_more(loop):
+def test_named_effects_take_a_quarter_of_the_error_and_interpolation_more_of_the_rest(loop):
     rows = everywhere(loop)
     assert 11.0 < rmse_db(loop.before, rows) < 13.5
     assert rmse_db(loop.search.explained, rows) <= 8.9
-    assert rmse_db(loop.after, rows) < 7.0
+    assert rmse_db(loop.after, rows) <= 6.4
 
 
 def test_with_boresights_turned_round_the_gain_is_gone(loop):
