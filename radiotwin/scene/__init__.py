@@ -32,11 +32,14 @@ class Scene:
         """Read a scene folder.
 
         Raises:
-            BadInput: not a scene folder, an impossible value, or a device inside a building.
+            BadInput: not a scene folder, an impossible value, a device inside a building, or a file that leads out of
+                the folder.
         """
         folder = Path(folder)
         if not folder.is_dir():
             raise BadInput(f"{folder} is not a folder; give a scene folder, as `radiotwin build-scene` makes it")
+        for name in ("scene.toml", "city.xml"):
+            require_within(folder, folder / name, str(folder))
         scene = cls(folder, read_config(folder / "scene.toml"))
         scene.check_devices()
         scene.device_antennas, scene.uav_antenna  # read now: a broken file is said before any work
