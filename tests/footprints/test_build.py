@@ -29,7 +29,7 @@ def table(report):
 
 def test_names():
     assert map_suffix("a.b.OSM.pbf") == ".osm.pbf" and map_suffix("a.osm") == ".osm" and map_suffix("a.xml") is None
-    assert map_name("data/old town.osm.pbf") == "old_town"
+    assert map_name("data/old town.osm.pbf") == "old_town" and map_name("area.v2.geojson") == "area.v2"
 
 
 def test_every_height_says_where_it_is_from(table, report):
