@@ -1,6 +1,7 @@
 """A scene: a declared world in a folder (`scene.toml`, `city.xml`, `meshes/*.ply`)."""
 
 import hashlib
+import shutil
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -80,6 +81,12 @@ class Scene:
         """Antenna of all UAVs, the mean over the headings that they may have; None: isotropic."""
         names = {uav.antenna for uav in self.config.uavs} - {None}
         return Antenna(self._pattern(names.pop()).around()) if names else None
+
+    def copy_antennas(self, folder: Path) -> None:
+        """Copy the files of all antennas into another scene folder, to where `scene.toml` looks for them."""
+        for name in sorted({end.antenna for end in (*self.config.devices, *self.config.uavs)} - {None}):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(self.folder / name, folder / name)
 
     def _pattern(self, name: str) -> Pattern:
         return read_pattern(require_within(self.folder, self.folder / name, str(self.folder / "scene.toml")))

@@ -45,6 +45,12 @@ def test_the_scene_knows_its_antennas(with_antennas, small_scene):
     assert len(hashes) == 3  # a map for other antennas is another map
 
 
+def test_another_scene_folder_gets_the_files(with_antennas, tmp_path):
+    Scene.load(with_antennas).copy_antennas(tmp_path / "other")
+    assert (tmp_path / "other" / "antennas" / "sector.csv").read_text() == SECTOR
+    assert {path.name for path in (tmp_path / "other" / "antennas").iterdir()} == {"sector.csv", "dipole.csv"}
+
+
 @pytest.mark.llvm
 def test_free_space_has_both_antennas_in_it(with_antennas):
     """Expected: Friis with the gains of both patterns along the straight line, each in its own direction."""
