@@ -33,6 +33,8 @@ def parse_elements(path: Path, start: Callable[[str, dict[str, str], int], None]
             parser.ParseFile(file)
     except OSError as error:
         raise BadInput(f"{path} cannot be read ({error.strerror}); give the path of an XML file") from None
+    except (ValueError, LookupError) as error:  # an encoding that expat leaves to Python, and Python has not
+        raise BadInput(f"{path}: its XML cannot be decoded ({error}); save it as UTF-8") from None
     except expat.ExpatError as error:
         raise BadInput(f"{path}, line {error.lineno}, column {error.offset + 1}: malformed XML "
                        f"({expat.ErrorString(error.code)}); correct or export the file again") from None

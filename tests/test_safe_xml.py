@@ -32,6 +32,13 @@ def test_entities_are_refused(tmp_path, what, reader):
     assert time.monotonic() - began_s < 1
 
 
+@pytest.mark.parametrize("encoding", ["utf-7", "shift_jis", "no-such", "hex"])
+def test_encodings_that_cannot_be_read(tmp_path, encoding):
+    (tmp_path / "a.osm").write_text(f'<?xml version="1.0" encoding="{encoding}"?><osm/>')
+    with pytest.raises(BadInput, match="cannot be decoded|malformed XML"):
+        read_osm_xml(tmp_path / "a.osm")
+
+
 def test_deep_nesting_is_no_danger(tmp_path):
     deep = 20_000
     (tmp_path / "a.osm").write_text("<osm>" + "<way id='1'>" * deep + "</way>" * deep + "</osm>")

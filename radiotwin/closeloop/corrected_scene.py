@@ -80,6 +80,7 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
     provenance = config.provenance | {"corrected": "; ".join(([earlier] if earlier else []) + changes)}
     with atomic_folder(folder) as temporary:
         _write_city(scene, temporary, keep, boxes)
+        scene.copy_antennas(temporary)
         write_config(config.model_copy(update={"provenance": provenance}), temporary / "scene.toml")
         draw_preview(Scene.load(temporary), temporary / "preview.png")
     return changes

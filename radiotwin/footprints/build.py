@@ -78,7 +78,7 @@ def map_name(source: Path | str) -> str:
     >>> map_name("data/old town.osm.pbf")
     'old_town'
     """
-    return scene_name(str(source)[: -len(map_suffix(source))])
+    return scene_name(f"{str(source)[: -len(map_suffix(source))]}.osm")
 
 
 def build_scene_from_map(source: Path | str, out_folder: Path | str, map_options: MapOptions = MapOptions(),
@@ -124,7 +124,7 @@ def build_scene_from_map(source: Path | str, out_folder: Path | str, map_options
     known = {"source": str(source), "seed": str(options.seed), "height_default_m": f"{map_options.default_height_m:g}",
              "heights_from": ", ".join(f"{key} {number}" for key, number in counts.items())}
     if map_options.bbox_deg is not None:
-        known["bbox_deg"] = ", ".join(f"{value:g}" for value in map_options.bbox_deg)
+        known["bbox_deg"] = ", ".join(map(repr, map_options.bbox_deg))
     declared = Declared(str(source), map_name(source), extent, origin, known, facts)
     return finish_scene(city, declared, out_folder, options, check_only, table)
 

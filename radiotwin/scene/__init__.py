@@ -1,6 +1,7 @@
 """A scene: a declared world in a folder (`scene.toml`, `city.xml`, `meshes/*.ply`)."""
 
 import hashlib
+import shutil
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -32,11 +33,14 @@ class Scene:
         """Read a scene folder.
 
         Raises:
-            BadInput: not a scene folder, an impossible value, or a device inside a building.
+            BadInput: not a scene folder, an impossible value, a device inside a building, or a file that leads out of
+                the folder.
         """
         folder = Path(folder)
         if not folder.is_dir():
             raise BadInput(f"{folder} is not a folder; give a scene folder, as `radiotwin build-scene` makes it")
+        for name in ("scene.toml", "city.xml"):
+            require_within(folder, folder / name, str(folder))
         scene = cls(folder, read_config(folder / "scene.toml"))
         scene.check_devices()
         scene.device_antennas, scene.uav_antenna  # read now: a broken file is said before any work
@@ -77,6 +81,12 @@ class Scene:
         """Antenna of all UAVs, the mean over the headings that they may have; None: isotropic."""
         names = {uav.antenna for uav in self.config.uavs} - {None}
         return Antenna(self._pattern(names.pop()).around()) if names else None
+
+    def copy_antennas(self, folder: Path) -> None:
+        """Copy the files of all antennas into another scene folder, to where `scene.toml` looks for them."""
+        for name in sorted({end.antenna for end in (*self.config.devices, *self.config.uavs)} - {None}):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(self.folder / name, folder / name)
 
     def _pattern(self, name: str) -> Pattern:
         return read_pattern(require_within(self.folder, self.folder / name, str(self.folder / "scene.toml")))

@@ -199,17 +199,16 @@ def scene_meshes(xml_path: Path) -> list[Path]:
     Raises:
         BadInput: no such file, malformed XML, or one that reads other files than those in its folder.
     """
-    meshes = []
-    for node in parse_xml(xml_path).walk():
+    root = parse_xml(xml_path)
+    for node in root.walk():
         if node.tag in ("include", "path"):
             raise BadInput(f"{node.place}: <{node.tag}> is not allowed in a scene folder; build the scene with "
                            "`radiotwin build-scene`")
-        named = node.attributes.get("filename")
-        if node.attributes.get("name") == "filename":
-            named = node.attributes.get("value", "")
-        if named is not None:
-            meshes.append(require_within(xml_path.parent, xml_path.parent / named, node.place))
-    return meshes
+        for key, name in node.attributes.items():
+            if key == "filename" or (key == "value" and node.attributes.get("name") == "filename"):
+                require_within(xml_path.parent, xml_path.parent / name, node.place)
+    names = [node.get("string", "filename") for node in root.children if node.tag == "shape"]
+    return [xml_path.parent / name for name in names if name is not None]
 
 
 def _numbers(node: Node, text: str, counts: tuple[int, ...]) -> np.ndarray:

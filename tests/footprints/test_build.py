@@ -1,5 +1,6 @@
 """A map becomes a scene that the rest of the package works with."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ def table(report):
 
 def test_names():
     assert map_suffix("a.b.OSM.pbf") == ".osm.pbf" and map_suffix("a.osm") == ".osm" and map_suffix("a.xml") is None
-    assert map_name("data/old town.osm.pbf") == "old_town"
+    assert map_name("data/old town.osm.pbf") == "old_town" and map_name("area.v2.geojson") == "area.v2"
 
 
 def test_every_height_says_where_it_is_from(table, report):
@@ -125,6 +126,16 @@ def test_too_far_apart(tmp_path, empty_map):
     path = empty_map.box(0, 0, 20, 20).box(90_000, 0, 90_020, 20).write(tmp_path / "a.osm")
     with pytest.raises(BadInput, match="the area is 90 km wide, 50 km are allowed; choose a part with --bbox"):
         build_scene_from_map(path, tmp_path / "out")
+
+
+def test_a_ring_of_three_points_is_no_building(tmp_path):
+    square = [[8.7, 47.5], [8.7003, 47.5], [8.7003, 47.5002], [8.7, 47.5002], [8.7, 47.5]]
+    features = [{"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
+                for ring in (square, [[8.7, 47.5]] * 3, square[:2] + square[:1])]
+    (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    report = build_scene_from_map(tmp_path / "a.geojson", tmp_path / "out")
+    assert dict(report.facts)["buildings"] == "1 in 1 blocks"
+    assert "2 building(s) have no area" in report.problems[0].message
 
 
 def test_nothing_usable_says_why(tmp_path, empty_map):

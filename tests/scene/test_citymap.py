@@ -103,7 +103,7 @@ def test_a_damaged_scene_is_bad_input(tmp_path):
     with pytest.raises(BadInput, match="does not exist"):
         CityMap.from_xml(tmp_path / "city.xml")
     (tmp_path / "city.xml").write_text("<scene>")
-    with pytest.raises(BadInput, match="not well-formed"):
+    with pytest.raises(BadInput, match="malformed XML"):
         CityMap.from_xml(tmp_path / "city.xml")
     (tmp_path / "city.xml").write_text(
         '<scene><shape type="ply"><string name="filename" value="meshes/no.ply"/></shape></scene>')

@@ -50,6 +50,16 @@ def test_links_within_the_folder_are_fine(town, tmp_path):
     assert not build_scene(with_mesh(town, "link.ply", None), tmp_path / "out").tracing_would_fail
 
 
+@pytest.mark.parametrize("name", ["scene.toml", "city.xml"])
+def test_a_scene_is_in_its_folder(small_scene, tmp_path, name):
+    folder = tmp_path / "scene"
+    shutil.copytree(small_scene.folder, folder, ignore=shutil.ignore_patterns("cache"))
+    shutil.move(folder / name, tmp_path / name)
+    (folder / name).symlink_to(tmp_path / name)
+    with pytest.raises(BadInput, match="leads out of"):
+        Scene.load(folder)
+
+
 @pytest.mark.parametrize("spoil", ["../x.ply", "include", "link", "listed link"])
 def test_no_way_leads_out_of_a_scene_folder(small_scene, tmp_path, spoil):
     folder = tmp_path / "scene"
