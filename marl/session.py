@@ -12,6 +12,7 @@ import torch
 
 from marl.algorithm import Outcome, run_algorithm
 from marl.figures import choose_flight, draw_curve, draw_trajectories
+from marl.flights import track_table
 from marl.mission import Known, Mission, make_mission
 from marl.randomness import stream
 from marl.settings import LEARNERS, LearnerSettings, RunSettings
@@ -118,8 +119,10 @@ class Session:
                   if entry["method"] in ("planner", "greedy", "random") and entry["method"] != self.run.algorithm}
         curves = {f"{self.run.algorithm} in {TRAINED_IN[twin]}": outcome.rows for twin, outcome in outcomes.items()}
         draw_curve(curves, levels, self.out / "curve.png")
-        flights = main.flights
-        draw_trajectories(scene, real, flights, choose_flight(flights, real), main.known, self.out / "trajectories.png")
+        flights, typical = main.flights, choose_flight(main.flights, real)
+        with atomic_path(self.out / "flights.csv") as temporary:
+            track_table(scene, real, flights, typical).to_csv(temporary, index=False)
+        draw_trajectories(scene, real, flights, typical, main.known, self.out / "trajectories.png")
         print_rows(f"Collected in the truth ({self.run.truth}), of all data; mean and standard deviation of "
                    f"{self.run.flights} flights",
                    {"method": "left", "trained in": "left", "real episodes": "right", "collected": "right",

@@ -10,7 +10,7 @@ import sys
 import typer
 
 from radiotwin import __version__
-from radiotwin.cli import importing, loop, model, tools, world
+from radiotwin.cli import importing, loop, model, report, tools, world
 from radiotwin.cli.console import complain
 from radiotwin.errors import BadInput, RunFailed
 
@@ -22,7 +22,7 @@ app = typer.Typer(
     help="Radio digital twins of cities, learnt from measurements. A scene is built, traced and surveyed; a twin is "
          "fitted to the measurements, mapped and compared.")
 
-for module in (world, importing, model, loop, tools):
+for module in (world, importing, model, loop, report, tools):
     module.add_commands(app)
 
 
