@@ -56,13 +56,18 @@ class Environment:
         self.frame = empty_frame((flights,), mission)
         self._rng = rng
 
-    def reset(self) -> Frame:
-        """All UAVs at their starts with full batteries, all data at their devices."""
+    def reset(self, which: np.ndarray | None = None) -> Frame:
+        """All UAVs at their starts with full batteries, all data at their devices.
+
+        Args:
+            which: (E,) bool, flights that begin anew while the others go on; None for all.
+        """
         frame, mission = self.frame, self.mission
-        frame.cell[:] = mission.start
-        frame.battery[:] = mission.battery
-        frame.data_units[:] = mission.data_units
-        _sense(mission, frame, np.ones(len(frame.cell), dtype=np.bool_), self._rng)
+        which = np.ones(len(frame.cell), dtype=np.bool_) if which is None else which
+        frame.cell[which] = mission.start
+        frame.battery[which] = mission.battery
+        frame.data_units[which] = mission.data_units
+        _sense(mission, frame, which, self._rng)
         return frame
 
     def step(self, action: np.ndarray) -> np.ndarray:
