@@ -83,8 +83,8 @@ def significant(drivers: list[Driver]) -> list[Driver]:
     return [driver for driver in drivers if driver.p_value <= STRUCTURED and driver.effect_db >= LEAST_EFFECT_DB]
 
 
-def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed: int,
-               tell: Callable[[str], None], hold_out: str = "auto") -> Loop:
+def close_loop(measurements: Measurements, scene: Scene | None = None, base: str = "auto", seed: int = 0,
+               tell: Callable[[str], None] = lambda _: None, hold_out: str = "auto") -> Loop:
     """Find what a base model lacks.
 
     Args:
