@@ -180,8 +180,8 @@ def diagnose() -> Diagnosis:
     return diagnosis
 
 
-def run(console: Console) -> bool:
-    """Print the diagnosis, and what to do, on `console`; True if everything works."""
+def run(console: Console) -> Diagnosis:
+    """Print the diagnosis, and what to do, on `console`."""
     with console.status("looking at this machine"):
         diagnosis = diagnose()
 
@@ -199,4 +199,4 @@ def run(console: Console) -> bool:
             say(f"  - {line}".replace("\n", "\n    "), style)
     if diagnosis.healthy:
         say("  Everything works.", "green")
-    return diagnosis.healthy
+    return diagnosis

@@ -12,6 +12,7 @@ import typer
 from radiotwin import __version__
 from radiotwin.cli import importing, loop, model, report, tools, world
 from radiotwin.cli.console import complain
+from radiotwin.cli.output import add_output_options
 from radiotwin.errors import BadInput, RunFailed
 
 app = typer.Typer(
@@ -24,6 +25,7 @@ app = typer.Typer(
 
 for module in (world, importing, model, loop, report, tools):
     module.add_commands(app)
+add_output_options(app)
 
 
 def _show_version(wanted: bool) -> None:

@@ -1,11 +1,12 @@
 """Commands that make a world and measure in it: build-scene, trace, survey."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from radiotwin.cli.console import console, say, show_warnings_plainly
+from radiotwin.cli.console import console, result, say, show_warnings_plainly
 from radiotwin.errors import BadInput
 
 SceneFolder = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder, as `build-scene` makes it.")]
@@ -54,6 +55,7 @@ def build_scene(
     else:
         report = build(source, out or Path("scenes") / scene_name(source), BuildOptions(**given), check_only=check)
     print_report(report, console)
+    result("scene", asdict(report))
     if report.folder:
         say(f"wrote {report.folder}: scene.toml, city.xml, meshes/, preview.png")
     if report.tracing_would_fail:
