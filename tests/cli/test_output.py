@@ -89,8 +89,9 @@ def test_the_shell_completes(words, expected):
 
 
 def test_planning_has_the_same_options(small_scene, tmp_path):
-    words = ["--scene", str(small_scene.folder), "--truth", "segmented", "--algorithm", "random",
-             "--real-episodes", "1", "--planner-iterations", "50", "--flights", "2", "--twin", "log-distance", "--json", "--out", "run"]
+    words = ["--scene", str(small_scene.folder), "--truth", "segmented", "--algorithm", "random", "--twin",
+             "log-distance", "--real-episodes", "1", "--planner-iterations", "50", "--flights", "2", "--json", "--out",
+             "run"]
     done = subprocess.run([sys.executable, "-m", "marl.fedqmix", *words], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     rows = json.loads(done.stdout)["tables"][0]["rows"]
