@@ -93,7 +93,7 @@ class CentralEnv(gymnasium.Env[Seen, np.ndarray]):
 
     def __init__(self, mission: Mission):
         self._flights = CentralVectorEnv(mission)
-        self.observation_space, self.action_space = spaces(mission)
+        self.observation_space, self.action_space = spaces(mission)  # type: ignore[assignment]  # Dict has no types
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Seen, dict[str, Any]]:
         super().reset(seed=seed)

@@ -125,9 +125,9 @@ def assign(strength: np.ndarray, max_rate: bool, out: np.ndarray) -> None:
     out[:] = -1
     if max_rate:
         for u in range(uavs):
-            best = np.argmax(strength[u])
+            own = np.argmax(strength[u])
             for k in range(devices):
-                if k != best:
+                if k != own:
                     strength[u, k] = -np.inf
     for _ in range(min(uavs, devices)):
         best_u, best_k, best = -1, -1, -np.inf

@@ -5,6 +5,7 @@ import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -59,7 +60,7 @@ class Session:
         make_mission(scene, truth, Known.truth(scene), self.run.assignment)  # complains before anything is written
         _torch_device(self.run.device)
         self._claim_folder(_world(scene, truth))
-        runs = {self.run.twin: self.run}
+        runs: dict[str, RunSettings] = {self.run.twin: self.run}
         if self.run.compare and self.run.algorithm in LEARNERS:
             runs |= {twin: self.run.model_copy(update={"twin": twin})
                      for twin in ("nn", "log-distance", "truth") if twin != self.run.twin}
@@ -167,7 +168,8 @@ class _Log:
     """Writes `metrics.csv` and TensorBoard events of one folder; called after every round with all rows so far."""
 
     def __init__(self, folder: Path):
-        self._folder, self._writer, self._rows, self._blocks = folder, None, 0, 0
+        self._folder, self._rows, self._blocks = folder, 0, 0
+        self._writer: Any = None
 
     def __call__(self, rows: list[dict], blocks: list[dict]) -> None:
         with atomic_path(self._folder / "metrics.csv") as temporary:

@@ -64,7 +64,7 @@ def _check_packages(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         diagnosis.problems.append("radiotwin runs from a folder and is not installed: pip install -e .")
         return [("radiotwin", "not installed")]
     for requirement in requirements:
-        name = re.match(r"[\w.-]+", requirement)[0]
+        name = re.findall(r"^[\w.-]+", requirement)[0]
         extra = re.search(r"extra == ['\"]([\w-]+)", requirement)
         try:
             rows.append((name, version(name)))

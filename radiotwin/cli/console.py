@@ -53,7 +53,7 @@ def print_rows(title: str, columns: dict[str, str], rows: list[list]) -> None:
     collected.setdefault("tables", []).append({"title": title, "rows": [dict(zip(names, row)) for row in rows]})
     table = Table(title=escape(title), title_justify="left", title_style="bold", box=SIMPLE_HEAD, pad_edge=False)
     for heading, justify in columns.items():
-        table.add_column(escape(heading), justify=justify)
+        table.add_column(escape(heading), justify=justify)  # type: ignore[arg-type]  # one of Rich's words
     for row in rows:
         table.add_row(*(escape(_text(cell)) for cell in row))
     console.print(table)

@@ -75,7 +75,7 @@ def close_loop(
                  p["unit"]] for effect in report["effects"] for name, p in effect["parameters"].items()])
     say(lead(report))
     say(f"wrote {out / 'closeloop.html'}")
-    if write_scene is not None:
+    if write_scene is not None and world is not None:
         changes = write_corrected_scene(loop, world, write_scene)
         say(f"wrote {write_scene}: {'; '.join(changes)}" if changes else
             f"{write_scene} is not written: no building and no anchor was found to be wrong in {scene}")

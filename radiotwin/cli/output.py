@@ -23,7 +23,8 @@ JSON = Annotated[bool, typer.Option("--json", help="Print tables and messages as
 def add_output_options(app: typer.Typer) -> None:
     """Give the commands of an app their options; the commands themselves know nothing of them."""
     for command in app.registered_commands:
-        command.callback = _with_options(command.callback, command.name in TABLES)
+        if command.callback is not None:
+            command.callback = _with_options(command.callback, command.name in TABLES)
 
 
 @contextmanager

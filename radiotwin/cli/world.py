@@ -2,7 +2,7 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -43,7 +43,8 @@ def build_scene(
     from radiotwin.scene.sources import scene_name
 
     show_warnings_plainly()
-    given = {"frequency_hz": frequency_hz, "materials": _pairs(material or []) or None, "scale": scale, "up": up,
+    given: dict[str, Any] = {
+             "frequency_hz": frequency_hz, "materials": _pairs(material or []) or None, "scale": scale, "up": up,
              "bbox": _box(bbox), "devices": devices, "uavs": uavs, "seed": seed}
     given = {name: value for name, value in given.items() if value is not None}
     if source.startswith("preset:"):

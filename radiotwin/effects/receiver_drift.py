@@ -5,6 +5,8 @@ temperature follows first-order cooling); ageing as a slope in time; a step at a
 'Inference about the change-point in a sequence of random variables', Biometrika 57).
 """
 
+from typing import Any
+
 import numpy as np
 
 from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured
@@ -45,7 +47,8 @@ class ReceiverDrift(Effect):
         return self._best(view, [int(receiver) for receiver in setting["receivers"]])
 
     def _best(self, view: View, receivers: list[int]) -> list[dict]:
-        records, best = view.records, (LEAST_NATS, None)
+        records = view.records
+        best: tuple[float, Any] = LEAST_NATS, None
         for receiver in receivers:
             rows = np.flatnonzero((records.receiver == receiver) & np.isfinite(records.time_s))
             candidates = _forms(

@@ -6,7 +6,7 @@ map each path has the gain of the direction in which it leaves the device; what 
 power is fitted too, has the mean of the pattern.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -62,7 +62,8 @@ class SectorAntenna(Effect):
         return None if _placed(records) else f"no device of known position has {LEAST_LINKS} links"
 
     def propose(self, view: View) -> list[dict]:
-        records, best = view.records, (LEAST_NATS, None)
+        records = view.records
+        best: tuple[float, Any] = LEAST_NATS, None
         known = {int(device) for devices in view.done(self.name, "devices") for device in devices}
         for device in sorted(set(_placed(records)) - known):
             every = np.flatnonzero(records.device == device)
@@ -141,7 +142,7 @@ class _Rays(NamedTuple):
         """(n,) what a pattern (6,), as in `FIELDS`, takes from each link [dB]."""
         gain = 10 ** (sector_pattern_db(self.azimuth_deg, self.elevation_deg, pattern[:5]) / 10)
         mean = np.mean(10 ** (sector_pattern_db(AROUND_DEG, np.full(len(AROUND_DEG), pattern[3]), pattern[:5]) / 10))
-        return through_antenna_db(self.power, gain, self.free * 10 ** (pattern[5] / 10), mean)
+        return through_antenna_db(self.power, gain, self.free * 10 ** (pattern[5] / 10), float(mean))
 
 
 def _best_pattern(rays: _Rays, view: View, rows: np.ndarray) -> tuple[list[float], float]:
@@ -153,7 +154,7 @@ def _best_pattern(rays: _Rays, view: View, rows: np.ndarray) -> tuple[list[float
         return float(view.nats(rows, offset_db + level_db).sum())
 
     before = nats(np.zeros(len(rows)))
-    best = -np.inf, []
+    best: tuple[float, list[float]] = -np.inf, []
     for azimuth in AZIMUTHS_DEG:
         for beamwidth in BEAMWIDTHS_DEG:
             for most_db in ATTENUATIONS_DB:

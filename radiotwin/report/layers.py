@@ -59,8 +59,8 @@ def link_layer(run: Run) -> dict | None:
 def device_layer(run: Run) -> list[dict]:
     """Name, role, true position as far as anybody knows it, and the twin's estimate of each device."""
     true_m = {d.device: (d.role, [d.x_m, d.y_m, d.z_m]) for d in run.scene.config.devices} if run.scene else {}
-    devices = {name: {"name": name, "role": role, "true": place_m, "estimate": None} for name, (role, place_m)
-               in true_m.items()}
+    devices: dict[str, dict] = {name: {"name": name, "role": role, "true": place_m, "estimate": None}
+                                for name, (role, place_m) in true_m.items()}
     for device in run.twin.devices if run.twin else []:
         place_m = [device.x_m, device.y_m, device.z_m]
         entry = devices.setdefault(device.device, {"name": device.device, "role": device.role, "true": None,

@@ -74,9 +74,9 @@ def write_report(run: Run, path: Path | str) -> None:
         for package, name in SCRIPTS:
             scripts += f"<script>{files(package).joinpath(name).read_text(encoding='utf-8')}</script>"
     parts += [f'<p class="notes">{html.escape(note)}</p>' for note in run.notes]
-    if run.closeloop is not None:
+    if run.closeloop is not None and run.closeloop_folder is not None:
         parts += closeloop_sections(run.closeloop, run.closeloop_folder)
-    if run.comparison is not None:
+    if run.comparison is not None and run.comparison_folder is not None:
         parts += comparison_sections(run.comparison, run.comparison_folder)
     parts += _planning(run) + _devices(run)
     parts.append(f"<footer>{html.escape(_facts(run))}</footer>")

@@ -158,10 +158,12 @@ def _report_on_errors(source: str, city: ImportedCity, frequency_hz: float) -> B
 
 
 def _city_shapes(city: ImportedCity, frequency_hz: float) -> tuple[list[CityShape], list[Problem]]:
-    written, problems = settle(city.materials, frequency_hz, {name.lower() for name in city.names})
+    assert city.surfaces is not None  # without an error among the problems
+    materials = [material for material in city.materials if material is not None]
+    written, problems = settle(materials, frequency_hz, {name.lower() for name in city.names})
     shapes = [
         CityShape(name, trimesh.Trimesh(vertices, faces, process=False), written[material])
-        for name, material, (vertices, faces) in zip(city.names, city.materials, city.surfaces.meshes())
+        for name, material, (vertices, faces) in zip(city.names, materials, city.surfaces.meshes())
     ]
     return shapes, problems
 
@@ -176,6 +178,7 @@ class _Plan:
 
 def _plan(city: ImportedCity, name: str, source: str, options: BuildOptions) -> _Plan:
     surfaces, solid = city.surfaces, ~city.ground
+    assert surfaces is not None
     if options.bbox is None:
         bounds = building_bounds(surfaces, solid)
         extent = choose_extent(bounds)
@@ -231,6 +234,7 @@ def _report(
     declared = dict(zip((shape.material for shape in shapes), city.materials))
     for material, count in Counter(shape.material for shape in shapes).most_common():
         origin = declared[material]
+        assert origin is not None
         kind = _kind(material.name, origin.itu)
         uses.append(MaterialUse(material.name, kind, count, *constants(origin, frequency_hz)))
     return BuildReport(

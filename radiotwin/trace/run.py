@@ -54,8 +54,9 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
     inside = scene.blocked.ravel()
     distance_m = np.linalg.norm(device_m[:, None, :] - positions_m[None], axis=2)
     frequency_hz = scene.config.radio.frequency_hz
-    figures = check_gains(raw_db[:, ~inside].ravel(), los[:, ~inside].ravel(), distance_m[:, ~inside].ravel(),
-                          frequency_hz, settings.solver, settings.combining)
+    figures: dict[str, float | str] = dict(
+        check_gains(raw_db[:, ~inside].ravel(), los[:, ~inside].ravel(), distance_m[:, ~inside].ravel(), frequency_hz,
+                    settings.solver, settings.combining))
     limit_db = scene.config.gain_limit_db
     gain_db, counts = _censor(raw_db, inside, limit_db)
     rows, columns, finer_db = solve_finer(scene, settings, store, index)
