@@ -19,12 +19,13 @@ SUDO := $(if $(filter 0,$(shell id -u)),,sudo -n)
 CAN_APT := command -v apt-get > /dev/null && $(SUDO) true 2> /dev/null
 APT_INSTALL := $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=120 install -y -q
 
-.PHONY: help demo test lint bench llvm clean
+.PHONY: help demo test check docs bench llvm clean
 
 help:
 	@echo "make demo    set up, then the whole chain on a small city"
 	@echo "make test    set up, then every test"
-	@echo "make lint    ruff"
+	@echo "make check   ruff and mypy"
+	@echo "make docs    the site, in site/; runs the examples"
 	@echo "make bench   what takes how long (the studies of docs/results.md are started one by one)"
 	@echo "make llvm    set up only: the package and a libLLVM for tracing"
 	@echo "make clean   remove the environment and what the tools left"
@@ -37,8 +38,15 @@ test: $(INSTALLED)
 	|| echo "make test: without a libLLVM the tests that trace rays are skipped; all the others run." >&2
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(TESTS)
 
-lint: $(INSTALLED)
+check: $(INSTALLED)
 	$(BIN)/ruff check
+	$(BIN)/mypy
+
+# In a folder of its own, where the examples leave what they make.
+docs: $(INSTALLED)
+	$(BIN)/python -m pip install --disable-pip-version-check -q $(PIP_ARGS) -c constraints.txt -e '.[docs]'
+	mkdir -p build/docs
+	cd build/docs && OMP_NUM_THREADS=1 $(abspath $(BIN))/mkdocs build --strict -f $(CURDIR)/mkdocs.yml -d $(CURDIR)/site
 
 bench: llvm
 	for benchmark in line_of_sight channel_fit localize marl_speed trace; do \
@@ -70,5 +78,5 @@ llvm: $(INSTALLED)
 	@$(BIN)/python -m radiotwin.llvm
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find radiotwin marl tests benchmarks -name __pycache__ -prune -exec rm -rf {} +

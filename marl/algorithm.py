@@ -68,7 +68,8 @@ def run_algorithm(run: RunSettings, learner: LearnerSettings, scene: Scene, trut
     checkpoint = folder / "checkpoint.pt" if folder else None
     rows, blocks, twin = [], [], None
     try:
-        if resume and checkpoint.is_file():  # a run that was stopped before its first one starts again
+        # A run that was stopped before its first checkpoint starts again.
+        if resume and folder and checkpoint and checkpoint.is_file():
             state = load_checkpoint(checkpoint)
             rows, blocks, reality.tables = state["rows"], state["blocks"], state["tables"]
             strategy.load_state(state["strategy"])
@@ -103,7 +104,7 @@ def run_algorithm(run: RunSettings, learner: LearnerSettings, scene: Scene, trut
                         | {"evaluation_flights": (number + 1) * run.flights, "learn_twin_s": learned_s,
                            "round_s": time.perf_counter() - started})
             advance(0, _summary(rows[-1], run))
-            if folder:
+            if folder and checkpoint:
                 state = {"rows": rows, "blocks": blocks, "tables": reality.tables,
                          "strategy": strategy.state(last=number + 1 == run.real_episodes)}
                 if twin is not None:

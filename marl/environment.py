@@ -56,13 +56,18 @@ class Environment:
         self.frame = empty_frame((flights,), mission)
         self._rng = rng
 
-    def reset(self) -> Frame:
-        """All UAVs at their starts with full batteries, all data at their devices."""
+    def reset(self, which: np.ndarray | None = None) -> Frame:
+        """All UAVs at their starts with full batteries, all data at their devices.
+
+        Args:
+            which: (E,) bool, flights that begin anew while the others go on; None for all.
+        """
         frame, mission = self.frame, self.mission
-        frame.cell[:] = mission.start
-        frame.battery[:] = mission.battery
-        frame.data_units[:] = mission.data_units
-        _sense(mission, frame, np.ones(len(frame.cell), dtype=np.bool_), self._rng)
+        which = np.ones(len(frame.cell), dtype=np.bool_) if which is None else which
+        frame.cell[which] = mission.start
+        frame.battery[which] = mission.battery
+        frame.data_units[which] = mission.data_units
+        _sense(mission, frame, which, self._rng)
         return frame
 
     def step(self, action: np.ndarray) -> np.ndarray:
@@ -120,9 +125,9 @@ def assign(strength: np.ndarray, max_rate: bool, out: np.ndarray) -> None:
     out[:] = -1
     if max_rate:
         for u in range(uavs):
-            best = np.argmax(strength[u])
+            own = np.argmax(strength[u])
             for k in range(devices):
-                if k != best:
+                if k != own:
                     strength[u, k] = -np.inf
     for _ in range(min(uavs, devices)):
         best_u, best_k, best = -1, -1, -np.inf

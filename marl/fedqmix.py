@@ -8,6 +8,7 @@ from pathlib import Path
 from marl.options import add_options, checked
 from marl.settings import EPISODES, LEARNERS, PRESETS, LearnerSettings, RunSettings
 from radiotwin.cli.console import complain, say, show_warnings_plainly
+from radiotwin.cli.output import output
 from radiotwin.errors import BadInput, RunFailed
 
 
@@ -20,13 +21,16 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, help="folder of the results [runs/SCENE-TRUTH-TWIN-ALGORITHM-SEED]")
     parser.add_argument("--resume", action="store_true", help="go on with a run that was stopped; same options, same "
                         "result")
+    parser.add_argument("--quiet", "-q", action="store_true", help="print nothing but warnings and errors")
+    parser.add_argument("--json", action="store_true", help="print the table and messages as one JSON document")
     add_options(parser, RunSettings, "run", without=set())
     add_options(parser, LearnerSettings, "learning (defaults: those of the preset fast)", without={"mix"})
     given = parser.parse_args(arguments)
     try:
         signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
         show_warnings_plainly()
-        _run(given)
+        with output(given.quiet, given.json):
+            _run(given)
         return 0
     except BadInput as error:
         complain(str(error))

@@ -93,8 +93,8 @@ def curve_figure(curves: dict[str, list[dict]], levels: dict[str, float]) -> Fig
         colour = COLOURS[number % len(COLOURS)]
         axes.plot(x, ratio, marker=MARKERS[number % len(MARKERS)], color=colour, label=name)
         axes.fill_between(x, ratio - spread, ratio + spread, color=colour, alpha=0.18, linewidth=0)
-    for style, (name, ratio) in zip(LEVEL_STYLES, levels.items()):
-        axes.axhline(ratio, color="black", linestyle=style, linewidth=1.1, label=f"{name}: {ratio:.2f}")
+    for style, (name, level) in zip(LEVEL_STYLES, levels.items()):
+        axes.axhline(level, color="black", linestyle=style, linewidth=1.1, label=f"{name}: {level:.2f}")
     axes.set(xscale="log", ylim=(0, 1.02), xlabel="real episodes", ylabel="share of all data collected in the truth")
     axes.grid(alpha=0.3, which="both")
     figure.legend(loc="outside lower center", ncols=3, frameon=False)
@@ -129,10 +129,10 @@ def _draw_path(axes, scene: Scene, mission: Mission, flights: Flights, flight: i
     steps = np.diff(points, axis=0)
     aside = 0.12 * np.stack([steps[:, 1], -steps[:, 0]], axis=1)
     paint = [IDLE_COLOUR if k < 0 else colours[k] for k in served]
-    axes.add_collection(LineCollection(np.stack([points[:-1] + aside, points[1:] + aside], axis=1),
+    axes.add_collection(LineCollection(list(np.stack([points[:-1] + aside, points[1:] + aside], axis=1)),
                                        colors=paint[:len(steps)], linewidths=2.4, capstyle="round"))
     stays = np.flatnonzero((steps == 0).all(axis=1))
-    hovers = {}
+    hovers: dict[tuple, list] = {}
     for slot in stays:
         hovers.setdefault((*points[slot], paint[slot]), []).append(slot)
     for (at_x_m, at_y_m, colour), slots in hovers.items():

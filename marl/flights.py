@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+import pandas as pd
 import torch
 
 from marl.environment import Environment, Frame, empty_frame
@@ -11,6 +12,7 @@ from marl.features import observe
 from marl.heuristics import greedy_actions, random_actions
 from marl.mission import Mission
 from marl.networks import Agent
+from radiotwin.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +34,21 @@ class Flights:
     def ratio(self, mission: Mission) -> np.ndarray:
         """(E,) collected data of all the data that waited."""
         return self.collected.sum(axis=(1, 2), dtype=float) / mission.data_units.sum()
+
+
+def track_table(scene: Scene, mission: Mission, flights: Flights, flight: int) -> pd.DataFrame:
+    """One flight as a table: flight, uav, time_s, x_m, y_m, z_m, the device that served the UAV there (empty for none),
+    and collected [data units]; a row for every slot until the UAV's battery is empty."""
+    parts, frames = [], flights.frames
+    names = np.array([device.device for device in scene.config.devices] + [""])
+    for u, uav in enumerate(scene.config.uavs):
+        slots = np.arange(max(int((frames.battery[flight, :flights.length[flight], u] > 0).sum()), 1))
+        cell = frames.cell[flight, slots, u].astype(int)
+        parts.append(pd.DataFrame({
+            "flight": f"f{flight}", "uav": uav.uav, "time_s": scene.config.mission.slot_s * slots,
+            "x_m": scene.lattice.x_m[cell[:, 1]], "y_m": scene.lattice.y_m[cell[:, 0]], "z_m": mission.altitude_m[u],
+            "device": names[frames.assigned[flight, slots, u]], "collected": flights.collected[flight, slots, u]}))
+    return pd.concat(parts, ignore_index=True)
 
 
 class Policy(Protocol):

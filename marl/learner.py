@@ -62,7 +62,7 @@ class Learner:
             # Double Q-learning: the present network says which action, the target network what it is worth.
             ranked = (values.detach() if settings.double_q else target_values).masked_fill(~mask, -torch.inf)
             best = target_values.gather(-1, ranked.argmax(-1, keepdim=True)).squeeze(-1)
-            if self.mixer:
+            if self.target_mixer is not None:
                 best = self.target_mixer(best, state)
             target = _lambda_targets(reward, best, valid, settings.discount, settings.td_lambda)
         if self.mixer:
@@ -81,7 +81,7 @@ class Learner:
 
     def copy_to_target(self) -> None:
         self.target_agent.load_state_dict(self.agent.state_dict())
-        if self.mixer:
+        if self.mixer is not None and self.target_mixer is not None:
             self.target_mixer.load_state_dict(self.mixer.state_dict())
 
     def _tensors(self, flights: Flights, mission: Mission):
@@ -95,9 +95,9 @@ class Learner:
         observation, mask, state = (torch.from_numpy(array).to(self.device).unflatten(0, (slots, count))
                                     for array in arrays)
         action = torch.from_numpy(flights.action.swapaxes(0, 1).astype(np.int64)).to(self.device)
-        reward = flights.collected.sum(axis=2).T / np.float32(self.settings.reward_scale)
-        valid = (np.arange(slots)[:, None] < flights.length[None]).astype(np.float32)
-        reward, valid = torch.from_numpy(reward).to(self.device), torch.from_numpy(valid).to(self.device)
+        scaled = flights.collected.sum(axis=2).T / np.float32(self.settings.reward_scale)
+        flown = (np.arange(slots)[:, None] < flights.length[None]).astype(np.float32)
+        reward, valid = torch.from_numpy(scaled).to(self.device), torch.from_numpy(flown).to(self.device)
         if not self.mixer:
             reward, valid = reward.unsqueeze(-1), valid.unsqueeze(-1)
         return observation, mask, state, action, reward, valid
@@ -118,8 +118,9 @@ class Learner:
         modules = {"agent": self.agent, "mixer": self.mixer}
         if self.settings.federate_all:
             modules |= {"target_agent": self.target_agent, "target_mixer": self.target_mixer}
-        named = [(f"{module}.{name}", parameter) for module, network in modules.items() if network
-                 for name, parameter in network.named_parameters()]
+        named: list[tuple[str, Tensor]] = [
+            (f"{module}.{name}", parameter) for module, network in modules.items() if network
+            for name, parameter in network.named_parameters()]
         if self.settings.federate_all:
             # The moments exist after the first update, in all replicas alike.
             named += [(f"{moment}.{number}", self.optimiser.state[parameter][moment])

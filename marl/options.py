@@ -1,7 +1,7 @@
 """Command-line options made of settings: a name, a type, a line of help and the default for each field."""
 
 import argparse
-from typing import Literal, TypeVar, get_args, get_origin
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
@@ -39,7 +39,8 @@ def checked(given: argparse.Namespace, defaults: Model) -> Model:
 def _metavar(field: FieldInfo) -> str:
     if get_origin(field.annotation) is Literal:
         return "|".join(get_args(field.annotation))
-    return {bool: "true|false", int: "INTEGER", float: "NUMBER"}.get(field.annotation, "PATH")
+    words: dict[Any, str] = {bool: "true|false", int: "INTEGER", float: "NUMBER"}
+    return words.get(field.annotation, "PATH")
 
 
 def _shown(value) -> str:

@@ -26,7 +26,7 @@ class Replicas:
     def __init__(self, count: int, settings: LearnerSettings, mission: Mission, horizon: int, seed: int,
                  device: str = "cpu"):
         arguments = [(settings, mission, horizon, seed, number, device) for number in range(count)]
-        self._replicas = [_Remote(*each) for each in arguments] if count > 1 else [_Local(*arguments[0])]
+        self._replicas: list = [_Remote(*each) for each in arguments] if count > 1 else [_Local(*arguments[0])]
         self._pool = ThreadPoolExecutor(count)  # only waits for the processes
 
     def call(self, method: str, *arguments, each: list | None = None) -> list:

@@ -5,6 +5,7 @@ import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,6 +13,7 @@ import torch
 
 from marl.algorithm import Outcome, run_algorithm
 from marl.figures import choose_flight, draw_curve, draw_trajectories
+from marl.flights import track_table
 from marl.mission import Known, Mission, make_mission
 from marl.randomness import stream
 from marl.settings import LEARNERS, LearnerSettings, RunSettings
@@ -58,7 +60,7 @@ class Session:
         make_mission(scene, truth, Known.truth(scene), self.run.assignment)  # complains before anything is written
         _torch_device(self.run.device)
         self._claim_folder(_world(scene, truth))
-        runs = {self.run.twin: self.run}
+        runs: dict[str, RunSettings] = {self.run.twin: self.run}
         if self.run.compare and self.run.algorithm in LEARNERS:
             runs |= {twin: self.run.model_copy(update={"twin": twin})
                      for twin in ("nn", "log-distance", "truth") if twin != self.run.twin}
@@ -118,8 +120,10 @@ class Session:
                   if entry["method"] in ("planner", "greedy", "random") and entry["method"] != self.run.algorithm}
         curves = {f"{self.run.algorithm} in {TRAINED_IN[twin]}": outcome.rows for twin, outcome in outcomes.items()}
         draw_curve(curves, levels, self.out / "curve.png")
-        flights = main.flights
-        draw_trajectories(scene, real, flights, choose_flight(flights, real), main.known, self.out / "trajectories.png")
+        flights, typical = main.flights, choose_flight(main.flights, real)
+        with atomic_path(self.out / "flights.csv") as temporary:
+            track_table(scene, real, flights, typical).to_csv(temporary, index=False)
+        draw_trajectories(scene, real, flights, typical, main.known, self.out / "trajectories.png")
         print_rows(f"Collected in the truth ({self.run.truth}), of all data; mean and standard deviation of "
                    f"{self.run.flights} flights",
                    {"method": "left", "trained in": "left", "real episodes": "right", "collected": "right",
@@ -164,7 +168,8 @@ class _Log:
     """Writes `metrics.csv` and TensorBoard events of one folder; called after every round with all rows so far."""
 
     def __init__(self, folder: Path):
-        self._folder, self._writer, self._rows, self._blocks = folder, None, 0, 0
+        self._folder, self._rows, self._blocks = folder, 0, 0
+        self._writer: Any = None
 
     def __call__(self, rows: list[dict], blocks: list[dict]) -> None:
         with atomic_path(self._folder / "metrics.csv") as temporary:

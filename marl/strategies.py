@@ -1,7 +1,7 @@
 """What decides where UAVs fly, in one form: given a map, prepare; then fly."""
 
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from marl.federation import average
 from marl.flights import AgentPolicy, Flights, HeuristicPolicy, Policy, fly
 from marl.learner import Learner
 from marl.mission import Mission
+from marl.networks import Agent
 from marl.planner import PlanPolicy, plan
 from marl.randomness import stream
 from marl.replicas import Replicas
@@ -96,7 +97,8 @@ class Planned:
     selection_flights = 0
 
     def __init__(self, iterations: int, seed: int):
-        self._iterations, self._seed, self._actions = iterations, seed, None
+        self._iterations, self._seed = iterations, seed
+        self._actions: Any = None  # until the first `prepare`
 
     def prepare(self, mission: Mission, advance) -> list[dict[str, float]]:
         self._actions = plan(mission, self._iterations, self._seed).actions
@@ -133,7 +135,8 @@ class Learned:
         self._replicas = Replicas(count, settings, mission, rounds * run.episodes, run.seed, device)
         self._best = Learner(settings, mission, run.seed, device).agent  # before any episode: the initial weights
         self._present = Learner(settings, mission, run.seed, device).agent
-        self._device, self._federated, self._episodes, self._actions = device, count > 1, 0, None
+        self._device, self._federated, self._episodes = device, count > 1, 0
+        self._actions: np.ndarray | None = None
 
     def prepare(self, mission: Mission, advance) -> list[dict[str, float]]:
         if self._run.guide == "planner":
@@ -158,7 +161,7 @@ class Learned:
             advance(block)
         return records
 
-    def _look(self, mission: Mission, agent: torch.nn.Module) -> float:
+    def _look(self, mission: Mission, agent: Agent) -> float:
         """Share of the data that a policy collects; always in the same shadowing. NaN where nobody looks."""
         flights, seed = self._settings.selection_flights, self._run.seed
         if not flights:

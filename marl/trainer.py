@@ -31,7 +31,8 @@ class Trainer:
         self.learner = Learner(settings, mission, seed, device)
         self.replay = Replay(settings.replay, mission)
         self.episodes, self.slots = 0, 0
-        self.mission, self._plan = mission, None
+        self.mission = mission
+        self._plan: np.ndarray | None = None
         self._rng = stream(seed, "learning", number)
 
     def enter(self, mission: Mission, plan: np.ndarray | None = None) -> None:
@@ -87,6 +88,7 @@ class Trainer:
     def _follow(self, count: int) -> np.ndarray:
         """Slots that each flight follows the plan: a quarter of the flights all the way, the others a random part,
         which fades out as training goes on."""
+        assert self._plan is not None
         longest = len(self._plan) * (1 - min(self.episodes / self.horizon, 1.0))
         slots = self._rng.integers(0, int(longest) + 1, count)
         slots[:int(np.ceil(GUIDED_SHARE * count))] = len(self._plan)

@@ -1,8 +1,64 @@
-"""Radio digital twins of cities, learnt from measurements."""
+"""Radio digital twins of cities, learnt from measurements.
 
+The objects and what is done with them stand here, `import radiotwin as rt`; each is loaded when it is first used, so
+that importing the package takes no time.
+"""
+
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from radiotwin.closeloop.corrected import corrected_twin
+    from radiotwin.closeloop.report import make_report
+    from radiotwin.closeloop.run import Loop, close_loop
+    from radiotwin.compare import Comparison, compare_models, score_map, split_flights
+    from radiotwin.errors import BadInput, RunFailed
+    from radiotwin.measurements import Measurements, read_measurements
+    from radiotwin.radiomap import RadioMap
+    from radiotwin.report import read_run, write_report
+    from radiotwin.scene import Scene
+    from radiotwin.scene.build import BuildOptions, build_scene
+    from radiotwin.scene.presets import build_preset
+    from radiotwin.survey import fly_survey, segmented_truth
+    from radiotwin.trace import SolverSettings, trace_map
+    from radiotwin.twin import Twin, fit_twin
 
 try:
     __version__ = version("radiotwin")
 except PackageNotFoundError:  # run from a source tree that was never installed
     __version__ = "0+source"
+
+_MODULES = {
+    "closeloop.corrected": ["corrected_twin"],
+    "closeloop.report": ["make_report"],
+    "closeloop.run": ["Loop", "close_loop"],
+    "compare": ["Comparison", "compare_models", "score_map", "split_flights"],
+    "errors": ["BadInput", "RunFailed"],
+    "measurements": ["Measurements", "read_measurements"],
+    "radiomap": ["RadioMap"],
+    "report": ["read_run", "write_report"],
+    "scene": ["Scene"],
+    "scene.build": ["BuildOptions", "build_scene"],
+    "scene.presets": ["build_preset"],
+    "survey": ["fly_survey", "segmented_truth"],
+    "trace": ["SolverSettings", "trace_map"],
+    "twin": ["Twin", "fit_twin"],
+}
+_WHERE = {name: module for module, names in _MODULES.items() for name in names}
+
+__all__ = [  # noqa: F822 - names that __getattr__ finds
+    "BadInput", "BuildOptions", "Comparison", "Loop", "Measurements", "RadioMap", "RunFailed", "Scene",
+    "SolverSettings", "Twin", "__version__", "build_preset", "build_scene", "close_loop", "compare_models",
+    "corrected_twin", "fit_twin", "fly_survey", "make_report", "read_measurements", "read_run", "score_map",
+    "segmented_truth", "split_flights", "trace_map", "write_report"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _WHERE:
+        raise AttributeError(f"module 'radiotwin' has no attribute {name!r}")
+    return getattr(import_module(f"radiotwin.{_WHERE[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,6 +1,7 @@
 """Channel models held against each other: on flights that none has seen, and on the whole truth map."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -130,6 +131,7 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene, truth:
                 scores += score_map(model, ideal.radio_map(scene), truth, positions="true")
         locations += _location_rows(model, twin, true_m)
     for name, candidate in (maps or {}).items():
+        assert truth is not None  # only a truth judges a map
         scores += score_map(name, candidate, truth)
     return Comparison(pd.DataFrame(scores), pd.DataFrame(locations), fitted, predictions)
 
@@ -178,7 +180,7 @@ def predict(twin: Twin, scene: Scene, measurements: Measurements) -> np.ndarray:
 
 def _moved(twin: Twin, position_m: dict[str, tuple[float, float, float]]) -> Twin:
     """The twin with its devices at other positions."""
-    devices = [replace(device, **dict(zip(("x_m", "y_m", "z_m"), position_m[device.device])))
+    devices = [replace(device, **dict[str, Any](zip(("x_m", "y_m", "z_m"), position_m[device.device])))
                for device in twin.devices]
     return replace(twin, devices=devices)
 

@@ -64,7 +64,7 @@ def _check_packages(diagnosis: Diagnosis) -> list[tuple[str, str]]:
         diagnosis.problems.append("radiotwin runs from a folder and is not installed: pip install -e .")
         return [("radiotwin", "not installed")]
     for requirement in requirements:
-        name = re.match(r"[\w.-]+", requirement)[0]
+        name = re.findall(r"^[\w.-]+", requirement)[0]
         extra = re.search(r"extra == ['\"]([\w-]+)", requirement)
         try:
             rows.append((name, version(name)))
@@ -180,8 +180,8 @@ def diagnose() -> Diagnosis:
     return diagnosis
 
 
-def run(console: Console) -> bool:
-    """Print the diagnosis, and what to do, on `console`; True if everything works."""
+def run(console: Console) -> Diagnosis:
+    """Print the diagnosis, and what to do, on `console`."""
     with console.status("looking at this machine"):
         diagnosis = diagnose()
 
@@ -199,4 +199,4 @@ def run(console: Console) -> bool:
             say(f"  - {line}".replace("\n", "\n    "), style)
     if diagnosis.healthy:
         say("  Everything works.", "green")
-    return diagnosis.healthy
+    return diagnosis

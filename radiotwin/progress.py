@@ -6,11 +6,12 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+silent = False  # whether no bar is shown at all
 _shown: list[Progress] = []  # the display in use: a terminal has room for one only
 
 
 @contextmanager
-def progress(description: str, total: int) -> Iterator[Callable[..., None]]:
+def progress(description: str, total: float | None) -> Iterator[Callable[..., None]]:
     """Show a bar with the time left on standard error; silent where there is no terminal.
 
     A bar inside another one gets a line of its own below it.
@@ -30,7 +31,7 @@ def progress(description: str, total: int) -> Iterator[Callable[..., None]]:
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
         TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with Progress(*columns, console=console, transient=True, disable=silent or not console.is_terminal) as bar:
         _shown.append(bar)
         try:
             task = bar.add_task(description, total=total)

@@ -4,7 +4,7 @@ import json
 import warnings
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
@@ -179,7 +179,8 @@ class Twin:
             content = _TwinFile.model_validate(record)
             devices = [TwinDevice(**_with_nan(device.model_dump())) for device in content.devices]
             channel = load_channel(folder / CHANNEL_FILE)
-            return cls(channel, devices, content.level, content.limit_db, content.provenance, content.effects or {})
+            return cls(channel, devices, content.level, content.limit_db, content.provenance,
+                       content.effects if isinstance(content.effects, dict) else {})
         except (FileNotFoundError, NotADirectoryError):
             raise BadInput(f"{folder} is not a twin's folder (no twin.json); `radiotwin fit` makes one") from None
         except (OSError, KeyError, TypeError, ValueError) as error:
@@ -217,7 +218,7 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
     # Where a file gives x and y of an unknown device, too, they are not to be learned from.
     anchors_m = np.where(measurements.is_anchor[:, None], measurements.device_m, np.nan)
     channel = _fit_channel(measurements, anchors_m, scene, MODELS[model](), limit_db, seed)
-    devices = [_anchor(row) if row.role == "anchor" else None for row in measurements.devices.itertuples()]
+    devices: list[Any] = [_anchor(row) if row.role == "anchor" else None for row in measurements.devices.itertuples()]
     unknown = np.flatnonzero(~measurements.is_anchor)
     if len(unknown):
         settings = LocalizeSettings(allow_indoor=allow_indoor)

@@ -29,7 +29,7 @@ def untraced(monkeypatch):
 def printed():
     """Whether all is well, and the lines that `doctor.run` prints."""
     output = io.StringIO()
-    healthy = doctor.run(Console(file=output, width=40))
+    healthy = doctor.run(Console(file=output, width=40)).healthy
     return healthy, output.getvalue().splitlines()
 
 

@@ -1,15 +1,53 @@
-"""The examples run as they are."""
+"""The examples run as they are, and say what their text says."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-def test_first_twin(tmp_path):
-    result = subprocess.run([sys.executable, str(EXAMPLES / "first_twin.py")], cwd=tmp_path, capture_output=True,
-                            text=True, timeout=200)
+def run(name, folder):
+    result = subprocess.run([sys.executable, str(EXAMPLES / f"{name}.py")], cwd=folder, capture_output=True, text=True,
+                            timeout=300)
     assert result.returncode == 0, result.stderr
-    assert "segmented_nn" in result.stdout and result.stdout.strip().endswith("dB")
-    assert (tmp_path / "first_twin" / "twin" / "twin.json").is_file()
+    return result.stdout
+
+
+def test_city_to_map(tmp_path):
+    out = run("city_to_map", tmp_path)
+    assert "7 devices" in out and " dB\n" in out
+    for name in ("map.csv", "map.png", "report.html", "map.nc"):
+        assert (tmp_path / "city_to_map" / name).stat().st_size > 1000
+
+
+def test_find_devices(tmp_path):
+    out = run("find_devices", tmp_path)
+    medians = {row.split()[0]: float(row.split()[2]) for row in out.splitlines() if "log_distance" in row}
+    assert medians["segmented_log_distance"] < 0.5 * medians["log_distance"]
+    assert len(re.findall(r"^d\d: .* within", out, re.MULTILINE)) == 4
+    assert (tmp_path / "find_devices" / "twin" / "twin.json").is_file()
+
+
+def test_close_the_loop(tmp_path):
+    out = run("close_the_loop", tmp_path)
+    assert "verdict: effect" in out and "receiver_gain_offset" in out
+    before, after = map(float, re.search(r"([\d.]+) dB before, ([\d.]+) dB after", out).groups())
+    assert after < before
+
+
+def test_plan_with_your_twin(tmp_path):
+    out = run("plan_with_your_twin", tmp_path)
+    shares = {found[1:]: int(found[0]) for found in (
+        (share, name, where) for name, share, where in re.findall(r"(\w+) flights collect (\d+)% .* the (\w+)", out))}
+    assert shares["greedy", "truth"] > shares["random", "truth"]
+    assert "hovering at the start collects" in out or "radiotwin[rl]" in out
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_they_are_in_cells(path):
+    cells = path.read_text(encoding="utf-8").split("# %%")
+    assert cells[0] == "" and cells[1].startswith(" [markdown]\n# # ") and len(cells) > 4

@@ -88,7 +88,7 @@ def shift_line(
 
     def objective(shift_db: float) -> float:
         mean_db = line.mean_db(log_distance) + shift_db
-        nll = gaussian_nll(level_db, mean_db, line.sigma_db, limit_db).sum()
+        nll = gaussian_nll(level_db, mean_db, np.asarray(line.sigma_db), limit_db).sum()
         return nll + 0.5 * ((shift_db - prior_db) / spread_db) ** 2
 
     reach_db = 10.0 * spread_db

@@ -55,7 +55,7 @@ class Links:
         """(n,) angle at the device up to the receiver [rad], arcsin((z_r - z_d) / d)."""
         return np.arcsin(np.clip((self.receiver_m[:, 2] - self.device_m[:, 2]) / self.distance_m, -1.0, 1.0))
 
-    def select(self, mask: np.ndarray) -> Links:
+    def select(self, mask: np.ndarray | slice) -> Links:
         """The links that a mask, a slice or an index array picks."""
         return Links(self.device_m[mask], self.receiver_m[mask], self.los[mask], self.device[mask])
 

@@ -18,7 +18,7 @@ class LogDistance(ChannelModel):
     uses_map = False
 
     def __init__(self, line: LogDistanceLine | None = None) -> None:
-        self.line = line
+        self.line: LogDistanceLine = line  # type: ignore[assignment]  # None only until it is fitted
 
     def fit(self, links: Links, level_db: np.ndarray, limit_db: float | None, seed: int = 0) -> Self:
         """Maximum likelihood with censoring; see ChannelModel.fit. The seed changes nothing."""

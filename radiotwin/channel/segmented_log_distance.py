@@ -36,7 +36,9 @@ class SegmentedLogDistance(ChannelModel):
         nlos: LogDistanceLine | None = None,
         borrowed: str | None = None,
     ) -> None:
-        self.los, self.nlos, self.borrowed = los, nlos, borrowed
+        self.los: LogDistanceLine = los  # type: ignore[assignment]  # None only until it is fitted
+        self.nlos: LogDistanceLine = nlos  # type: ignore[assignment]
+        self.borrowed = borrowed
 
     def fit(self, links: Links, level_db: np.ndarray, limit_db: float | None, seed: int = 0) -> Self:
         """Maximum likelihood with censoring, each class by itself; see ChannelModel.fit. The seed changes nothing."""
@@ -46,7 +48,7 @@ class SegmentedLogDistance(ChannelModel):
             "nlos": (links.log_distance[~links.los], level_db[~links.los]),
         }
         detected = {name: int(np.isfinite(level).sum()) for name, (_, level) in data.items()}
-        poor, rich = sorted(detected, key=detected.get)
+        poor, rich = sorted(detected, key=lambda name: detected[name])
         lines = {rich: fit_line(*data[rich], limit_db)}
         self.borrowed = poor if detected[poor] < MIN_DETECTED else None
         if self.borrowed is None:

@@ -10,8 +10,9 @@ import sys
 import typer
 
 from radiotwin import __version__
-from radiotwin.cli import importing, loop, model, scenes, tools, world
+from radiotwin.cli import importing, loop, model, report, scenes, tools, world
 from radiotwin.cli.console import complain
+from radiotwin.cli.output import add_output_options
 from radiotwin.errors import BadInput, RunFailed
 
 app = typer.Typer(
@@ -22,8 +23,9 @@ app = typer.Typer(
     help="Radio digital twins of cities, learnt from measurements. A scene is built, traced and surveyed; a twin is "
          "fitted to the measurements, mapped and compared.")
 
-for module in (scenes, world, importing, model, loop, tools):
+for module in (scenes, world, importing, model, loop, report, tools):
     module.add_commands(app)
+add_output_options(app)
 
 
 def _show_version(wanted: bool) -> None:

@@ -3,7 +3,7 @@
 import math
 import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -53,14 +53,15 @@ def import_(
     from radiotwin.progress import progress
 
     show_warnings_plainly()
-    given = {"level_unit": level_unit, "length_unit": length_unit, "time_format": time_format, "time_zone": time_zone,
+    given: dict[str, Any] = {
+             "level_unit": level_unit, "length_unit": length_unit, "time_format": time_format, "time_zone": time_zone,
              "not_detected": _values(not_detected), "not_measured": _values(not_measured),
              "not_detected_at_or_below": not_detected_at_or_below, "min_level": min_level, "max_level": max_level,
              "min_distance_m": min_distance_m, "max_distance_m": max_distance_m, "average_m": average_m,
              "average": average, "origin": _origin(origin), "crs": crs, "devices": devices, "receivers": receivers,
              "wide": [parse_columns(text) for text in wide] if wide else None}
     pairs = columns is not None and "=" in columns and not columns.endswith(".toml")
-    if pairs:
+    if columns is not None and pairs:
         given["columns"] = parse_columns(columns)
     settings = read_settings(None if pairs else columns, {k: v for k, v in given.items() if v is not None})
     with progress("importing", total=None) as advance:

@@ -35,6 +35,7 @@ def close_loop(
     from radiotwin.closeloop.figures import draw_figures
     from radiotwin.closeloop.page import lead, write_page
     from radiotwin.closeloop.report import make_report, write_report
+    from radiotwin.closeloop.residual_table import write_residuals
     from radiotwin.closeloop.run import close_loop as run
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
@@ -51,9 +52,10 @@ def close_loop(
         check_corrected_target(write_scene, world, out)
     with progress("closing the loop", total=None) as advance:
         loop = run(data, world, base, seed, lambda text: advance(1, text), hold_out)
-    report = make_report(loop)
+    report = make_report(loop) | {"inputs": {"measurements": str(measurements), "scene": scene and str(scene)}}
     draw_figures(loop, world, report, out)
     write_report(report, out / "closeloop.json")
+    write_residuals(loop, out / "residuals.csv.gz")
     corrected_twin(loop, world).save(out / "twin")
     write_page(report, out, f"What the model of {measurements.name} lacks")
     for remark in report["remarks"]:
@@ -73,7 +75,7 @@ def close_loop(
                  p["unit"]] for effect in report["effects"] for name, p in effect["parameters"].items()])
     say(lead(report))
     say(f"wrote {out / 'closeloop.html'}")
-    if write_scene is not None:
+    if write_scene is not None and world is not None:
         changes = write_corrected_scene(loop, world, write_scene)
         say(f"wrote {write_scene}: {'; '.join(changes)}" if changes else
             f"{write_scene} is not written: no building and no anchor was found to be wrong in {scene}")

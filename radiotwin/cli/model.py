@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from radiotwin.cli.console import print_rows, say, show_warnings_plainly
+from radiotwin.cli.console import print_rows, result, say, show_warnings_plainly
 from radiotwin.errors import BadInput
 
 MeasurementFile = Annotated[Path, typer.Argument(
@@ -128,5 +128,7 @@ def compare(
 
 def print_comparison(comparison) -> None:
     """The tables of a comparison on the terminal."""
+    result("scores", comparison.scores.to_dict("records"))
+    result("locations", comparison.locations.to_dict("records"))
     for title, columns, rows in comparison.tables():
         print_rows(title, columns, rows)

@@ -1,11 +1,12 @@
 """Commands that make scenes, and scenes for other programs: build-scene, export-scene."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from radiotwin.cli.console import console, say, show_warnings_plainly
+from radiotwin.cli.console import console, result, say, show_warnings_plainly
 from radiotwin.errors import BadInput
 
 SceneFolder = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene folder, as `build-scene` makes it.")]
@@ -58,6 +59,7 @@ def build_scene(
         options = common | of_cities | _given(materials=pairs or None, bbox=numbers)
         report = _build_from_city(source, out, options, check)
     print_report(report, console)
+    result("scene", asdict(report))
     if report.folder:
         say(f"wrote {report.folder}: {', '.join(_content(report.folder))}")
     if report.tracing_would_fail:

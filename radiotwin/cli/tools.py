@@ -1,11 +1,12 @@
 """Commands that look after the user: demo, doctor."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from radiotwin.cli.console import console, say, show_warnings_plainly
+from radiotwin.cli.console import console, result, say, show_warnings_plainly
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -18,7 +19,7 @@ def demo(
         help="preset:small, or any source of `build-scene`, of which a part of 300 x 300 m is taken.")
         ] = "preset:small",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for everything that is made.")] = Path("demo"),
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of placement, flights and fits.")] = 0,
 ) -> None:
     """The whole chain on a small scene, in minutes: build, trace, survey, fit, compare, and an HTML page."""
     from radiotwin.cli.model import print_comparison
@@ -34,5 +35,7 @@ def doctor() -> None:
     """Say what works on this machine, and what to do about what does not."""
     from radiotwin import doctor as checks
 
-    if not checks.run(console):
+    diagnosis = checks.run(console)
+    result("doctor", {"healthy": diagnosis.healthy, **asdict(diagnosis)})
+    if not diagnosis.healthy:
         raise typer.Exit(1)

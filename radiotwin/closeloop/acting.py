@@ -88,7 +88,7 @@ def acts_through(acting: Acting) -> tuple[str, float]:
             continue
         by_panel = [_share(value[rows], acting.added_db[rows]) for _, rows in acting.panels()]
         shares[name] = float(np.mean(by_panel)) if by_panel else 0.0
-    best = max(shares, key=shares.get)
+    best = max(shares, key=lambda name: shares[name])
     return best, shares[best]
 
 

@@ -78,6 +78,7 @@ class LogDistanceBase(Base):
 
     def fit(self, records: Records) -> FittedBase:
         if np.isnan(records.device_m).any():
+            assert self._scene is not None  # without one, links of devices that are nowhere have been left out
             twin = _fit_twin(records, self._scene, "log_distance", self._seed)
             return FittedChannel(twin.channel, _located_m(twin), twin.devices)
         return _fit_channel(records, LogDistance(), self._seed)

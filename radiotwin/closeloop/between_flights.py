@@ -15,7 +15,17 @@ from radiotwin.closeloop.bases import Base
 from radiotwin.closeloop.folds import Folds, evidence_blocks, make_folds
 from radiotwin.closeloop.model import Side
 from radiotwin.closeloop.regression import Solution
-from radiotwin.closeloop.search import MOST_EFFECTS, SIGNIFICANCE, Look, Model, Search, judge, look_at, make_model
+from radiotwin.closeloop.search import (
+    MOST_EFFECTS,
+    SIGNIFICANCE,
+    Judged,
+    Look,
+    Model,
+    Search,
+    judge,
+    look_at,
+    make_model,
+)
 from radiotwin.effects.base import Effect, Setting
 from radiotwin.effects.receiver_drift import ReceiverDrift
 
@@ -33,7 +43,7 @@ def search_between_flights(search: Search, base: Base, folds: Folds, seed: int, 
     while len(search.model.whole.parts) < MOST_EFFECTS:
         step = len(search.model.whole.parts)
         look = look_at(model, effect, step)
-        if not _stands_out(model, look):
+        if isinstance(look, Judged) or not _stands_out(model, look):
             return
         judged, extended = judge(model, look, block, 1, step, seed)
         if extended is None:

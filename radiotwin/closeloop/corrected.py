@@ -1,8 +1,11 @@
 """The twin with what the loop found in it: saved in `twin.json`, and applied wherever the twin predicts a map."""
 
+from typing import Any
+
 import numpy as np
 
 import radiotwin
+from radiotwin.channel import ChannelModel
 from radiotwin.closeloop.bases import FittedBase, FittedChannel, FittedPaths
 from radiotwin.closeloop.locate import Corrected, calibrated_temper, device_spread_db, whole_area
 from radiotwin.closeloop.records import Records
@@ -33,8 +36,8 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
               "coefficients": fit.coefficients[place].tolist()}
              for part, place in zip(whole.parts, whole.places) if part.effect.explains]
     # Also devices whose place is too unsure to be learned from: a map with them is better than one without.
-    devices = list(law.found) or [TwinDevice(name, *map(float, place_m), "anchor", True, 0.0, None)
-                                  for name, place_m in zip(records.device_names, law.device_m)]
+    devices = list(law.found) or [TwinDevice(name, float(x_m), float(y_m), float(z_m), "anchor", True, 0.0, None)
+                                  for name, (x_m, y_m, z_m) in zip(records.device_names, law.device_m)]
     effects = {"base": loop.base, "coefficients": fit.coefficients[:split].tolist(), "dof": whole.dof,
                "scale_db": fit.scale_db.tolist(), "receivers": records.receiver_names, "parts": parts,
                "first_s": None if np.isnan(records.first_s) else records.first_s,
@@ -67,9 +70,9 @@ def corrected_map(twin: Twin, scene: Scene) -> RadioMap:
         BadInput: effects that this version does not know.
     """
     found = twin.effects
-    base = FittedChannel(twin.channel, twin.device_m)
+    base: FittedBase = FittedChannel(twin.channel, twin.device_m)
     if found["base"] == "raytrace":
-        base = FittedPaths(base, tuple(found["rest"]))
+        base = FittedPaths(FittedChannel(twin.channel, twin.device_m), tuple(found["rest"]))
     parts = [(_effect(part["name"], part["variant"]), part) for part in found["parts"]]
     shadowing = Shadowing.from_state(found["shadowing"]) if "shadowing" in found else None
     known = np.flatnonzero(np.isfinite(twin.device_m).all(axis=1))
@@ -81,7 +84,7 @@ def corrected_map(twin: Twin, scene: Scene) -> RadioMap:
         for row, device in enumerate(known):
             for start in range(0, len(receiver_m), CHUNK):
                 place = slice(start, start + CHUNK)
-                records = _records(twin, scene, receiver_m[place], device)
+                records = _records(twin, scene, receiver_m[place], int(device))
                 group = base.group(records)
                 mean_db[row, place] = _mean_db(base, records, np.array(found["coefficients"]), parts)
                 sigma_db[row, place] = scale_db[group]
@@ -154,5 +157,6 @@ def _effect(name: str, variant: str) -> Effect:
                    f"knows {', '.join(sorted({effect.name for effect in CATALOGUE}))}")
 
 
-def _channel(base: FittedBase):
-    return base.law.channel if isinstance(base, FittedPaths) else base.channel
+def _channel(base: FittedBase) -> ChannelModel:
+    law: Any = base.law if isinstance(base, FittedPaths) else base
+    return law.channel

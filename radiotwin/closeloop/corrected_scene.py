@@ -92,9 +92,9 @@ def _moved(loop: Loop, scene: Scene, city: CityMap | None) -> tuple[SceneConfig,
     found_m: dict[str, np.ndarray] = {}
     for part in loop.after.whole.parts:
         if isinstance(part.effect, DevicePositionError):
-            for device in site_of(records, part.setting["device"]):
-                name = records.device_names[device]
-                found_m[name] = found_m.get(name, records.device_m[device, :2]) + part.setting["move_m"]
+            for row in site_of(records, part.setting["device"]):
+                name = records.device_names[row]
+                found_m[name] = found_m.get(name, records.device_m[row, :2]) + part.setting["move_m"]
     devices, changes = [], []
     for device in scene.config.devices:
         if device.device in found_m:
@@ -138,7 +138,8 @@ def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
             choices.append((pulled, high) if side is low else (low, pulled))
         low, high = max(choices, key=lambda choice: np.prod(np.maximum(choice[1] - choice[0], 0.0)))
     x_m, y_m = 0.5 * (low + high)[:2] @ axes + (box.x_m, box.y_m)
-    return Box(x_m, y_m, *(high - low)[:2], high[2], box.turn_deg)
+    length_m, width_m = (high - low)[:2]
+    return Box(x_m, y_m, length_m, width_m, high[2], box.turn_deg)
 
 
 def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box]) -> None:

@@ -143,7 +143,7 @@ def _draw_histogram(acting: Acting, path: Path) -> None:
     figure = new_figure(7.0, 3.8)
     ax = figure.add_subplot()
     for residual_db, colour, label in zip(residuals_db, (BEFORE, AFTER), ("without it", "with it")):
-        ax.hist(residual_db, np.linspace(-most_db, most_db, 61), color=colour, alpha=0.55,
+        ax.hist(residual_db, np.linspace(-most_db, most_db, 61).tolist(), color=colour, alpha=0.55,
                 label=f"{label}: {np.sqrt(np.mean(residual_db**2)):.2f} dB (RMSE)")
     ax.axvline(0, color="0.3", linewidth=0.8)
     ax.set(xlabel="measured − predicted [dB]", ylabel="links",

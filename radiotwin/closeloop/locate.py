@@ -196,9 +196,9 @@ def _place(device: int, places_m: np.ndarray, share: np.ndarray, width_m: float,
     apart_m = np.linalg.norm(places_m[:, None] - places_m[None], axis=2)
     best = int((apart_m @ share).argmin())
     order = np.argsort(apart_m[best])
-    reached = np.searchsorted(np.cumsum(share[order]), CREDIBLE)
+    reached = int(np.searchsorted(np.cumsum(share[order]), CREDIBLE))
     radius_m = apart_m[best][order[min(reached, len(order) - 1)]] + width_m / 2
-    return Place(device, *map(float, places_m[best]), float(radius_m), links)
+    return Place(device, float(places_m[best, 0]), float(places_m[best, 1]), float(radius_m), links)
 
 
 def _grid(area_m: tuple[float, float, float, float]) -> tuple[np.ndarray, float]:

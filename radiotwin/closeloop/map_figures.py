@@ -1,6 +1,7 @@
 """The residual on the city map, and what was found there drawn in."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.collections import LineCollection, PolyCollection
@@ -39,6 +40,7 @@ class Ground:
         self.records, self.scene = records, scene
         self.receivers_move = len(np.unique(records.receiver_m[:, :2].round(), axis=0)) >= len(records.device_names)
         device_m = records.device_m[records.device]
+        self.moving_m: np.ndarray
         self.moving_m, still_m = ((records.receiver_m, device_m) if self.receivers_move
                                   else (device_m, records.receiver_m))
         if scene is not None:
@@ -88,9 +90,8 @@ class Ground:
         if self.receivers_move:
             members = np.unique(records.device)
             anchor = np.isin(members, list(records.anchors))
-            kinds = (("^", "black", "device, declared", members[anchor]),
-                     ("o", "white", "device, located", members[~anchor]))
-            kinds = [(*style, records.device_m[who]) for *style, who in kinds]
+            kinds = [("^", "black", "device, declared", records.device_m[members[anchor]]),
+                     ("o", "white", "device, located", records.device_m[members[~anchor]])]
         else:
             kinds = [("s", "black", "receiver", np.unique(records.receiver_m.round(), axis=0))]
         for marker, colour, label, place_m in kinds:
@@ -108,9 +109,9 @@ class Ground:
         x_min, x_max, y_min, y_max = self.bounds
         edges = [np.arange(low, high + self.cell_m, self.cell_m) for low, high in ((x_min, x_max), (y_min, y_max))]
         places_m = self.moving_m[seen, :2]
-        total, count = (np.histogram2d(*places_m.T, bins=edges, weights=weights)[0]
+        total, count = (np.histogram2d(places_m[:, 0], places_m[:, 1], edges, weights=weights)[0]  # type: ignore[call-overload]
                         for weights in (residual_db[seen], np.ones(seen.sum())))
-        return *edges, np.where(count >= LEAST_LINKS, total / np.maximum(count, 1), np.nan).T
+        return edges[0], edges[1], np.where(count >= LEAST_LINKS, total / np.maximum(count, 1), np.nan).T
 
 
 def draw_residual_map(loop: Loop, ground: Ground, path: Path) -> None:
@@ -208,8 +209,9 @@ def draw_links(part: Part, without_db: np.ndarray, with_db: np.ndarray, ground: 
                               zorder=2)
         rays.set_clim(-most_db, most_db)
         ax.add_collection(rays, autolim=False)
-        dots = ax.scatter(*ground.moving_m[order, :2].T, c=residual_db[order], s=12, cmap=RESIDUAL_COLOURS,
-                          vmin=-most_db, vmax=most_db, linewidths=0.2, edgecolors="0.3", zorder=3)
+        dots = ax.scatter(ground.moving_m[order, 0], ground.moving_m[order, 1], c=residual_db[order], s=12,
+                          cmap=RESIDUAL_COLOURS, vmin=-most_db, vmax=most_db, linewidths=0.2, edgecolors="0.3",
+                          zorder=3)
         ax.set(xlim=frame[:2], ylim=frame[2:])
         mark(ax, part, records)
         error = f"{np.sqrt(np.mean(residual_db[rows] ** 2)):.2f} dB" if len(rows) else "none was detected"
@@ -222,6 +224,7 @@ def draw_links(part: Part, without_db: np.ndarray, with_db: np.ndarray, ground: 
 def mark(ax, part: Part, records: Records) -> None:
     """Draw where an effect is, if it has a place: a box, a building that is gone, an end that stands elsewhere."""
     setting, name = part.setting, plainly(part.effect.name)
+    place_m: Any
     if "box" in setting:
         x_m, y_m, length_m, width_m, height_m, turn_deg = setting["box"]
         turn = np.radians(turn_deg)

@@ -76,7 +76,7 @@ class Side:
         """The same with other effects."""
         return replace(self, parts=parts)
 
-    def problem(self, rows: np.ndarray) -> Problem:
+    def problem(self, rows: np.ndarray | slice) -> Problem:
         """The regression on links of a mask or index."""
         records, parts = self.records, self.parts
         terms = [part.term for part in parts]
@@ -151,11 +151,12 @@ class Side:
         return sides
 
 
-def _bend(parts: list[Part], stage: str, records: Records | None, rows: np.ndarray) -> Callable | None:
+def _bend(parts: list[Part], stage: str, records: Records | None, rows: np.ndarray | slice) -> Callable | None:
     """What all parts of a stage do to the level, one after the other; None where there is none."""
     parts = [part for part in parts if part.effect.stage == stage]
     if not parts:
         return None
+    assert records is not None
     extras = [None if part.term.extra is None else part.term.extra[rows] for part in parts]
 
     def bend(level_db: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -169,9 +170,10 @@ def _bend(parts: list[Part], stage: str, records: Records | None, rows: np.ndarr
 
 def _lost(parts: list[Part], records: Records | None) -> np.ndarray | float:
     """(n,) probability that a link is lost to any of the parts; 0 where there is none that loses links."""
-    kept = 1.0
+    kept: np.ndarray | float = 1.0
     for part in parts:
         if part.effect.stage == "detection":
+            assert records is not None
             kept = kept * (1.0 - part.effect.loses(records, part.setting))
     return 1.0 - kept
 
@@ -281,7 +283,7 @@ def _refine_members(side: Side, fitted: Solution, part: Part, variation: Variati
         return sum(part.effect.bend(np.full(len(records), level_db), records, there.setting, there.term.extra)[0]
                    for level_db in EXTREMES_DB)
 
-    for member in variation.members:
+    for member in variation.members or ():
         moved = numbers.copy()
         moved[member] += variation.steps[member]
         rows = np.flatnonzero(side.train)

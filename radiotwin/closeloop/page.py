@@ -1,13 +1,12 @@
 """The report as one HTML file with its figures inside, which opens without a network."""
 
-import base64
 import html
 from collections import Counter
 from pathlib import Path
 
 from radiotwin.closeloop.words import LAST_RESORTS, listed, parameter, plainly, variable
-from radiotwin.demo_page import STYLE
 from radiotwin.files import atomic_path
+from radiotwin.pages import STYLE, details, image, table
 
 FIGURES = (
     ("waterfall.png", "From step to step", "Error on links that took no part in choosing or fitting: the model alone, "
@@ -35,7 +34,6 @@ COLUMNS = {"n": "links", "bias_db": "mean [dB]", "std_db": "standard deviation [
 FIGURES_OF_MERIT = (("rmse_db", "error, RMSE", "dB"), ("bias_db", "mean error", "dB"),
                     ("std_db", "standard deviation", "dB"), ("correlation", "correlation", ""))
 MOST_NAMED = 4  # variables in a sentence
-TEXT, STRONG = ' class="text"', ' class="strong"'
 MOST_ROWS = 40  # of a group in the tables
 MORE_STYLE = """
 body { background: #fff } h2 { font-size: 1.25rem; border-top: 1px solid #dde2e6; padding-top: 1.2rem }
@@ -46,7 +44,6 @@ h3 { font-size: 1.05rem; margin: 1.6rem 0 .2rem } summary { cursor: pointer; fon
 .card span { color: #4a5964; font-size: .88rem }
 .verdict { border-left: 6px solid #1f6f8b; flex-basis: 13rem } .verdict b { white-space: normal; font-size: 1.05rem }
 code { color: #5b6b78; font-size: .85em; font-weight: 400 }
-th.text, td.text { text-align: left } tr.strong td { font-weight: 600; background: #eaf3f6 }
 """
 
 
@@ -72,18 +69,22 @@ def lead(report: dict) -> str:
 
 def write_page(report: dict, folder: Path, title: str) -> None:
     """Write `closeloop.html` from the report and the figures that lie in `folder`."""
-    parts = [f"<h1>{html.escape(title)}</h1>", f'<p class="lead">{html.escape(lead(report))}</p>', _cards(report)]
-    for name, heading, text in FIGURES:
-        parts.append(f"<h2>{heading}</h2><p>{text}</p>{_image(folder / name, heading)}")
-    parts += [_effects(report, folder), "<h2>Error before and after</h2>", _errors(report, ("los",)),
-              _details("by device, receiver and flight", _errors(report, ("device", "receiver", "flight"))),
-              _candidates(report), _remaining(report), _remarks(report),
-              f"<footer>{html.escape(_facts(report))}</footer>"]
+    parts = [f"<h1>{html.escape(title)}</h1>", *sections(report, folder),
+             f"<footer>{html.escape(_facts(report))}</footer>"]
     page = ('<!doctype html><html lang="en"><meta charset="utf-8">'
             '<meta name="viewport" content="width=device-width, initial-scale=1">'
             f"<title>{html.escape(title)}</title><style>{STYLE}{MORE_STYLE}</style><main>{''.join(parts)}</main></html>")
     with atomic_path(folder / "closeloop.html") as temporary:
         temporary.write_text(page, encoding="utf-8")
+
+
+def sections(report: dict, folder: Path) -> list[str]:
+    """All that the page says between its title and its last line."""
+    figures = [f"<h2>{heading}</h2><p>{text}</p>{image(folder / name, heading)}" for name, heading, text in FIGURES]
+    return [f'<p class="lead">{html.escape(lead(report))}</p>', _cards(report), *figures, _effects(report, folder),
+            "<h2>Error before and after</h2>", _errors(report, ("los",)),
+            details("by device, receiver and flight", _errors(report, ("device", "receiver", "flight"))),
+            _candidates(report), _remaining(report), _remarks(report)]
 
 
 def _cards(report: dict) -> str:
@@ -105,11 +106,11 @@ def _effects(report: dict, folder: Path) -> str:
             filled = True
         parts.append(f"<h3>{effect['rank']}. {html.escape(name)} <code>{html.escape(effect['name'])}</code></h3>"
                      f"<p>{html.escape(_evidence(effect))}</p>")
-        parts.append(_image(folder / f"effect_{effect['rank']}_{effect['name']}.png", name))
+        parts.append(image(folder / f"effect_{effect['rank']}_{effect['name']}.png", name))
         rows = [[parameter(key), _number(p["value"]), _interval(p), p["unit"]]
                 for key, p in effect["parameters"].items()]
-        table = _table("", ["parameter", "value", "90 % interval", "unit"], rows)
-        parts.append(table if len(rows) <= 12 else _details(f"{len(rows)} parameters", table))
+        found = table("", ["parameter", "value", "90 % interval", "unit"], rows)
+        parts.append(found if len(rows) <= 12 else details(f"{len(rows)} parameters", found))
     return "".join(parts)
 
 
@@ -154,7 +155,7 @@ def _errors(report: dict, kinds: tuple[str, ...]) -> str:
             rows += [["", plainly(name), *(_number(scores.get(key)) for key in columns)]
                      for name, scores in others.items()]
     heldout = report["heldout"]
-    return _table(f"On held-out links (by {heldout['by']}, {heldout['folds']} folds)",
+    return table(f"On held-out links (by {heldout['by']}, {heldout['folds']} folds)",
                   ["", "model", *(COLUMNS.get(key, key.replace("_", " ")) for key in columns)], rows, left=2)
 
 
@@ -163,9 +164,9 @@ def _candidates(report: dict) -> str:
              _number(c["heldout_rmse_db"]), _p_value(c["p_value"])] for c in report["candidates"]]
     strong = [number for number, c in enumerate(report["candidates"]) if c["kept"]]
     steps = len({c["step"] for c in report["candidates"]})
-    table = _table("", ["step", "effect", "kept, or why not", "held-out gain [nats]", "held-out RMSE [dB]", "p"], rows,
+    tried = table("", ["step", "effect", "kept, or why not", "held-out gain [nats]", "held-out RMSE [dB]", "p"], rows,
                    left=3, strong=strong)
-    return "<h2>What was tried</h2>" + _details(f"{len(rows)} trials in {steps} steps", table)
+    return "<h2>What was tried</h2>" + details(f"{len(rows)} trials in {steps} steps", tried)
 
 
 def _remaining(report: dict) -> str:
@@ -173,7 +174,7 @@ def _remaining(report: dict) -> str:
     if not drivers:
         return "<h2>What remains</h2><p>No structure: the rest depends on none of the variables that were tested.</p>"
     rows = [[_variable(driver), _number(driver.get("effect_db")), _p_value(driver["p_value"])] for driver in drivers]
-    return "<h2>What remains</h2><p>The rest still depends on:</p>" + _table(
+    return "<h2>What remains</h2><p>The rest still depends on:</p>" + table(
         "", ["variable", "scatter of the mean residual over it [dB]", "p, corrected"], rows)
 
 
@@ -191,27 +192,6 @@ def _facts(report: dict) -> str:
     if floor_db is not None:
         facts.append(f"links measured again at one place scatter by {floor_db:.2f} dB")
     return " · ".join(facts)
-
-
-def _image(path: Path, name: str) -> str:
-    if not path.is_file():
-        return ""
-    data = base64.b64encode(path.read_bytes()).decode()
-    return f'<img alt="{html.escape(name)}" src="data:image/png;base64,{data}">'
-
-
-def _details(summary: str, content: str) -> str:
-    return f"<details><summary>{html.escape(summary)}</summary>{content}</details>"
-
-
-def _table(title: str, columns: list[str], rows: list[list], left: int = 1, strong: list[int] = ()) -> str:
-    """A table whose first `left` columns are text, with rows that stand out."""
-    def line(cells: list, tag: str) -> str:
-        return "".join(f'<{tag}{TEXT if number < left else ""}>{html.escape(str(cell))}</{tag}>'
-                       for number, cell in enumerate(cells))
-    body = "".join(f'<tr{STRONG if number in strong else ""}>{line(row, "td")}</tr>' for number, row in enumerate(rows))
-    caption = f"<caption>{html.escape(title)}</caption>" if title else ""
-    return f'<div class="scroll"><table>{caption}<tr>{line(columns, "th")}</tr>{body}</table></div>'
 
 
 def _variable(driver: dict) -> str:

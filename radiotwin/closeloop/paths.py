@@ -75,14 +75,15 @@ _remembered: OrderedDict[tuple, _Followed] = OrderedDict()
 
 def _by_device(records: Records) -> Iterator[tuple[np.ndarray, _Followed, np.ndarray]]:
     """Of each device: its links, what was followed, and the rows of that."""
+    assert records.city is not None  # paths are followed over a map
     for device in np.unique(records.device):
         rows = np.flatnonzero(records.device == device)
         place_m = records.device_m[device]
         if device not in records.anchors:
             rounded_m = np.append(np.round(place_m[:2] / GRID_M) * GRID_M, place_m[2])
             place_m = place_m if records.city.inside(rounded_m[None])[0] else rounded_m
-        followed, place = _follow(records.city, tuple(map(float, place_m)), records.receiver_m[rows],
-                                  records.frequency_hz)
+        x_m, y_m, z_m = map(float, place_m)
+        followed, place = _follow(records.city, (x_m, y_m, z_m), records.receiver_m[rows], records.frequency_hz)
         yield rows, followed, place
 
 

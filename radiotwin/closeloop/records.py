@@ -159,8 +159,8 @@ class Records:
             greatest[rows] = (over_m * np.sqrt(2 * length_m / (wavelength_m * near_m * far_m))).max(axis=1)
         return greatest
 
-    def select(self, rows: np.ndarray) -> "Records":
-        """The links of a mask or index array."""
+    def select(self, rows: np.ndarray | slice) -> "Records":
+        """The links of a mask, a slice or an index array."""
         names = ("level_db", "receiver_m", "device", "receiver", "flight", "time_s", "heading_deg", "pitch_deg",
                  "roll_deg", "quality")
         values = {name: getattr(self, name) for name in names}
@@ -225,7 +225,7 @@ def make_records(measurements: Measurements, scene: Scene | None, unplaced: bool
     flat = np.isnan(measurements.device_m[:, 2]).sum()
     if flat:
         remarks.append(f"{flat:,} device heights are empty and taken for {MISSING_HEIGHT_M} m")
-    placed = np.isfinite(device_m).all(axis=1) | (scene is not None) | unplaced
+    placed = np.asarray(np.isfinite(device_m).all(axis=1) | (scene is not None) | unplaced)
     leave_out(~placed[device_index], "without a scene, devices of unknown position cannot be located")
     for bad, why in useless_receivers(table, level_db, keep):
         leave_out(bad, why)

@@ -18,7 +18,7 @@ from radiotwin.closeloop.search import Model, Search, add_shadowing, make_model,
 from radiotwin.closeloop.structure import Driver, find_drivers, variables
 from radiotwin.closeloop.trends import UnexplainedTrend
 from radiotwin.effects import CATALOGUE
-from radiotwin.effects.base import Parameter
+from radiotwin.effects.base import Effect, Parameter
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
@@ -83,8 +83,8 @@ def significant(drivers: list[Driver]) -> list[Driver]:
     return [driver for driver in drivers if driver.p_value <= STRUCTURED and driver.effect_db >= LEAST_EFFECT_DB]
 
 
-def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed: int,
-               tell: Callable[[str], None], hold_out: str = "auto") -> Loop:
+def close_loop(measurements: Measurements, scene: Scene | None = None, base: str = "auto", seed: int = 0,
+               tell: Callable[[str], None] = lambda _: None, hold_out: str = "auto") -> Loop:
     """Find what a base model lacks.
 
     Args:
@@ -125,7 +125,7 @@ def close_loop(measurements: Measurements, scene: Scene | None, base: str, seed:
     drivers_after = _drivers(search.model, seed) if search.model is not before else drivers_before
     if significant(drivers_after):
         values = variables(search.model.whole.records, search.model.held_out_mean_db())
-        trends = [UnexplainedTrend(driver.variable) for driver in significant(drivers_after)
+        trends: list[Effect] = [UnexplainedTrend(driver.variable) for driver in significant(drivers_after)
                   if values[driver.variable].dtype.kind == "f"]  # labels have no order that a curve could follow
         search_effects(search, trends[:MOST_TRENDS], seed, tell)
         tell("correlated_shadowing")

@@ -192,7 +192,9 @@ def search_effects(result: Search, catalogue: list[Effect], seed: int, tell: Cal
         else:
             available.append(effect)
     while len(result.model.whole.parts) < MOST_EFFECTS:
-        step, looks, passed = len(result.model.whole.parts), [], []
+        step = len(result.model.whole.parts)
+        looks: list[Look] = []
+        passed: list[tuple[Effect, Judged, Model]] = []
         for effect in available:
             tell(f"step {step + 1}: {effect.name}")
             if not effect.repeatable and any(part.effect is effect for part in result.model.whole.parts):

@@ -25,7 +25,8 @@ class UnexplainedTrend(Effect):
     explains = False
 
     def __init__(self, variable: str):
-        self.variable, self.variant = variable, f"over {variable}"
+        self.variable = variable
+        self.variant = f"over {variable}"  # type: ignore[misc]  # one class stands for every variable
         self._values = Remembered()
 
     def propose(self, view: View) -> list[dict]:

@@ -104,7 +104,7 @@ def lacks_nats(residual_db: np.ndarray, scale_db: np.ndarray, losses_db: tuple[f
 
 def best_cells(centres_m: np.ndarray, total: np.ndarray, count: int) -> list[tuple[np.ndarray, int, float]]:
     """The best cells that are not neighbours: centre, index of the height, and nats."""
-    found = []
+    found: list[tuple[np.ndarray, int, float]] = []
     for place in np.argsort(-total.max(axis=1)):
         if all(np.linalg.norm(centres_m[place] - other[0]) > APART_M for other in found):
             height = int(total[place].argmax())

@@ -49,7 +49,7 @@ class Interference(Effect):
         levels_db = np.nanquantile(records.level_db, QUANTILES)
         rows = some(np.arange(len(records)), ENOUGH_LINKS)
         nats = _gain_of_places(view, rows, places, levels_db) * len(records) / len(rows)
-        found = []
+        found: list[dict] = []
         for number in np.argsort(-nats.max(axis=1)):
             if nats[number].max() < LEAST_NATS or len(found) == STARTS:
                 break

@@ -3,6 +3,8 @@
 No law of its own: the base model is asked again with the end elsewhere, lines of sight included.
 """
 
+from typing import Any
+
 import numpy as np
 
 from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured, some
@@ -35,7 +37,8 @@ class DevicePositionError(Effect):
         return None
 
     def propose(self, view: View) -> list[dict]:
-        records, best = view.records, (LEAST_NATS, None)
+        records = view.records
+        best: tuple[float, Any] = LEAST_NATS, None
         moves = [(radius * np.sin(angle), radius * np.cos(angle)) for radius in RADII_M
                  for angle in np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS]
         known = {other for device in view.done(self.name, "device") for other in site_of(records, device)}
@@ -88,7 +91,8 @@ class ReceiverPositionError(Effect):
         return None if receivers else f"no receiver has {LEAST_LINKS} links"
 
     def propose(self, view: View) -> list[dict]:
-        records, best = view.records, (LEAST_NATS, None)
+        records = view.records
+        best: tuple[float, Any] = LEAST_NATS, None
         axes = [(1, 0, 0), (0, 1, 0), (0.7, 0.7, 0), (0.7, -0.7, 0), (0, 0, 1)]
         moves = [sign * size * np.array(axis) for axis in axes for size in RECEIVER_OFFSETS_M for sign in (-1, 1)]
         for receiver in sorted(set(measured(records.receiver, LEAST_LINKS)) - set(view.done(self.name, "receiver"))):

@@ -5,6 +5,7 @@ temperature follows first-order cooling); ageing as a slope in time; a step at a
 'Inference about the change-point in a sequence of random variables', Biometrika 57).
 """
 
+
 import numpy as np
 
 from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured

@@ -4,6 +4,8 @@ Rapp's model of a solid-state amplifier (Rapp 1991, 'Effects of HPA-nonlinearity
 input / (1 + (input / saturation)^(2p))^(1 / 2p), in amplitudes; here in decibels.
 """
 
+from typing import Any
+
 import numpy as np
 
 from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured
@@ -22,13 +24,13 @@ class ReceiverSaturation(Effect):
     confused_with = ("antenna_pattern", "excess_attenuation")
 
     def propose(self, view: View) -> list[dict]:
-        records, found = view.records, {}
+        records, found = view.records, dict[str, Any]()
         seen = np.isfinite(records.level_db)
         members = measured(records.receiver[seen], 5 * LEAST_STRONG)
         for receiver in members:
             rows = seen & (records.receiver == receiver)
             mean, residual, weight = view.mean_db[rows], view.residual_db[rows], view.weight[rows]
-            best = 0.0, None
+            best: tuple[float, Any] = 0.0, None
             for quantile in QUANTILES:
                 level = float(np.quantile(mean, quantile))
                 if (mean > level).sum() < LEAST_STRONG:

@@ -78,7 +78,8 @@ class RemovedObstacle(Effect):
         low_m, high_m = corners_m.min(axis=0), corners_m.max(axis=0)
         if self._others.get(building, (None,))[0] is not city:
             self._others[building] = city, CityMap(city.vertices, city.faces[label != building])
-        return self._others[building][1], Box(*(low_m + high_m)[:2] / 2, *(high_m - low_m)[:2], high_m[2], 0.0)
+        (x_m, y_m, _), (length_m, width_m, _) = (low_m + high_m) / 2, high_m - low_m
+        return self._others[building][1], Box(x_m, y_m, length_m, width_m, high_m[2], 0.0)
 
     def _only_blocker(self, records) -> np.ndarray:
         """(n,) building that alone stands between the ends of each link; -1 where there is none or more than one."""

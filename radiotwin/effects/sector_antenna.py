@@ -155,7 +155,7 @@ class _Rays(NamedTuple):
         """(n,) what a pattern (6,), as in `FIELDS`, takes from each link [dB]."""
         gain = 10 ** (sector_pattern_db(self.azimuth_deg, self.elevation_deg, pattern[:5]) / 10)
         mean = np.mean(10 ** (sector_pattern_db(AROUND_DEG, np.full(len(AROUND_DEG), pattern[3]), pattern[:5]) / 10))
-        return through_antenna_db(self.power, gain, self.free * 10 ** (pattern[5] / 10), mean)
+        return through_antenna_db(self.power, gain, self.free * 10 ** (pattern[5] / 10), float(mean))
 
 
 def _best_pattern(rays: _Rays, view: View, rows: np.ndarray) -> tuple[list[float], float]:
@@ -167,7 +167,7 @@ def _best_pattern(rays: _Rays, view: View, rows: np.ndarray) -> tuple[list[float
         return float(view.nats(rows, offset_db + level_db).sum())
 
     before = nats(np.zeros(len(rows)))
-    best = -np.inf, []
+    best: tuple[float, list[float]] = -np.inf, []
     for azimuth in AZIMUTHS_DEG:
         for beamwidth in BEAMWIDTHS_DEG:
             for most_db in ATTENUATIONS_DB:

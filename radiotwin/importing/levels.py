@@ -49,7 +49,7 @@ def read_levels(source: Source, spec: str, settings: Settings) -> Levels:
     if settings.not_detected_at_or_below is not None:
         not_detected |= ~said & (numbers <= settings.not_detected_at_or_below)
     with np.errstate(divide="ignore", invalid="ignore"):  # what is not positive is impossible, and found below
-        factor = MILLIWATTS.get(settings.level_unit)
+        factor = MILLIWATTS.get(str(settings.level_unit))
         db = numbers if factor is None else 10 * np.log10(numbers * factor)
     low, high = POSSIBLE_DB
     impossible = ~not_measured & ~not_detected & ~((db > low) & (db < high))

@@ -116,7 +116,7 @@ def _names(source: Source, name: str, spec: str, shared: pd.DataFrame, settings:
 
 def _level_columns(source: Source, settings: Settings) -> list[LevelColumn]:
     if not settings.wide:
-        return [LevelColumn(settings.columns.level, {})]
+        return [LevelColumn(str(settings.columns.level), {})]
     found = [column for block in settings.wide for column in _columns_of(source, block)]
     specs = [column.spec for column in found]
     double = next((spec for spec in specs if specs.count(spec) > 1), None)

@@ -82,8 +82,8 @@ def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
     devices = by_device.median()
     devices["role"] = np.where(devices[["x_m", "y_m"]].notna().all(axis=1), "anchor", "unknown")
     devices.loc[devices["role"] == "unknown", ["x_m", "y_m"]] = np.nan
-    for name in DEVICE_OPTIONAL if table is not None else ():
-        if name in table:
+    for name in DEVICE_OPTIONAL:
+        if table is not None and name in table:
             devices[name] = table[name].reindex(devices.index)
     if "frequency_hz" in links:
         measured = links.groupby("device", sort=False)["frequency_hz"].median()

@@ -113,7 +113,7 @@ def _read_geojson(path: Path) -> pd.DataFrame:
     for number, feature in enumerate(features, start=1):
         geometry = feature.get("geometry") if isinstance(feature, dict) else None
         kind = geometry.get("type") if isinstance(geometry, dict) else None
-        coordinates = geometry.get("coordinates") if kind == "Point" else None
+        coordinates = geometry.get("coordinates") if geometry and kind == "Point" else None
         if not isinstance(coordinates, list) or not all(isinstance(n, int | float) for n in coordinates) \
                 or len(coordinates) not in (2, 3):
             raise BadInput(f"{path}: feature {number} is {kind or 'without a geometry'}; allowed are points with two "

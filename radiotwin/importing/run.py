@@ -51,7 +51,8 @@ def import_file(path: Path | str, settings: Settings, out: Path | str, compress:
     advance("links")
     links, width = build_links(source, settings, tally)
     readings = rows * width
-    tally.count("repeats an earlier row exactly", "", len(repeated) * width, repeated[:1] and source.where(repeated[0]))
+    tally.count("repeats an earlier row exactly", "", len(repeated) * width,
+                source.where(repeated[0]) if repeated else "")
     advance("positions")
     placed = _filtered(source, place(source, links, settings, tally), settings, tally)
     if placed.links.empty:
@@ -113,7 +114,7 @@ def _or(value: float | None, otherwise: float) -> float:
 
 
 def _measurements(table: pd.DataFrame, devices: pd.DataFrame, settings: Settings) -> Measurements:
-    level = COLUMN[settings.level_unit]
+    level = COLUMN[str(settings.level_unit)]
     table = table.rename(columns={"level_db": level})
     order = ["time_s", *REQUIRED, level, *(name for name in OPTIONAL if name != "time_s")]
     table = table[[name for name in order if name in table]].reset_index(drop=True)

@@ -36,9 +36,9 @@ def seconds(source: Source, spec: str, form: str | None, zone: str | None) -> np
                        f"{str(cells.iloc[0])!r} to {str(cells.iloc[-1])!r}")
     if form in EPOCH_S and not typed:
         return _checked(source, spec, as_text(cells), source.numbers(spec, "time") * EPOCH_S[form])
-    if not typed and form != ISO and "%" not in form:
+    if not typed and form != ISO and "%" not in str(form):
         raise BadInput(f"time_format {form!r} is unknown; {ALLOWED}")
-    parsed, text = (cells, as_text(cells)) if typed else _parse(source, spec, cells, form)
+    parsed, text = (cells, as_text(cells)) if typed else _parse(source, spec, cells, str(form))
     if parsed.dt.tz is None:
         if zone is None:
             raise BadInput(f"{source.path}: column {spec}: the times, such as {text.iloc[0]!r}, carry no offset from "

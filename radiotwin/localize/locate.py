@@ -88,7 +88,7 @@ def localize(
             for i, k in enumerate(search.devices):
                 effect = design_effect(residuals[k], correlation)
                 posterior = refine(
-                    lambda xy_m, k=k, search=search: search.log_likelihood(k, xy_m),
+                    lambda xy_m, k=k, search=search: search.log_likelihood(k, xy_m),  # type: ignore[misc]
                     scan.centre_m, scan.point_m, scan.value[i], scan.width_m, peaks[k], 1.0 / effect,
                 )  # fmt: skip
                 found[k] = (posterior, effect, search)
@@ -137,13 +137,13 @@ def _fly(
             value[device == k] = search_of[k].log_likelihood(k, xy_m[device == k])
         return value
 
-    whose = np.concatenate(whose)
+    devices = np.concatenate(whose)
     best_m, value = swarm_search(
-        log_likelihood, np.concatenate(centres), whose, scans[0].point_m, scans[0].width_m,
+        log_likelihood, np.concatenate(centres), devices, scans[0].point_m, scans[0].width_m,
         settings.particles, settings.iterations, rng, advance,
     )  # fmt: skip
     order = np.argsort(-value, kind="stable")
-    return {k: best_m[order][whose[order] == k] for k in search_of}
+    return {k: best_m[order][devices[order] == k] for k in search_of}
 
 
 def _estimate(

@@ -125,6 +125,6 @@ def refine(
             cell_m[allowed],
             value[allowed],
         )
-    xy_m, cell_m, width_m, value = (np.concatenate(each) for each in zip(*done, strict=True))
-    mass = width_m**2 * np.exp(temper * (value - value.max()))
-    return Posterior(xy_m, cell_m, width_m, value, mass / mass.sum())
+    xy_m, cell_m, widths_m, value = (np.concatenate(each) for each in zip(*done, strict=True))
+    mass = widths_m**2 * np.exp(temper * (value - value.max()))
+    return Posterior(xy_m, cell_m, widths_m, value, mass / mass.sum())

@@ -1,6 +1,7 @@
 """The flat surfaces of a city: triangles that share a segment and lie in one plane, however a wall is subdivided."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -113,7 +114,7 @@ def _frame(corners_m: np.ndarray, cross: np.ndarray) -> np.ndarray:
     normal = normal / (2 * area_m2)
     sides = (np.roll(corners_m, -1, axis=1) - corners_m).reshape(-1, 3)
     longest = np.argsort(-np.linalg.norm(sides, axis=1), kind="stable")[:SIDES_TRIED]
-    best = None
+    best: Any = None
     for side in sides[longest]:
         axis_u = side - (side @ normal) * normal
         axis_u /= np.linalg.norm(axis_u)

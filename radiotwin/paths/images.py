@@ -43,7 +43,7 @@ class Buffer(NamedTuple):
     receiver: np.ndarray
     candidate: np.ndarray
     points_m: np.ndarray
-    count: np.ndarray
+    count: np.ndarray  # type: ignore[assignment]  # hides the method of tuples, which nobody calls
 
     @classmethod
     def of(cls, capacity: int) -> "Buffer":

@@ -112,7 +112,7 @@ def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, dev
                 _add_rays(departures, mine, points_m[:, 1] - points_m[:, 0], gain)
                 _add_rays(arrivals, mine, points_m[every, last - 1] - points_m[every, last], gain)
             advance(1)
-    return PathPowers(*powers, departures, arrivals)
+    return PathPowers(*powers, departures, arrivals)  # type: ignore[call-arg]  # a row of powers for each kind
 
 
 def _add_rays(sums: np.ndarray, link: np.ndarray, ray_m: np.ndarray, power: np.ndarray) -> None:

@@ -103,11 +103,11 @@ def _split(vertices_m: np.ndarray, sides: np.ndarray) -> tuple[np.ndarray, np.nd
         side.append(row[on])
         corner.append(near[on])
         along.append(at_m[on])
-    side, corner, along = np.concatenate(side), np.concatenate(corner), np.concatenate(along)
-    order = np.lexsort((along, side))
-    side, corner = side[order], corner[order]
-    within = side[1:] == side[:-1]
-    return np.column_stack([corner[:-1], corner[1:]])[within], side[:-1][within]
+    sides, corners = np.concatenate(side), np.concatenate(corner)
+    order = np.lexsort((np.concatenate(along), sides))
+    sides, corners = sides[order], corners[order]
+    within = sides[1:] == sides[:-1]
+    return np.column_stack([corners[:-1], corners[1:]])[within], sides[:-1][within]
 
 
 def _rows_of_sides(pieces, piece_side, side_of_row, side_count):

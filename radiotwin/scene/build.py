@@ -210,10 +210,12 @@ def _report_on_errors(source: str, city: ImportedCity, frequency_hz: float) -> B
 
 
 def _city_shapes(city: ImportedCity, frequency_hz: float) -> tuple[list[CityShape], list[Problem]]:
-    written, problems = settle(city.materials, frequency_hz, {name.lower() for name in city.names})
+    assert city.surfaces is not None  # without an error among the problems
+    materials = [material for material in city.materials if material is not None]
+    written, problems = settle(materials, frequency_hz, {name.lower() for name in city.names})
     shapes = [
         CityShape(name, trimesh.Trimesh(vertices, faces, process=False), written[material])
-        for name, material, (vertices, faces) in zip(city.names, city.materials, city.surfaces.meshes())
+        for name, material, (vertices, faces) in zip(city.names, materials, city.surfaces.meshes())
     ]
     return shapes, problems
 
@@ -283,6 +285,7 @@ def _report(
     as_declared = dict(zip((shape.material for shape in shapes), city.materials))
     for material, count in Counter(shape.material for shape in shapes).most_common():
         before = as_declared[material]
+        assert before is not None
         kind = _kind(material.name, before.itu)
         uses.append(MaterialUse(material.name, kind, count, *constants(before, frequency_hz)))
     return BuildReport(

@@ -128,19 +128,19 @@ def check_closed(surfaces: Surfaces, ground: np.ndarray, names: Sequence[str]) -
     opened[surfaces.shape[surfaces.free_edges[1]]] = True
     opened[surfaces.shape[ground]] = False
     if opened.any():
-        which = [names[index] for index in np.flatnonzero(opened)]
+        leaky = [names[int(index)] for index in np.flatnonzero(opened)]
         problems.append(
             Problem(
                 "warning",
                 "",
-                f"{len(which)} of {surfaces.shapes} meshes are not watertight "
-                f"({listed(which)}). Open bottoms, and roofs apart from walls, do no harm: what is inside is "
+                f"{len(leaky)} of {surfaces.shapes} meshes are not watertight "
+                f"({listed(leaky)}). Open bottoms, and roofs apart from walls, do no harm: what is inside is "
                 "found by looking upwards. Holes in walls or roofs let rays in",
             )
         )
     seams = np.unique(surfaces.seams())
     if len(seams):
-        which = listed([names[index] for index in seams])
+        which = listed([names[int(index)] for index in seams])
         message = (
             f"{len(seams)} meshes are roofs and walls of different materials that meet in an edge ({which}). "
             "Sionna RT takes such an edge for two free edges of thin sheets: nothing diffracts there, or, with "

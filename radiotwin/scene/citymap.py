@@ -88,7 +88,7 @@ class CityMap:
         """(n,) index of the first face on the way from a to b, both (n, 3) [m]; -1 where nothing stands between."""
         return self._first_hits(np.asarray(a_m, dtype=float), np.asarray(b_m, dtype=float))[1]
 
-    def height_at(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    def height_at(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> np.ndarray:
         """Height of the highest surface above each point of the plane.
 
         Args:

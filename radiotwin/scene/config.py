@@ -117,7 +117,7 @@ class MissionConfig(Table):
 class SceneConfig(Table):
     """All of `scene.toml`."""
 
-    schema_: Literal["radiotwin.scene/1"] = Field(SCHEMA, alias="schema")
+    schema_: Literal["radiotwin.scene/1"] = Field("radiotwin.scene/1", alias="schema")
     name: Name
     radio: RadioConfig = RadioConfig()
     extent: Extent

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -87,6 +88,7 @@ def import_city(
     if bbox is not None:
         city = _cut(city, bbox)
     city = _move_to_origin(city)
+    assert city.surfaces is not None
     city.problems.extend(checks.check_ground(city.ground, city.surfaces))
     city.problems.extend(checks.check_closed(city.surfaces, city.ground, city.names))
     return city
@@ -184,7 +186,7 @@ def _outward(surfaces: Surfaces, names: Sequence[str]) -> tuple[Surfaces, list[P
     if len(mixed):
         meshes = surfaces.meshes()
         for index in mixed:
-            mesh = trimesh.Trimesh(*meshes[index], process=False)
+            mesh = trimesh.Trimesh(*meshes[index][:2], process=False)  # type: ignore[misc]
             trimesh.repair.fix_winding(mesh)
             meshes[index] = np.asarray(mesh.vertices), np.asarray(mesh.faces)
         surfaces = Surfaces(meshes)
@@ -222,7 +224,7 @@ def _joined(names: list[str], materials: list[Material | None], surfaces: Surfac
     meshes, whole, first = surfaces.meshes(), [], []
     for index in range(building.max() + 1):
         members = np.flatnonzero(building == index)
-        mesh = trimesh.util.concatenate([trimesh.Trimesh(*meshes[one], process=False) for one in members])
+        mesh: Any = trimesh.util.concatenate([trimesh.Trimesh(*meshes[one], process=False) for one in members])
         whole.append(clean(mesh.vertices, mesh.faces)[:2] if len(members) > 1 else meshes[members[0]])
         first.append(members[0])
     message = (
@@ -239,6 +241,7 @@ def _joined(names: list[str], materials: list[Material | None], surfaces: Surfac
 
 def _cut(city: ImportedCity, bbox: tuple[float, float, float, float]) -> ImportedCity:
     """Whole shapes, and single triangles of the ground, whose bounds reach into the box."""
+    assert city.surfaces is not None  # some shape was read
     surfaces = city.surfaces
     low, high = surfaces.face_bounds()
     overlaps = ((low[:, :2] <= bbox[2:]) & (high[:, :2] >= bbox[:2])).all(axis=1)
@@ -247,7 +250,7 @@ def _cut(city: ImportedCity, bbox: tuple[float, float, float, float]) -> Importe
     np.minimum.at(shape_low, surfaces.shape[solid], low[solid, :2])
     np.maximum.at(shape_high, surfaces.shape[solid], high[solid, :2])
     reaches = ((shape_low <= bbox[2:]) & (shape_high >= bbox[:2])).all(axis=1)
-    keep = np.where(city.ground, overlaps, reaches[surfaces.shape])
+    keep = np.where(city.ground, overlaps, np.asarray(reaches)[surfaces.shape])
     shapes = np.unique(surfaces.shape[keep])
     if len(shapes) == 0:
         (x_min, y_min, _), (x_max, y_max, _) = surfaces.vertices.min(axis=0), surfaces.vertices.max(axis=0)
@@ -266,6 +269,7 @@ def _cut(city: ImportedCity, bbox: tuple[float, float, float, float]) -> Importe
 
 def _move_to_origin(city: ImportedCity) -> ImportedCity:
     """Flat ground to z = 0 (uneven ground: its lowest point), and a city far away to around the origin."""
+    assert city.surfaces is not None  # some shape was read
     vertices, problems = city.surfaces.vertices, list(city.problems)
     middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
     offset = np.zeros(3)
@@ -302,4 +306,5 @@ def _move_to_origin(city: ImportedCity) -> ImportedCity:
             )
     if not offset.any():
         return replace(city, problems=problems)
-    return replace(city, problems=problems, surfaces=city.surfaces.moved(offset), moved_m=tuple(offset))
+    return replace(city, problems=problems, surfaces=city.surfaces.moved(offset),
+                   moved_m=(float(offset[0]), float(offset[1]), float(offset[2])))

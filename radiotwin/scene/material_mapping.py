@@ -4,6 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
+from typing import Any
 
 from radiotwin.errors import BadInput
 from radiotwin.scene.materials import (
@@ -79,6 +80,7 @@ class _Mapper:
         if shape.material is None:
             self.bare.append(shape.name)
             return None
+        node: Node | None
         if isinstance(shape.material, Node):
             node = shape.material
             identifier = node.attributes.get("id") or f"{shape.name}-material"
@@ -111,7 +113,8 @@ class _Mapper:
             )
         return found
 
-    def _error(self, identifier: str, message: str) -> None:
+    def _error(self, identifier: str, message: str) -> Any:
+        """Note an error; None, for a material that there is not."""
         self.problems.append(Problem("error", identifier, message))
 
     def _resolve(self, identifier: str, node: Node | None) -> Material | None:
@@ -211,7 +214,7 @@ def settle(
                     "fixed",
                     material.name,
                     f"material {material.name!r} (ITU {material.itu}, "
-                    f"{ranges_text(material.itu)}) cannot be loaded by Sionna RT, which starts at 3.5 GHz: "
+                    f"{ranges_text(material.itu or '')}) cannot be loaded by Sionna RT, which starts at 3.5 GHz: "
                     f"{values}",
                 )
             )
@@ -221,7 +224,7 @@ def settle(
                     "warning",
                     material.name,
                     f"material {material.name!r} (ITU {material.itu}, "
-                    f"{ranges_text(material.itu)}) is not known at {frequency_hz / 1e9:g} GHz; taken at the "
+                    f"{ranges_text(material.itu or '')}) is not known at {frequency_hz / 1e9:g} GHz; taken at the "
                     f"nearest end of its ranges: {values}",
                 )
             )

@@ -134,7 +134,7 @@ def permittivity(name: str, frequency_hz: float) -> tuple[float, float, bool]:
     if not frequency_hz > 0:
         raise BadInput(f"frequency {frequency_hz:g} Hz is not possible; give a positive frequency in hertz")
     frequency_ghz = frequency_hz / 1e9
-    ranges = ITU_TABLE[itu_material(name).itu]
+    ranges = ITU_TABLE[itu_material(name).itu or ""]  # an ITU material has a name
     in_range = next((row for row in ranges if row[0] <= frequency_ghz <= row[1]), None)
     if in_range is None:
         nearest_ghz, row = min(
@@ -158,7 +158,7 @@ def constants(material: Material, frequency_hz: float) -> tuple[float, float, bo
     """Relative permittivity and conductivity [S/m] of any material, and whether ITU covers the frequency."""
     if material.itu is not None:
         return permittivity(material.itu, frequency_hz)
-    return material.relative_permittivity, material.conductivity_s_per_m, True
+    return material.relative_permittivity, material.conductivity_s_per_m, True  # type: ignore[return-value]  # given without ITU
 
 
 def traceable(material: Material, frequency_hz: float) -> Material:

@@ -117,7 +117,8 @@ def read_obj(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
     Raises:
         BadInput: a line with a wrong number, with its row.
     """
-    vertices, polygons = [], {}
+    vertices: list = []
+    polygons: dict[int, list] = {}
     for row, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
         words = line.split()
         try:

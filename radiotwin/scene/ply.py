@@ -43,7 +43,7 @@ class _Element:
 
     def dtype(self, order: str, lengths: dict[str, int]) -> np.dtype:
         """Of one row whose lists have the given lengths."""
-        fields = []
+        fields: list[tuple] = []
         for name, kind, length_kind in self.properties:
             if length_kind is None:
                 fields.append((name, order + kind))
@@ -146,7 +146,8 @@ def _truncated(path: Path, element: _Element, row: int) -> BadInput:
 
 def _read_ascii(path: Path, data: bytes, elements: list[_Element]) -> dict:
     lines = [line for line in data.decode("latin-1").splitlines() if line.strip()]
-    columns, first = {}, 0
+    columns: dict[tuple[str, str], list] = {}
+    first = 0
     for element in elements:
         rows = [line.split() for line in lines[first : first + element.count]]
         first += element.count
@@ -180,7 +181,7 @@ def _read_ascii(path: Path, data: bytes, elements: list[_Element]) -> dict:
 
 
 def _read_binary(path: Path, data: bytes, start: int, order: str, elements: list[_Element]) -> dict:
-    columns = {}
+    columns: dict[str, dict] = {}
     for element in elements:
         found, start = _read_uniform(data, start, order, element) or _read_ragged(
             path, data, start, order, element
@@ -213,7 +214,7 @@ def _read_uniform(data: bytes, start: int, order: str, element: _Element) -> tup
 
 def _read_ragged(path: Path, data: bytes, at: int, order: str, element: _Element) -> tuple[dict, int]:
     codes = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
-    found = {name: [] for name, *_ in element.properties}
+    found: dict[str, list] = {name: [] for name, *_ in element.properties}
     for row in range(element.count):
         try:
             for name, kind, length_kind in element.properties:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -11,7 +12,7 @@ from rich.text import Text
 from radiotwin.scene.problems import Problem
 
 _COLOURS = {"error": "bold red", "warning": "yellow", "fixed": "green"}
-_TITLE = {"title_justify": "left", "title_style": "bold"}
+_TITLE: dict[str, Any] = {"title_justify": "left", "title_style": "bold"}
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ def _material_table(report: BuildReport) -> Table:
         ("relative permittivity", "right"),
         ("conductivity [S/m]", "right"),
     ):
-        table.add_column(heading, justify=justify)
+        table.add_column(heading, justify=justify)  # type: ignore[arg-type]  # one of Rich's words
     for use in report.materials:
         mark = "" if use.in_range else " (out of range)"
         table.add_row(

@@ -11,7 +11,7 @@ def sionna_scenes() -> dict[str, Path]:
     """XML files of the scenes that come with sionna-rt, by name; found without importing it."""
     spec = find_spec("sionna")
     folders = (
-        [] if spec is None else [Path(place) / "rt" / "scenes" for place in spec.submodule_search_locations]
+        [] if spec is None else [Path(place) / "rt" / "scenes" for place in spec.submodule_search_locations or ()]
     )
     return {
         path.parent.name: path

@@ -66,7 +66,8 @@ def _material_element(material: Material) -> ET.Element:
     return element
 
 
-def _add_float(element: ET.Element, name: str, value: float) -> None:
+def _add_float(element: ET.Element, name: str, value: float | None) -> None:
+    assert value is not None  # of a material that is not of ITU's, both constants are given
     ET.SubElement(element, "float", name=name, value=repr(float(value)))
 
 

@@ -23,7 +23,7 @@ class FlightGrid:
     def __init__(self, allowed: np.ndarray, terminal: tuple[int, int]):
         self.allowed = allowed
         self.terminal = terminal
-        self._steps = {}
+        self._steps: dict[tuple[int, int], np.ndarray] = {}
 
     def steps_to(self, cell: tuple[int, int]) -> np.ndarray:
         """(ny, nx) moves from every cell to `cell`; UNREACHABLE where there is no way."""

@@ -58,7 +58,8 @@ def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, fr
         worst = int(np.nanargmax(gain_db))
         raise RunFailed(f"a link of {distance_m[worst]:.3g} m has a gain of {gain_db[worst]:.1f} dB: more power would "
                         "arrive than was sent; is a receiver within a wavelength of a device?")
-    figures = {"links": int(gain_db.size), "links_with_path": int(found.sum()), "links_los": int(los.sum())}
+    figures: dict[str, float] = {"links": int(gain_db.size), "links_with_path": int(found.sum()),
+                                 "links_los": int(los.sum())}
     if not los.any():
         return figures
     above_db = np.where(found, gain_db, -np.inf) - free_space_gain_db(distance_m, frequency_hz)

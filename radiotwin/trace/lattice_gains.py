@@ -1,6 +1,7 @@
 """Gains over a scene's lattice, part by part, each kept on disk as soon as it is solved."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -72,7 +73,7 @@ def _plane(scene: Scene) -> int:
 def _solve(scene: Scene, settings: SolverSettings, store: BatchStore, work: list[tuple[str, int, np.ndarray]],
            description: str) -> list[np.ndarray]:
     """Gains of each (name in the store, device, positions)."""
-    known = {name: store.get(name, len(part)) for name, _, part in work}
+    known: dict[str, Any] = {name: store.get(name, len(part)) for name, _, part in work}
     missing = [(name, device, part) for name, device, part in work if known[name] is None]
     if missing:
         solve = _open(scene, settings)

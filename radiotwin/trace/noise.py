@@ -3,7 +3,7 @@
 import numpy as np
 
 
-def noise_figures(gain_db: np.ndarray, finer_db: np.ndarray) -> dict[str, float]:
+def noise_figures(gain_db: np.ndarray, finer_db: np.ndarray) -> dict[str, float | str]:
     """Difference between two solutions of the same links.
 
     Args:

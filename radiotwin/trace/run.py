@@ -55,9 +55,10 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
     distance_m = np.linalg.norm(device_m[:, None, :] - positions_m[None], axis=2)
     frequency_hz = scene.config.radio.frequency_hz
     direct_dbi, peak_dbi = antenna_gains(scene, index)
-    figures = check_gains(raw_db[:, ~inside].ravel(), los[:, ~inside].ravel(), distance_m[:, ~inside].ravel(),
-                          frequency_hz, settings.solver, settings.combining, direct_dbi[:, ~inside].ravel(),
-                          np.broadcast_to(peak_dbi, raw_db.shape)[:, ~inside].ravel())
+    figures: dict[str, float | str] = dict(
+        check_gains(raw_db[:, ~inside].ravel(), los[:, ~inside].ravel(), distance_m[:, ~inside].ravel(), frequency_hz,
+                    settings.solver, settings.combining, direct_dbi[:, ~inside].ravel(),
+                    np.broadcast_to(peak_dbi, raw_db.shape)[:, ~inside].ravel()))
     limit_db = scene.config.gain_limit_db
     gain_db, counts = _censor(raw_db, inside, limit_db)
     rows, columns, finer_db = solve_finer(scene, settings, store, index)

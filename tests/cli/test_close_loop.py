@@ -36,6 +36,15 @@ def test_a_file_and_a_table_of_devices_are_enough(run, tmp_path):
     assert report["schema"] == "radiotwin.closeloop/1" and report["verdict"] == "effect"
     assert report["effects"][0]["name"] == "receiver_gain_offset"
     assert report["error"]["after"]["rmse_db"] < 0.8 * report["error"]["before"]["rmse_db"]
+    links = pd.read_csv(tmp_path / "result" / "residuals.csv.gz")
+    assert len(links) == report["error"]["before"]["n"] == 1280
+    for when in ("before", "after"):
+        rmse_db = np.sqrt((links[f"{when}_db"] ** 2).mean())
+        assert rmse_db == pytest.approx(report["error"][when]["rmse_db"], abs=1e-3)
+    shown = run("report result", tmp_path)
+    assert shown.returncode == 0 and "no scene" in shown.stdout, shown.stderr
+    whole = (tmp_path / "result" / "report.html").read_text()
+    assert "receiver_gain_offset" in whole and not re.search(r'<[^>]*(?:src|href)="(?!data:)', whole)
     reasons = {candidate["name"]: candidate["reason"] for candidate in report["candidates"]}
     assert "heading" in reasons["body_shadowing"] and "frequency" in reasons["missing_obstacle"]
     page = (tmp_path / "result" / "closeloop.html").read_text()
@@ -53,3 +62,9 @@ def test_bad_input_is_one_message(run, tmp_path, words, parts):
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert all(part in done.stderr for part in parts), done.stderr
     assert not (tmp_path / "result").exists()
+
+
+def test_report_of_nothing_is_bad_input(run, tmp_path):
+    for words, part in (("report nowhere", "is not a folder"), ("report .", "holds nothing to show")):
+        done = run(words, tmp_path)
+        assert done.returncode == 2 and part in done.stderr and not list(tmp_path.iterdir())

@@ -49,7 +49,7 @@ def test_a_whole_run_writes_everything_and_ends_in_the_table(scene_option, tmp_p
     assert lines[2].split()[3] == str(160 + 3 * 64)
     folder = tmp_path / "result"
     for name in ("config.json", "metrics.csv", "checkpoint.pt", "comparison.csv", "curve.png", "trajectories.png",
-                 "twin/twin.json", "compare/truth/metrics.csv"):
+                 "flights.csv", "twin/twin.json", "compare/truth/metrics.csv"):
         assert (folder / name).is_file(), name
     assert list((folder / "tensorboard").iterdir())
     config = json.loads((folder / "config.json").read_text())

@@ -1,0 +1,41 @@
+# %% [markdown]
+# # From a city to a radio map
+# A small made-up city, its ray-traced truth, and the map as files that other programs read. Your own city: see
+# `radiotwin build-scene`. Tracing needs libLLVM 17 or newer; where there is none, the statistical truth stands in.
+
+# %%
+from pathlib import Path
+
+import xarray
+
+import radiotwin as rt
+from radiotwin import llvm
+from radiotwin.export import write_csv, write_picture
+
+out = Path("city_to_map")
+rt.build_preset("small", out / "scene")
+scene = rt.Scene.load(out / "scene")
+print(scene.config.name, scene.lattice.shape, "positions (z, y, x);", len(scene.config.devices), "devices")
+
+# %% [markdown]
+# The gain at every position where a UAV can be, here for one device. NaN: not detected.
+
+# %%
+if llvm.available():
+    radio_map = rt.trace_map(scene, rt.SolverSettings.of_quality("fast"), out / "map.nc", ["d3"])
+else:
+    radio_map = rt.segmented_truth(scene)
+    radio_map.write(out / "map.nc")
+gain_db = radio_map.dataset["gain_db"]
+print(f"{float(gain_db.isnull().mean()):.1%} of all links are not detected")
+print(gain_db.sel(device="d3", z=55.0).sel(x=100.0, y=100.0, method="nearest").item(), "dB")
+
+# %% [markdown]
+# As NetCDF, which xarray reads with its units; as a table; as a picture; and as a page to turn and zoom.
+
+# %%
+write_csv(radio_map, scene, out / "map.csv")
+write_picture(radio_map, scene, out / "map.png")
+rt.write_report(rt.read_run(out), out / "report.html")
+with xarray.open_dataset(out / "map.nc", engine="h5netcdf") as dataset:
+    print(dataset["gain_db"].attrs["units"], dict(dataset.sizes))

@@ -1,0 +1,49 @@
+# %% [markdown]
+# # Plan with your own twin
+# A twin's map is all that a planner needs: a flight is planned in the twin and flown in the truth.
+
+# %%
+import numpy as np
+
+import radiotwin as rt
+from marl.environment import Environment
+from marl.flights import HeuristicPolicy, fly
+from marl.mission import make_mission
+from marl.reality import known_by
+
+rt.build_preset("small", "plan/scene")
+scene = rt.Scene.load("plan/scene")
+truth = rt.segmented_truth(scene)
+measurements = rt.fly_survey(scene, truth, flights=2, pattern="random-waypoint", seed=0, noise_db=0.0)
+twin = rt.fit_twin(measurements, scene, model="segmented_log_distance", seed=0)
+
+# %% [markdown]
+# The mission in the twin, with the devices where the twin believes they are, and the same in the truth.
+
+# %%
+known = known_by(twin)
+in_twin = make_mission(scene, twin.radio_map(scene), known)
+in_truth = make_mission(scene, truth, known)
+for name in ("greedy", "random"):
+    for where, mission in (("twin", in_twin), ("truth", in_truth)):
+        rng = np.random.default_rng(0)
+        ratio = fly(Environment(mission, 32, rng), HeuristicPolicy(name, rng)).ratio(mission)
+        print(f"{name} flights collect {ratio.mean():.0%} of all data in the {where}")
+
+# %% [markdown]
+# A learner of your own sees the same mission as a PettingZoo or Gymnasium environment (extra `rl`).
+
+# %%
+try:
+    from marl.parallel_env import HarvestEnv
+except ImportError as error:
+    print(error)
+else:
+    env = HarvestEnv(in_twin, [uav.uav for uav in scene.config.uavs])
+    observations, infos = env.reset(seed=0)
+    collected = 0.0
+    while env.agents:
+        actions = {agent: int(infos[agent]["action_mask"].argmax()) for agent in env.agents}  # hover while it lasts
+        observations, rewards, ended, cut, infos = env.step(actions)
+        collected += sum(rewards.values())
+    print(f"hovering at the start collects {collected / in_twin.data_units.sum():.0%} in the twin")

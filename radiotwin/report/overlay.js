@@ -1,0 +1,91 @@
+"use strict";
+// What is drawn over the 3D picture: axes, devices and their estimates, paths and places of the UAVs.
+
+const UAV_COLOURS = ["#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9"];  // Okabe and Ito
+const FOUND = "#c1121f", UNKNOWN = "#f08a00", INK = "#111";
+const FONT = "12px system-ui, sans-serif";
+
+function path(context, stage, points, colour, width) {
+  context.beginPath();
+  let drawn = false;  // whether the pen is down
+  for (const point of points) {
+    const at = point && stage.pixel(...point);
+    if (!at) { drawn = false; continue; }
+    if (drawn) context.lineTo(...at); else context.moveTo(...at);
+    drawn = true;
+  }
+  Object.assign(context, {strokeStyle: colour, lineWidth: width, lineJoin: "round"});
+  context.stroke();
+}
+
+function label(context, text, [x, y], colour = INK) {
+  Object.assign(context, {font: FONT, textAlign: "center", lineWidth: 3, strokeStyle: "rgba(255, 255, 255, 0.85)", fillStyle: colour});
+  context.strokeText(text, x, y);
+  context.fillText(text, x, y);
+}
+
+function mark(context, kind, [x, y], size, colour) {
+  context.beginPath();
+  if (kind === "cross") {
+    context.moveTo(x - size, y - size); context.lineTo(x + size, y + size);
+    context.moveTo(x - size, y + size); context.lineTo(x + size, y - size);
+    Object.assign(context, {strokeStyle: colour, lineWidth: 2.5});
+    context.stroke();
+    return;
+  }
+  if (kind === "diamond") {
+    context.moveTo(x, y - size); context.lineTo(x + size, y); context.lineTo(x, y + size); context.lineTo(x - size, y);
+    context.closePath();
+  } else context.arc(x, y, size, 0, 2 * Math.PI);
+  Object.assign(context, {fillStyle: colour, strokeStyle: "#fff", lineWidth: 1.5});
+  context.fill();
+  context.stroke();
+}
+
+// A round number of metres, of which a handful make `length`.
+function roundStep(length) {
+  const power = 10 ** Math.floor(Math.log10(length / 5));
+  return [1, 2, 5, 10].map(part => part * power).find(step => length / step <= 6);
+}
+
+function drawAxes(context, stage) {
+  const [x0, x1, y0, y1] = stage.data.bounds, step = roundStep(Math.max(x1 - x0, y1 - y0)), off = 0.03 * Math.max(x1 - x0, y1 - y0);
+  path(context, stage, [[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0], [x0, y0, 0]], "#9aa5ad", 1);
+  const write = (text, x, y) => { const at = stage.pixel(x, y, 0); if (at) label(context, text, at, "#4a5964"); };
+  for (let x = Math.ceil(x0 / step) * step; x <= x1; x += step) write(x.toFixed(0), x, y0 - off);
+  for (let y = Math.ceil(y0 / step) * step; y <= y1; y += step) write(y.toFixed(0), x1 + 1.3 * off, y);
+  write("x, east [m]", (x0 + x1) / 2, y0 - 2.6 * off);
+  write("y, north [m]", x1 + 4 * off, (y0 + y1) / 2);
+}
+
+function drawDevices(context, stage) {
+  const [x0, x1, y0, y1] = stage.data.bounds, most = Math.max(x1 - x0, y1 - y0) / 4;
+  const {devices} = stage.data;
+  for (const {estimate, true: place, radius_m: radius} of devices) {
+    if (!estimate) continue;
+    const [x, y, z] = estimate;
+    if (place) path(context, stage, [place, estimate], FOUND, 1.5);
+    if (radius > 0 && radius < most)  // a larger circle says little and hides much
+      path(context, stage, Array.from({length: 49}, (_, n) => [x + radius * Math.cos(n * Math.PI / 24),
+                                                               y + radius * Math.sin(n * Math.PI / 24), z]), FOUND, 1);
+    const at = stage.pixel(x, y, z);
+    if (at) mark(context, "cross", at, 5, FOUND);
+  }
+  for (const device of devices) {
+    const at = device.true && stage.pixel(...device.true);
+    if (!at) continue;
+    const anchor = device.role === "anchor";
+    mark(context, anchor ? "diamond" : "circle", at, anchor ? 6 : 5, anchor ? INK : UNKNOWN);
+    if (devices.length <= 60) label(context, device.name, [at[0], at[1] - 9]);
+  }
+}
+
+function drawFlight(context, stage, uavs) {
+  uavs.forEach(({trail}, number) => path(context, stage, trail, UAV_COLOURS[number % UAV_COLOURS.length], 2.5));
+  uavs.forEach(({name, place}, number) => {
+    const at = stage.pixel(...place);
+    if (!at) return;
+    mark(context, "circle", at, 7, UAV_COLOURS[number % UAV_COLOURS.length]);
+    label(context, name, [at[0], at[1] - 11]);
+  });
+}

@@ -1,0 +1,198 @@
+"""What there is to show of a run: the folder of a demo, a twin, a close-loop, a planning run, or a scene."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pandas as pd
+
+from radiotwin.compare import Comparison
+from radiotwin.errors import BadInput
+from radiotwin.measurements import read_measurements
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.survey import segmented_truth
+from radiotwin.twin import Twin
+
+TRUTH = "truth"
+MEASUREMENTS = tuple(f"{folder}measurements{suffix}" for folder in ("", "survey/")
+                     for suffix in (".csv", ".csv.gz", ".parquet"))
+PLACE = ["x_m", "y_m", "z_m"]
+TRACK = ["flight", "uav", "time_s", *PLACE]
+RESIDUALS = ["flight", "receiver", "device", "los", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device_x_m",
+             "device_y_m", "device_z_m", "before_db", "after_db"]
+CONTENT = "scene.toml, twin.json, closeloop.json, compare.json, config.json of a planning run, or measurements.csv"
+
+
+@dataclass(eq=False)
+class Run:
+    """What was found; None or empty where there is nothing of it.
+
+    Attributes:
+        folder: of the run.
+        scene: the 3D map.
+        maps: name -> radio map; the truth is called `truth`.
+        twin: what the devices' estimates are from.
+        tracks: flight, uav, time_s, x_m, y_m, z_m: a row for every place of a UAV in time.
+        residuals: held-out links of a close-loop, as `radiotwin.closeloop.residual_table` writes them.
+        closeloop: content of `closeloop.json`.
+        closeloop_folder, comparison_folder: where figures lie beside the tables.
+        comparison: its tables; twins and predictions are empty.
+        planning: content of `comparison.csv` of a planning run.
+        notes: what is not shown and why, a sentence each.
+    """
+
+    folder: Path
+    scene: Scene | None = None
+    maps: dict[str, RadioMap] = field(default_factory=dict)
+    twin: Twin | None = None
+    tracks: pd.DataFrame | None = None
+    residuals: pd.DataFrame | None = None
+    closeloop: dict | None = None
+    closeloop_folder: Path | None = None
+    comparison: Comparison | None = None
+    comparison_folder: Path | None = None
+    planning: pd.DataFrame | None = None
+    notes: list[str] = field(default_factory=list)
+
+
+def read_run(folder: Path | str, scene: Path | None = None, truth: str | None = None,
+             measurements: Path | None = None) -> Run:
+    """Find what there is to show, and predict the maps of its twin.
+
+    Args:
+        folder: that a command of radiotwin or `marl.fedqmix` wrote.
+        scene: scene folder, where the run does not hold or name one.
+        truth: `segmented`, or the file of a radio map [SCENE/truth.nc, if it is there].
+        measurements: whose flights are shown, where the run does not hold them.
+
+    Raises:
+        BadInput: no such folder, nothing in it that can be shown, or something damaged.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise BadInput(f"{folder} is not a folder; give the folder of a run: it holds {CONTENT}")
+    run = Run(folder)
+    run.closeloop, run.closeloop_folder = _json_of(folder, ("", "closeloop"), "closeloop.json", "radiotwin.closeloop/1")
+    record, run.comparison_folder = _json_of(folder, ("", "comparison"), "compare.json", "radiotwin.comparison/1")
+    run.comparison = _comparison(record, run.comparison_folder)
+    settings = _planning_settings(folder)
+    inputs = (run.closeloop or {}).get("inputs", {})
+    run.scene = _scene(run, scene, inputs.get("scene") or settings.get("scene"))
+    run.twin = next((Twin.load(path) for path in (folder, folder / "twin") if (path / "twin.json").is_file()), None)
+    if settings and (folder / "comparison.csv").is_file():
+        run.planning = _table(folder / "comparison.csv", ["method", "trained_in", "real_episodes", "truth_ratio"])
+    _read_maps(run, truth or ("segmented" if settings.get("truth") == "segmented" else None))
+    if run.closeloop_folder is not None and (run.closeloop_folder / "residuals.csv.gz").is_file():
+        run.residuals = _table(run.closeloop_folder / "residuals.csv.gz", RESIDUALS)
+    run.tracks = _tracks(run, measurements)
+    if all(part is None for part in (run.scene, run.twin, run.closeloop, run.comparison, run.planning, run.tracks)):
+        raise BadInput(f"{folder} holds nothing to show; a run's folder holds {CONTENT}")
+    return run
+
+
+def _scene(run: Run, given: Path | None, named: str | None) -> Scene | None:
+    if given is not None:
+        return Scene.load(given)
+    for path in (run.folder, run.folder / "scene"):
+        if (path / "scene.toml").is_file():
+            return Scene.load(path)
+    if named and (Path(named) / "scene.toml").is_file():
+        return Scene.load(named)
+    run.notes.append(f"No 3D map: {f'the scene {named} is not there' if named else 'the run names no scene'}; give one "
+                     "with --scene.")
+    return None
+
+
+def _read_maps(run: Run, truth: str | None) -> None:
+    """The truth, the twin's map, and those in the folder; only maps over the scene's lattice can be shown in it."""
+    if truth is not None and truth != "segmented":
+        run.maps[TRUTH] = RadioMap.read(truth)
+    elif truth == "segmented" and run.scene is not None:
+        run.maps[TRUTH] = segmented_truth(run.scene)
+    elif run.scene is not None and (run.scene.folder / "truth.nc").is_file():
+        found = RadioMap.read(run.scene.folder / "truth.nc")
+        try:
+            run.scene.check_map(found)
+            run.maps[TRUTH] = found
+        except BadInput as error:
+            run.notes.append(f"{run.scene.folder / 'truth.nc'} is not shown: {error}.")
+    if run.twin is not None and run.scene is not None:
+        run.maps["twin, corrected" if run.twin.effects else "twin"] = run.twin.radio_map(run.scene)
+    for path in sorted(run.folder.glob("*.nc")):
+        if path.stem != TRUTH or TRUTH not in run.maps:
+            run.maps[path.stem] = RadioMap.read(path)
+
+
+def _tracks(run: Run, measurements: Path | None) -> pd.DataFrame | None:
+    """Where the UAVs were, from the flights of a planning run, measurements, or the links of a close-loop."""
+    path = run.folder / "flights.csv"
+    if measurements is None and path.is_file():
+        return _table(path, TRACK)
+    found = measurements or next((run.folder / name for name in MEASUREMENTS if (run.folder / name).is_file()), None)
+    if found is not None:
+        links = read_measurements(found).table
+    elif run.residuals is not None and "time_s" in run.residuals:
+        links = run.residuals
+    else:
+        return None
+    tracks = links.rename(columns={"receiver": "uav"} | {f"receiver_{name}": name for name in PLACE})
+    if "time_s" not in tracks or tracks["time_s"].isna().any():
+        return None  # places without an order are no flight
+    return tracks[TRACK].drop_duplicates().reset_index(drop=True)
+
+
+def _comparison(record: dict | None, folder: Path | None) -> Comparison | None:
+    if record is None:
+        return None
+    try:
+        scores, locations = (pd.DataFrame(record[name]) for name in ("scores", "locations"))
+        numbers = ["rmse_db", "mae_db", "bias_db"]
+        scores[numbers] = scores[numbers].astype(float)
+        if len(locations):
+            locations["error_m"] = locations["error_m"].astype(float)
+        return Comparison(scores, locations, {}, pd.DataFrame())
+    except (KeyError, TypeError, ValueError) as error:
+        raise BadInput(f"{folder}/compare.json is damaged ({type(error).__name__}: {error}); run `radiotwin compare` "
+                       "again") from None
+
+
+def _planning_settings(folder: Path) -> dict:
+    """The settings of `marl.fedqmix`; empty for a folder of something else."""
+    path = folder / "config.json"
+    record = _json(path) if path.is_file() else {}
+    settings = record.get("run", {})
+    return settings if isinstance(settings, dict) else {}
+
+
+def _json_of(folder: Path, places: tuple[str, ...], name: str, schema: str) -> tuple[dict | None, Path | None]:
+    for place in places:
+        path = folder / place / name
+        if path.is_file():
+            record = _json(path)
+            if record.get("schema") != schema:
+                raise BadInput(f"{path}: schema is {record.get('schema')!r}, this version reads {schema!r}; make the "
+                               "run again")
+            return record, path.parent
+    return None, None
+
+
+def _json(path: Path) -> dict:
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise BadInput(f"{path} cannot be read as JSON ({error}); make the run again") from None
+    if not isinstance(record, dict):
+        raise BadInput(f"{path} is no JSON object; make the run again")
+    return record
+
+
+def _table(path: Path, needed: list[str]) -> pd.DataFrame:
+    try:
+        table = pd.read_csv(path, dtype=dict.fromkeys(("flight", "uav", "receiver", "device", "method"), str))
+    except (OSError, ValueError, EOFError) as error:
+        raise BadInput(f"{path} cannot be read: {error}; make the run again") from None
+    missing = [name for name in needed if name not in table]
+    if missing:
+        raise BadInput(f"{path}: column {missing[0]!r} is missing; make the run again")
+    return table

@@ -1,0 +1,184 @@
+"use strict";
+// The 3D picture: the city and a slice in WebGL (three.js), and over it a plain canvas with everything that must stay
+// readable at any distance: devices, paths, labels. Coordinates are metres, x east, y north, z up.
+
+class Stage {
+  constructor(place, data) {
+    this.place = place;
+    this.data = data;
+    this.renderer = new THREE.WebGLRenderer({antialias: true});
+    this.renderer.setPixelRatio(window.devicePixelRatio);
+    this.renderer.setClearColor(0xffffff);
+    this.overlay = document.createElement("canvas");
+    place.append(this.renderer.domElement, this.overlay);
+    this.scene = new THREE.Scene();
+    this.camera = new THREE.PerspectiveCamera(35, 1, 1, 1e6);
+    this.camera.up.set(0, 0, 1);
+    this.city = data.city ? this.addCity(data.city) : new THREE.Object3D();
+    this.addGround();
+    this.slice = this.addSlice();
+    this.dots = new THREE.Points(new THREE.BufferGeometry(),
+                                 new THREE.PointsMaterial({size: 6, sizeAttenuation: false, vertexColors: THREE.VertexColors}));
+    this.dots.frustumCulled = false;
+    this.scene.add(this.dots);
+    this.drawings = [];  // functions of the overlay's context, called after each frame
+    this.look("oblique");
+    this.listen();
+    new ResizeObserver(() => this.resize()).observe(place);
+    this.resize();
+  }
+
+  addCity({x, y, z, i, j, k}) {
+    // Every face in one colour, lit once and for all: brighter the higher it is and the more it faces the light.
+    const light = new THREE.Vector3(-0.35, -0.62, 0.7).normalize(), top = Math.max(this.data.top_m, 1);
+    const place = new Float32Array(9 * i.length), colour = new Float32Array(9 * i.length);
+    const corners = [new THREE.Vector3(), new THREE.Vector3(), new THREE.Vector3()], across = new THREE.Vector3();
+    for (let face = 0; face < i.length; face++) {
+      [i, j, k].forEach((index, n) => {
+        const from = index[face];
+        corners[n].set(x[from], y[from], z[from]).toArray(place, 9 * face + 3 * n);
+      });
+      const normal = corners[1].sub(corners[0]).cross(across.subVectors(corners[2], corners[0])).normalize();
+      const lit = 0.5 + 0.3 * Math.abs(normal.dot(light)), high = Math.max(z[i[face]], z[j[face]], z[k[face]]) / top;
+      for (let n = 0; n < 3; n++)
+        colour.set([lit, lit + 0.012, lit + 0.03].map(part => Math.min(part + 0.15 * high, 1)), 9 * face + 3 * n);
+    }
+    const geometry = new THREE.BufferGeometry();
+    geometry.addAttribute("position", new THREE.BufferAttribute(place, 3));
+    geometry.addAttribute("color", new THREE.BufferAttribute(colour, 3));
+    const mesh = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({vertexColors: THREE.VertexColors, side: THREE.DoubleSide}));
+    this.scene.add(mesh);
+    return mesh;
+  }
+
+  addGround() {
+    const [x0, x1, y0, y1] = this.data.bounds;
+    const ground = new THREE.Mesh(new THREE.PlaneBufferGeometry(x1 - x0, y1 - y0),
+                                  new THREE.MeshBasicMaterial({color: 0xf1f3f4, side: THREE.DoubleSide}));
+    ground.position.set((x0 + x1) / 2, (y0 + y1) / 2, -0.3);
+    this.scene.add(ground);
+  }
+
+  addSlice() {
+    const slice = new THREE.Mesh(new THREE.PlaneBufferGeometry(1, 1), new THREE.MeshBasicMaterial({
+      transparent: true, opacity: 0.72, side: THREE.DoubleSide, depthWrite: false}));
+    slice.visible = false;
+    this.scene.add(slice);
+    return slice;
+  }
+
+  // A slice of coloured cells: RGBA bytes (ny, nx), south first, and where the middle of the first cell is.
+  showSlice(rgba, nx, ny, west, south, step, z) {
+    this.slice.material.map?.dispose();
+    const texture = new THREE.DataTexture(rgba, nx, ny, THREE.RGBAFormat);  // nearest cell, no mean over cells
+    texture.needsUpdate = true;
+    this.slice.material.map = texture;
+    this.slice.material.needsUpdate = true;
+    this.slice.scale.set(nx * step, ny * step, 1);
+    this.slice.position.set(west + (nx - 1) * step / 2, south + (ny - 1) * step / 2, z);
+    this.slice.visible = true;
+    this.dots.visible = false;
+  }
+
+  showDots(place, colour) {
+    this.dots.geometry.dispose();
+    this.dots.geometry = new THREE.BufferGeometry();
+    this.dots.geometry.addAttribute("position", new THREE.BufferAttribute(new Float32Array(place), 3));
+    this.dots.geometry.addAttribute("color", new THREE.BufferAttribute(new Float32Array(colour), 3));
+    this.dots.visible = true;
+    this.slice.visible = false;
+  }
+
+  // The camera moves on a sphere around a point.
+  look(from) {
+    const [x0, x1, y0, y1] = this.data.bounds;
+    this.middle = new THREE.Vector3((x0 + x1) / 2, (y0 + y1) / 2, 0.3 * this.data.top_m);
+    this.far = 1.9 * Math.max(x1 - x0, y1 - y0);
+    [this.turn, this.lift] = from === "above" ? [-Math.PI / 2, Math.PI / 2 - 1e-3] : [-Math.PI / 2 + 0.45, 0.72];
+    this.redraw();
+  }
+
+  listen() {
+    const pointers = new Map();
+    this.place.addEventListener("pointerdown", event => {
+      this.place.setPointerCapture(event.pointerId);
+      pointers.set(event.pointerId, event);
+    });
+    for (const end of ["pointerup", "pointercancel"])
+      this.place.addEventListener(end, event => pointers.delete(event.pointerId));
+    this.place.addEventListener("pointermove", event => {
+      const before = pointers.get(event.pointerId);
+      if (!before) { this.hover?.(event); return; }
+      const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
+      const other = [...pointers.values()].find(pointer => pointer.pointerId !== event.pointerId);
+      if (other) {  // two fingers: nearer or farther
+        const apart = pointer => Math.hypot(pointer.clientX - other.clientX, pointer.clientY - other.clientY);
+        this.zoom(apart(before) / Math.max(apart(event), 1));
+      } else if (event.buttons & 2 || event.shiftKey) this.pan(dx, dy);
+      else {
+        this.turn -= 0.006 * dx;
+        this.lift = Math.min(Math.max(this.lift + 0.006 * dy, 0.05), Math.PI / 2 - 1e-3);
+      }
+      pointers.set(event.pointerId, event);
+      this.redraw();
+    });
+    this.place.addEventListener("contextmenu", event => event.preventDefault());
+    this.place.addEventListener("wheel", event => {
+      event.preventDefault();
+      this.zoom(Math.exp(0.001 * event.deltaY));
+      this.redraw();
+    }, {passive: false});
+  }
+
+  zoom(factor) { this.far = Math.min(Math.max(this.far * factor, 5), 1e5); }
+
+  pan(dx, dy) {
+    const metres = 2 * this.far * Math.tan(Math.PI * this.camera.fov / 360) / this.place.clientHeight;
+    const [sin, cos] = [Math.sin(this.turn), Math.cos(this.turn)];
+    this.middle.x += metres * (sin * dx - cos * dy);
+    this.middle.y += metres * (-cos * dx - sin * dy);
+  }
+
+  resize() {
+    const {clientWidth: width, clientHeight: height} = this.place;
+    this.renderer.setSize(width, height);
+    Object.assign(this.overlay, {width: width * window.devicePixelRatio, height: height * window.devicePixelRatio});
+    this.camera.aspect = width / Math.max(height, 1);
+    this.draw();
+  }
+
+  redraw() {  // once a frame, however much has changed
+    if (this.waiting) return;
+    this.waiting = true;
+    requestAnimationFrame(() => { this.waiting = false; this.draw(); });
+  }
+
+  draw() {
+    const {camera, far} = this;
+    camera.position.set(Math.cos(this.lift) * Math.cos(this.turn), Math.cos(this.lift) * Math.sin(this.turn), Math.sin(this.lift));
+    camera.position.multiplyScalar(far).add(this.middle);
+    Object.assign(camera, {near: far / 200, far: 10 * far + 1e4});
+    camera.lookAt(this.middle);
+    camera.updateProjectionMatrix();
+    this.renderer.render(this.scene, camera);
+    const context = this.overlay.getContext("2d");
+    context.setTransform(window.devicePixelRatio, 0, 0, window.devicePixelRatio, 0, 0);
+    context.clearRect(0, 0, this.place.clientWidth, this.place.clientHeight);
+    this.drawings.forEach(drawing => drawing(context));
+  }
+
+  // Pixels of a point; null behind the camera.
+  pixel(x, y, z) {
+    const at = new THREE.Vector3(x, y, z).project(this.camera);
+    if (at.z > 1) return null;
+    return [(at.x + 1) / 2 * this.place.clientWidth, (1 - at.y) / 2 * this.place.clientHeight];
+  }
+
+  // (x, y) on a level [m] under a mouse event; null where it is not met.
+  under(event, z) {
+    const box = this.place.getBoundingClientRect(), ray = new THREE.Raycaster();
+    ray.setFromCamera(new THREE.Vector2(2 * (event.clientX - box.left) / box.width - 1,
+                                        1 - 2 * (event.clientY - box.top) / box.height), this.camera);
+    return ray.ray.intersectPlane(new THREE.Plane(new THREE.Vector3(0, 0, 1), -z), new THREE.Vector3());
+  }
+}

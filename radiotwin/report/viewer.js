@@ -1,0 +1,195 @@
+"use strict";
+// The controls: which map, device and altitude is shown, and which moment of which flight. The page holds all data as
+// JSON (layers.py); nothing is fetched.
+
+const NOTHING = -32768;  // a level that is not there (packing.py)
+const PLAY_MS = 40, PLAY_FRAMES = 400;
+const HOVER_PIXELS = 8;
+const HOLES = "Holes: not detected.", DOTS = "Each dot is a link that took no part in fitting, at the place of the end that moves.";
+
+const control = name => document.getElementById("control-" + name);
+const chosen = name => Number(control(name).value);
+
+// Every packed array becomes a typed one.
+function unpack(value) {
+  if (Array.isArray(value)) return value.map(unpack);
+  if (value === null || typeof value !== "object") return value;
+  if (value.data === undefined || value.type === undefined)
+    return Object.fromEntries(Object.entries(value).map(([key, each]) => [key, unpack(each)]));
+  const kind = {float32: Float32Array, int32: Int32Array, int16: Int16Array, uint8: Uint8Array}[value.type];
+  return new kind(Uint8Array.from(atob(value.data), letter => letter.charCodeAt(0)).buffer);
+}
+
+const data = unpack(JSON.parse(document.getElementById("radiotwin-data").textContent));
+const views = data.maps.flatMap(map => map.fields.map(field => ({map, field, label: field.label})));
+if (data.links) for (const when of ["before", "after"])
+  views.push({links: when, label: `held-out residual (measured − predicted): ${when}`});
+const view = () => views[chosen("view")];
+
+function colourOf(scale, share) {  // (r, g, b) of 0 to 255
+  const colours = data.scales[scale];
+  return colours[Math.round(Math.min(Math.max(share, 0), 1) * (colours.length - 1))];
+}
+
+function fill(select, labels) {
+  select.replaceChildren(...labels.map((text, value) => new Option(text, value)));
+  select.parentElement.hidden = labels.length === 0;
+  select.disabled = labels.length < 2;
+}
+
+function refill(name, labels) {  // keeps what was chosen, where it is still there
+  const before = control(name).selectedOptions[0]?.text;
+  fill(control(name), labels);
+  if (labels.includes(before)) control(name).value = labels.indexOf(before);
+}
+
+function chooseView() {
+  const shown = view();
+  refill("device", !shown ? [] : shown.map ? shown.map.devices : ["all devices", ...data.links.devices]);
+  refill("altitude", shown?.map ? shown.map.z.map(z => `${z} m`) : []);
+  drawView();
+}
+
+function drawView() {
+  const shown = view();
+  if (!shown) return;
+  const scale = shown.map ? shown.field.kind : "link";
+  const [low, high] = shown.map ? [shown.field.low, shown.field.high] : [-data.links.range_db, data.links.range_db];
+  const share = value => (value - low) / (high - low);
+  if (shown.map) {
+    const {map} = shown, cells = levelsOf(shown), rgba = new Uint8Array(4 * cells.length);
+    cells.forEach((level, n) => { if (level !== null) rgba.set([...colourOf(scale, share(level)), 255], 4 * n); });
+    stage.showSlice(rgba, map.x.length, map.y.length, map.x[0], map.y[0], map.step_m, map.z[chosen("altitude")]);
+  } else {
+    const links = linksOf(shown);
+    stage.showDots(links.flatMap(n => [data.links.x[n], data.links.y[n], data.links.z[n]]),
+                   links.flatMap(n => colourOf(scale, share(data.links[shown.links][n] / 100)).map(part => part / 255)));
+  }
+  const bar = control("colours"), stops = data.scales[scale].map(colour => `rgb(${colour})`);
+  bar.style.background = scale === "los" ? `linear-gradient(to right, ${stops[0]} 50%, ${stops.at(-1)} 50%)`
+                                         : `linear-gradient(to right, ${stops})`;
+  control("title").textContent = shown.map ? shown.field.title : "measured − predicted [dB]";
+  control("low").textContent = scale === "los" ? "no" : low.toFixed(0).replace("-", "−");
+  control("high").textContent = scale === "los" ? "yes" : high.toFixed(0).replace("-", "−");
+  control("legend").textContent = !shown.map ? DOTS : scale === "los" ? "" : HOLES;
+  stage.redraw();
+}
+
+// Levels of the chosen slice, south-west first; null where nothing is detected.
+function levelsOf({map, field}) {
+  const size = map.x.length * map.y.length, start = (chosen("device") * map.z.length + chosen("altitude")) * size;
+  return Array.from(field.values.subarray(start, start + size),
+                    value => field.kind === "los" ? value : value === NOTHING ? null : value / 100);
+}
+
+// Numbers of the links that the chosen view shows.
+function linksOf({links: when}) {
+  const device = chosen("device") - 1, {links} = data;
+  return Array.from(links.x.keys()).filter(n => links[when][n] !== NOTHING && (device < 0 || links.device[n] === device));
+}
+
+// Flights
+function placeAt(track, time) {  // the last moment that has passed, and the place between it and the next one
+  let low = 0, high = track.t.length - 1;
+  if (time >= track.t[high]) return [high, [track.x[high], track.y[high], track.z[high]]];
+  while (high - low > 1) {
+    const middle = (low + high) >> 1;
+    if (track.t[middle] <= time) low = middle; else high = middle;
+  }
+  const share = Math.max(0, (time - track.t[low]) / Math.max(track.t[high] - track.t[low], 1e-9));
+  return [low, ["x", "y", "z"].map(axis => track[axis][low] + share * (track[axis][high] - track[axis][low]))];
+}
+
+function uavsNow() {
+  const flight = data.flights[chosen("flight")];
+  return !flight ? [] : flight.uavs.map(track => {
+    const [last, place] = placeAt(track, chosen("time")), trail = [];
+    for (let n = 0; n <= last; n++) trail.push([track.x[n], track.y[n], track.z[n]]);
+    return {name: track.name, place, trail: [...trail, place]};
+  });
+}
+
+function showTime() {
+  control("clock").textContent = `${chosen("time").toFixed(0)} of ${data.flights[chosen("flight")].end_s.toFixed(0)} s`;
+  stage.redraw();
+}
+
+function chooseFlight() {  // at its end: all of it is seen
+  const flight = data.flights[chosen("flight")], slider = control("time");
+  if (!flight) return;
+  slider.max = Math.max(flight.end_s, 1e-3);
+  slider.step = slider.max / 1000;
+  slider.value = slider.max;
+  showTime();
+}
+
+let player = null;
+function play() {
+  const slider = control("time"), end = Number(slider.max);
+  if (player) {
+    clearInterval(player);
+    player = null;
+  } else {
+    if (chosen("time") >= end) slider.value = 0;
+    player = setInterval(() => {
+      slider.value = chosen("time") + end / PLAY_FRAMES;
+      showTime();
+      if (chosen("time") >= end) play();
+    }, PLAY_MS);
+  }
+  control("play").textContent = player ? "❚❚" : "▶";
+}
+
+// The level under the mouse
+function textUnder(event) {
+  const shown = view();
+  if (!shown) return "";
+  if (!shown.map) {
+    const box = stage.place.getBoundingClientRect();
+    const near = linksOf(shown).find(n => {
+      const at = stage.pixel(data.links.x[n], data.links.y[n], data.links.z[n]);
+      return at && Math.hypot(at[0] + box.left - event.clientX, at[1] + box.top - event.clientY) < HOVER_PIXELS;
+    });
+    return near === undefined ? "" : `${data.links.devices[data.links.device[near]]}, ${data.links.los[near] ? "LoS" : "NLoS"}: ` +
+      `${(data.links[shown.links][near] / 100).toFixed(2)} dB`;
+  }
+  const {map, field} = shown, z = map.z[chosen("altitude")], at = stage.under(event, z);
+  if (!at) return "";
+  const column = Math.round((at.x - map.x[0]) / map.step_m), row = Math.round((at.y - map.y[0]) / map.step_m);
+  if (column < 0 || row < 0 || column >= map.x.length || row >= map.y.length) return "";
+  const level = levelsOf(shown)[row * map.x.length + column];
+  const words = level === null ? "not detected" : field.kind !== "los" ? `${level.toFixed(2)} dB` : level ? "line of sight" : "no line of sight";
+  return `(${map.x[column]}, ${map.y[row]}, ${z}) m: ${words}`;
+}
+
+let stage = null;
+function start() {
+  const place = document.getElementById("viewer");
+  try {
+    stage = new Stage(place, data);
+  } catch (error) {
+    place.textContent = "This browser gives no WebGL, so the city cannot be drawn: " + error.message;
+    return;
+  }
+  stage.drawings.push(context => drawAxes(context, stage),
+                      context => { if (control("devices").checked) drawDevices(context, stage); },
+                      context => drawFlight(context, stage, uavsNow()));
+  stage.hover = event => { control("hover").textContent = textUnder(event); };
+  fill(control("view"), views.map(({label}) => label));
+  fill(control("flight"), data.flights.map(({name}) => name));
+  document.getElementById("flight-controls").hidden = data.flights.length === 0;
+  document.getElementById("scale").hidden = views.length === 0;
+  control("view").onchange = chooseView;
+  control("device").onchange = control("altitude").onchange = drawView;
+  control("flight").onchange = chooseFlight;
+  control("time").oninput = showTime;
+  control("play").onclick = play;
+  control("buildings").onchange = event => { stage.city.visible = event.target.checked; stage.redraw(); };
+  control("devices").onchange = () => stage.redraw();
+  for (const from of ["oblique", "above"]) control(from).onclick = () => stage.look(from);
+  chooseView();
+  chooseFlight();
+  requestAnimationFrame(() => { document.body.dataset.readyMs = performance.now().toFixed(0); });
+}
+
+start();

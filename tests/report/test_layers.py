@@ -1,0 +1,93 @@
+"""What goes into a page: packed numbers, simplified cities, thinned maps, residuals and flights."""
+
+import base64
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.radiomap import RadioMap
+from radiotwin.report import Run, city, layers, read_run
+from radiotwin.report.packing import NOTHING, pack, pack_db
+
+
+def unpacked(packed):
+    return np.frombuffer(base64.b64decode(packed["data"]), packed["type"]).reshape(packed["shape"])
+
+
+def test_levels_are_kept_to_a_hundredth_of_a_decibel():
+    level_db = np.array([[-78.126, np.nan], [0.0, -400.0]])
+    assert unpacked(pack_db(level_db)).tolist() == [[-7813, NOTHING], [0, -32767]]
+    assert unpacked(pack(np.array([1, 2], dtype=">i4"))).tolist() == [1, 2]
+
+
+def test_blocks_have_the_citys_volume_and_a_closed_surface():
+    height_m = np.array([[0, 5.0, 5.0], [0, 12.0, 0.2], [3.0, 0, 0]])
+    vertices_m, faces = city.blocks(height_m, 10.0, -20.0, 4.0)
+    triangles_m = vertices_m[faces]
+    area_m2 = 0.5 * np.cross(triangles_m[:, 1] - triangles_m[:, 0], triangles_m[:, 2] - triangles_m[:, 0])
+    flat = np.abs(area_m2[:, 2]) > 0
+    # Roofs: each cell once. Walls: every step in height between neighbours once, over a side of 4 m.
+    assert np.abs(area_m2[flat, 2]).sum() == pytest.approx(4 * 16)
+    assert (triangles_m[flat, :, 2].mean(axis=1) * np.abs(area_m2[flat, 2])).sum() == pytest.approx(25 * 16)
+    padded = np.pad(np.where(height_m > 0.5, height_m, 0), 1)
+    steps_m = sum(np.abs(np.diff(padded, axis=axis)).sum() for axis in (0, 1))
+    assert np.linalg.norm(area_m2[~flat], axis=1).sum() == pytest.approx(4 * steps_m)
+    assert triangles_m[..., 0].min() == 10 and triangles_m[..., 0].max() == 22 and triangles_m[..., 1].min() == -20
+
+
+def test_a_city_with_too_many_triangles_is_drawn_as_blocks(small_scene, monkeypatch):
+    whole, note = city.city_mesh(small_scene)
+    assert note == "" and unpacked(whole["i"]).size < len(small_scene.city.faces)  # without the ground
+    monkeypatch.setattr(city, "MOST_FACES", 20)
+    blocks, note = city.city_mesh(small_scene)
+    assert "blocks" in note
+    assert unpacked(blocks["z"]).max() == pytest.approx(small_scene.city.vertices[:, 2].max(), abs=0.01)
+
+
+def test_large_maps_are_thinned_and_the_page_says_so(run_folder, monkeypatch):
+    run = read_run(run_folder)
+    assert layers.map_layers(run)[0]["step_m"] == 20 and run.notes == []
+    monkeypatch.setattr(layers, "MOST_VALUES", 3000)
+    thinned = layers.map_layers(run)[0]
+    step = int(thinned["step_m"] / 20)
+    assert step > 1 and f"every {step}th" in run.notes[0]
+    expected_db = np.nan_to_num(run.maps["truth"].gain_db[..., ::step, ::step], nan=NOTHING / 100)
+    np.testing.assert_allclose(unpacked(thinned["fields"][0]["values"]) / 100, expected_db, atol=0.006)
+
+
+def test_the_residual_counts_only_what_the_truth_detects(run_folder):
+    run = read_run(run_folder)
+    truth, twin = run.maps["truth"], run.maps["twin"]
+    fields = {field["label"]: field for field in layers.map_layers(run)[1]["fields"]}
+    error = unpacked(fields["twin: residual (model − truth)"]["values"])
+    np.testing.assert_array_equal(error == NOTHING, np.isnan(truth.gain_db))
+    assert fields["twin: residual (model − truth)"]["low"] == -fields["twin: residual (model − truth)"]["high"]
+    stranger = RadioMap(twin.dataset.assign_coords(device=[f"x{n}" for n in range(len(twin.devices))]))
+    assert np.isnan(layers._difference_db(stranger, truth)).all()
+
+
+def links(n=6):
+    rng = np.random.default_rng(1)
+    table = pd.DataFrame({f"{end}_{axis}_m": rng.uniform(0, 100, n) if end == "receiver" else 5.0
+                          for end in ("receiver", "device") for axis in "xyz"})
+    return table.assign(time_s=np.arange(n) * 1.0, flight="f0", receiver="u", device=["b", "a"] * (n // 2), los=1,
+                        before_db=[4.0, np.nan, -3.0, 2.0, 1.0, 0.0][:n], after_db=0.5)
+
+
+def test_residuals_stand_where_the_moving_end_is(tmp_path):
+    run = Run(tmp_path, residuals=links())
+    layer = layers.link_layer(run)
+    np.testing.assert_allclose(unpacked(layer["x"]), run.residuals["receiver_x_m"], rtol=1e-6)
+    assert layer["devices"] == ["a", "b"] and unpacked(layer["device"]).tolist() == [1, 0] * 3
+    assert unpacked(layer["before"]).tolist() == [400, NOTHING, -300, 200, 100, 0] and layer["range_db"] == 4.0
+    x_min, x_max, *_ = layers.bounds_m(run)
+    assert x_min <= 5.0 and x_max >= run.residuals["receiver_x_m"].max()
+
+
+def test_flights_start_at_zero_and_keep_their_order(tmp_path):
+    tracks = pd.DataFrame({"flight": ["f0", "f0", "f1", "f1"], "uav": ["a", "a", "a", "b"],
+                           "time_s": [12.0, 10, 50, 51], "x_m": [2.0, 1, 3, 4], "y_m": 0.0, "z_m": np.nan})
+    first, second = layers.flight_layer(Run(tmp_path, tracks=tracks))
+    assert (first["name"], first["start_s"], first["end_s"]) == ("f0", 10, 2) and len(second["uavs"]) == 2
+    assert unpacked(first["uavs"][0]["x"]).tolist() == [1, 2] and unpacked(second["uavs"][1]["t"]).tolist() == [1]

@@ -1,0 +1,149 @@
+"""The page in a real browser: it shows the run's own numbers, and its controls move what they say."""
+
+import numpy as np
+import pytest
+
+from radiotwin.radiomap import RadioMap
+from radiotwin.report import Run, read_run, write_report
+from radiotwin.scene.citymap import CityMap
+from radiotwin.twin import Twin, TwinDevice
+
+BUTTONS = ("oblique", "above")
+
+
+@pytest.fixture(scope="module")
+def run(run_folder):
+    return read_run(run_folder)
+
+
+@pytest.fixture(scope="module")
+def path(run, tmp_path_factory):
+    path = tmp_path_factory.mktemp("page") / "report.html"
+    write_report(run, path)
+    return path
+
+
+def choose(page, control, label):
+    page.select_option(f"#control-{control}", label=label)
+
+
+def shown_db(page):
+    """Levels of the slice as the page has them; None where nothing is detected."""
+    return np.array(page.evaluate("levelsOf(view())"), dtype=float)
+
+
+def test_each_device_and_altitude_shows_its_own_map(opened, run, path, pixels, tmp_path):
+    page, truth = opened(path), run.maps["truth"]
+    pictures = []
+    for device, z in (("d0", 0), ("d3", 0), ("d3", 1)):
+        choose(page, "view", "truth: gain")
+        choose(page, "device", device)
+        choose(page, "altitude", f"{truth.lattice.z_m[z]:g} m")
+        expected_db = truth.gain_db[truth.devices.index(device), z].ravel()
+        assert 0 < np.isnan(expected_db).sum() < len(expected_db)
+        np.testing.assert_allclose(shown_db(page), expected_db, atol=0.006)
+        opacity = np.array(page.evaluate("[...stage.slice.material.map.image.data]")).reshape(-1, 4)[:, 3]
+        np.testing.assert_array_equal(opacity > 0, np.isfinite(expected_db))
+        pictures.append(pixels(page))
+    for one, other in zip(pictures, pictures[1:]):
+        assert (np.abs(one - other).max(axis=-1) > 20).mean() > 0.02, "the picture changes with the selectors"
+    picture = tmp_path / "report.png"
+    page.screenshot(path=picture, full_page=True)
+    assert picture.stat().st_size > 20_000
+
+
+def test_line_of_sight_and_the_residual_are_shown(opened, run, path):
+    page, truth, twin = opened(path), run.maps["truth"], run.maps["twin"]
+    choose(page, "view", "truth: line of sight")
+    choose(page, "device", "d5")
+    np.testing.assert_array_equal(shown_db(page), truth.los[truth.devices.index("d5"), 0].ravel())
+    choose(page, "view", "twin: residual (model − truth)")
+    assert page.evaluate("control('device').selectedOptions[0].text") == "d5", "a chosen device stays chosen"
+    error_db = (twin.gain_db[twin.devices.index("d5"), 0] - truth.gain_db[truth.devices.index("d5"), 0]).ravel()
+    np.testing.assert_allclose(shown_db(page), error_db, atol=0.02)
+
+
+def test_the_slider_moves_the_uavs(opened, run, path, pixels):
+    page = opened(path)
+    tracks = run.tracks
+    second = tracks[tracks["flight"] == "f1"]
+    start_s, end_s = second["time_s"].min(), second["time_s"].max()
+    choose(page, "flight", "f1")
+    pictures = []
+    for share in (0.0, 0.31, 1.0):
+        time_s = share * (end_s - start_s)
+        page.evaluate("time => { control('time').value = time; control('time').oninput(); }", time_s)
+        time_s = page.evaluate("chosen('time')")  # the slider has a thousand steps
+        for uav in page.evaluate("uavsNow()"):
+            track = second[second["uav"] == uav["name"]]
+            expected_m = [np.interp(start_s + time_s, track["time_s"], track[f"{axis}_m"]) for axis in "xyz"]
+            np.testing.assert_allclose(uav["place"], expected_m, atol=0.01)
+        pictures.append(pixels(page))
+    assert page.inner_text("#control-clock") == f"{end_s - start_s:.0f} of {end_s - start_s:.0f} s"
+    for one, other in zip(pictures, pictures[1:]):
+        assert (np.abs(one - other).max(axis=-1) > 20).sum() > 100
+    page.click("#control-play")
+    page.wait_for_timeout(200)
+    assert 0 < page.evaluate("chosen('time')") < end_s - start_s
+
+
+def test_the_city_turns_and_zooms(opened, path, pixels):
+    page = opened(path)
+    before = pixels(page)
+    box = page.locator("#viewer").bounding_box()
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 120, middle[1] + 30, steps=3)
+    page.mouse.up()
+    turned = pixels(page)
+    far_m = page.evaluate("stage.far")
+    page.mouse.wheel(0, -400)
+    page.wait_for_timeout(200)
+    assert page.evaluate("stage.far") < 0.9 * far_m
+    assert (np.abs(turned - before).max(axis=-1) > 20).mean() > 0.1
+    assert (np.abs(pixels(page) - turned).max(axis=-1) > 20).mean() > 0.1
+    for button in BUTTONS:
+        page.click(f"#control-{button}")
+    page.mouse.move(*middle)
+    text = page.inner_text("#control-hover")
+    assert "m: " in text and ("dB" in text or "not detected" in text)
+    page.uncheck("#control-buildings")
+    assert page.evaluate("stage.city.visible") is False
+
+
+def test_names_from_a_file_are_never_run(opened, tmp_path):
+    name = "</script><img src=x onerror=\"document.title='run'\"><b>"
+    devices = [TwinDevice(name, 10.0, 20.0, 1.5, "unknown", True, 4.0, None),
+               TwinDevice("a", 0.0, 0.0, 1.5, "anchor", True, 0.0, None)]
+    write_report(Run(tmp_path, twin=Twin(None, devices, "gain_db", None)), tmp_path / "page.html")
+    page = opened(tmp_path / "page.html")
+    assert page.title() == f"radiotwin: {tmp_path.name}" and page.locator("img").count() == 0
+    assert name in page.inner_text("table"), "it is shown as it is"
+
+
+def test_a_city_like_munich_is_small_and_quick(opened, run, tmp_path):
+    # 3,300 houses of 12 triangles on 1.4 km², as many as Sionna RT's Munich has, and twelve devices on 3 x 71 x 71.
+    side = np.linspace(0, 1400, 58)[:-1]
+    x_m, y_m = (axis.ravel() for axis in np.meshgrid(side, side))
+    corner = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)])
+    size_m = np.column_stack([np.full((len(x_m), 2), 17.0), 8 + (x_m * 7 + y_m * 13) % 25])
+    vertices_m = np.column_stack([x_m, y_m, 0 * x_m])[:, None] + corner * size_m[:, None]
+    faces = np.array([(0, 1, 3), (0, 3, 2), (4, 5, 7), (4, 7, 6), (0, 1, 5), (0, 5, 4), (2, 3, 7), (2, 7, 6),
+                      (0, 2, 6), (0, 6, 4), (1, 3, 7), (1, 7, 5)])
+    extent = {"x_min_m": 0.0, "x_max_m": 1400.0, "y_min_m": 0.0, "y_max_m": 1400.0}
+    config = run.scene.config
+    scene = type(run.scene)(run.scene.folder, config.model_copy(update={
+        "extent": config.extent.model_copy(update=extent),
+        "lattice": config.lattice.model_copy(update={"altitudes_m": [35.0, 40.0, 45.0]})}))
+    scene.__dict__["city"] = CityMap(vertices_m.reshape(-1, 3),
+                                     (8 * np.arange(len(x_m))[:, None, None] + faces).reshape(-1, 3))
+    names = [f"d{n}" for n in range(12)]
+    level_db = -60 - 50 * np.random.default_rng(0).random((12, *scene.lattice.shape))
+    radio_map = RadioMap.build(names, scene.lattice, level_db, level_db > -90, sigma_db=np.ones_like(level_db))
+    large = Run(tmp_path, scene=scene, maps={"truth": radio_map, "twin": radio_map}, tracks=run.tracks)
+    write_report(large, tmp_path / "page.html")
+    assert (tmp_path / "page.html").stat().st_size < 15e6
+    page = opened(tmp_path / "page.html")
+    # 3 to 5 seconds on two busy cores without a graphics card (1.7 seconds of computing); tests share theirs.
+    assert float(page.evaluate("document.body.dataset.readyMs")) < 20_000

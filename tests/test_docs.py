@@ -1,0 +1,24 @@
+"""The documentation site builds without a single warning."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_the_site_builds(tmp_path):
+    pytest.importorskip("mkdocs_jupyter", reason="the extra docs is not installed")
+    pytest.importorskip("mkdocstrings", reason="the extra docs is not installed")
+    result = subprocess.run(  # the examples have tests of their own
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-f", str(ROOT / "mkdocs.yml"), "-d",
+         str(tmp_path / "site")], cwd=tmp_path, capture_output=True, text=True,
+        env=os.environ | {"EXECUTE_EXAMPLES": "false", "NO_MKDOCS_2_WARNING": "1"})
+    assert result.returncode == 0, result.stderr
+    reference = (tmp_path / "site" / "reference" / "index.html").read_text(encoding="utf-8")
+    for name in ("radiotwin.twin.fit_twin", "radiotwin.radiomap.RadioMap.read", "marl.parallel_env.HarvestEnv"):
+        assert f'id="{name}"' in reference
+    assert "rt.trace_map" in (tmp_path / "site" / "examples" / "city_to_map" / "index.html").read_text(encoding="utf-8")
