@@ -44,11 +44,12 @@ def find_source(source: Path | str) -> Path:
     path = Path(source)
     if not path.is_file():
         raise BadInput(
-            f"{path} is not a file; give a Mitsuba or Sionna RT scene (.xml), or sionna:NAME with one of: "
+            f"{path} is not a file; give a map, a Mitsuba or Sionna RT scene (.xml), or sionna:NAME with one of: "
             f"{', '.join(sionna_scenes()) or '(sionna-rt is not installed)'}"
         )
     if path.suffix.lower() != ".xml":
-        raise BadInput(f"{path}: '{path.suffix}' is not read; give a Mitsuba or Sionna RT scene (.xml)")
+        raise BadInput(f"{path}: '{path.suffix}' is not read; give a map (.osm, .osm.pbf, .geojson, .gpkg) or a "
+                       "Mitsuba or Sionna RT scene (.xml)")
     return path
 
 
