@@ -52,13 +52,14 @@ def opened(browser):
     pages, wrong = [], []
 
     def open_page(path):
-        page = browser.new_page(viewport={"width": 900, "height": 700})
+        page = browser.new_page(viewport={"width": 720, "height": 560})
         page.on("console", lambda message: wrong.append(message.text) if message.type in ("error", "warning") else None)
         page.on("pageerror", lambda error: wrong.append(str(error)))
         page.on("request", lambda request: wrong.append(request.url) if request.url != path.as_uri() else None)
+        page.set_default_timeout(120_000)  # machines that run tests may be busy
         pages.append(page)
         page.goto(path.as_uri())
-        page.wait_for_selector("body[data-ready-ms]", timeout=60_000)
+        page.wait_for_selector("body[data-ready-ms]")
         return page
 
     yield open_page
