@@ -1,7 +1,7 @@
 """Replicas that learn side by side: one in this process, several in a process each.
 
-Processes, because three of them use two cores a quarter better than three threads do (`benchmarks/marl_speed.py`). Where
-this process may use one core only, they learn one after the other in it, which comes to the same.
+Processes, because three of them use two cores a quarter better than three threads do (`benchmarks/marl_speed.py`).
+Where this process may use one core only, they learn one after the other in it, which comes to the same.
 """
 
 import multiprocessing

@@ -1,3 +1,2 @@
-from pathlib import Path
 def write_report(study, out, figures):
     return []

@@ -198,5 +198,6 @@ def _check(run: Run) -> None:
         return
     for name, value in run.settings.items():
         for each in value if isinstance(value, list) else [value]:
-            if isinstance(each, int | float) and (each < 0 or (each == 0 and name not in ("noise_db", "epsilon_slots"))):
-                raise BadInput(f"--set {name}={each}: it must be above 0")
+            least = 0 if name in ("noise_db", "epsilon_slots") else 1
+            if isinstance(each, int | float) and each < least:
+                raise BadInput(f"--set {name}={each}: allowed is {least} or more")

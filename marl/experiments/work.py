@@ -18,9 +18,9 @@ from marl.threads import keep_memory, limit_threads
 from radiotwin.cli.console import complain, say, show_warnings_plainly
 from radiotwin.errors import BadInput, RunFailed
 
-
-KINDS = {"learning": ("learning", "learn"), "twin quality": ("twins", "judge_twin"), "trained in": ("twins", "train_in"),
-         "disturbed": ("disturbances", "fly_disturbed")}
+KINDS = {"learning": ("learning", "learn"), "twin quality": ("twins", "judge_twin"),
+         "trained in": ("twins", "train_in"), "disturbed": ("disturbances", "fly_disturbed")}
+"""Kind of a run -> module in this package, and function."""
 
 
 class Clock:
@@ -127,7 +127,7 @@ def _claimed(run: Run, out: Path) -> Iterator[bool]:
 
 
 def _do(run: Run, out: Path, place: str) -> None:
-    copied = earlier_result(run)
+    copied = earlier_result(run, out)
     if copied is not None:
         result, cpu_s, wall_s, source = copied
         write_record(run, out, result, cpu_s, wall_s, taken_from=source)
