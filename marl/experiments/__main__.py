@@ -54,6 +54,9 @@ def _run(given: argparse.Namespace) -> None:
     scenes = given.scenes.split(",")
     plans = {}
     for name in STUDIES if given.name == "all" else [given.name]:
+        if STUDIES[name].runs is None:
+            plans[name] = []
+            continue
         runs = STUDIES[name].runs(scenes, seeds)
         if given.only:
             runs = [run for run in runs if any(part in run.name for part in given.only.split(","))]
@@ -64,7 +67,7 @@ def _run(given: argparse.Namespace) -> None:
     if not given.report:
         _check_scenes(scenes)
     for name, runs in plans.items():
-        if not given.report:
+        if runs and not given.report:
             from marl.experiments.work import do_runs  # torch and all: not for --help
 
             done = sum(finished(run, given.out) for run in runs)
@@ -78,7 +81,7 @@ def _run(given: argparse.Namespace) -> None:
         from marl.experiments.report import write_report
 
         figures = FIGURES if given.out == OUT else given.out / "figures"
-        for path in write_report(name, given.out, figures):
+        for path in write_report(name, STUDIES[name].question, given.out, figures):
             say(f"wrote {path}")
 
 

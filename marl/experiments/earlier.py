@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from marl.experiments.records import Run, read_record
+from marl.experiments.records import Run, read_record, same
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "docs" / "results"
 _OWN = ("schema", "study", "name", "kind", "seed", "version", "code", "machine", "cpu_s", "wall_s", "taken_from",
@@ -21,13 +21,13 @@ def earlier_result(run: Run, out: Path) -> tuple[dict, float, float, str] | None
     """
     for path in sorted(out.glob(f"*/*-s{run.seed}.json")):
         record = read_record(path)
-        if (record["kind"], record["seed"], record["settings"]) == (run.kind, run.seed, run.settings):
+        if record["seed"] == run.seed and same(run, record["kind"], record["settings"]):
             result = {name: value for name, value in record.items() if name not in _OWN}
             return result, record["cpu_s"], record["wall_s"], f"{record['study']}/{path.name}"
     if run.kind == "learning" and run.settings["run"]["truth"] == "traced":
         for path in sorted(BENCHMARKS.glob("marl_*_traced_*.json")):
             record = json.loads(path.read_text(encoding="utf-8"))
-            for done in record["runs"] if record["settings"] == run.settings else ():
+            for done in record["runs"] if same(run, "learning", record["settings"]) else ():
                 if done["seed"] == run.seed:
                     return {"curve": done["rows"]}, done["cpu_s"], done["wall_s"], path.name
     return None

@@ -13,6 +13,7 @@ import numpy as np
 
 import marl
 import radiotwin
+from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 
@@ -56,8 +57,8 @@ def finished(run: Run, out: Path) -> bool:
     if not path.is_file():
         return False
     record = read_record(path)
-    if record["settings"] != run.settings or record["kind"] != run.kind:
-        differ = _difference(record["settings"], run.settings)
+    if not same(run, record["kind"], record["settings"]):
+        differ = _difference(filled(record["kind"], record["settings"]), run.settings)
         raise BadInput(f"{path} holds a run with other settings ({differ}); give another --out, or remove the file")
     return True
 
@@ -75,6 +76,19 @@ def write_record(run: Run, out: Path, result: dict, cpu_s: float, wall_s: float,
               "cpu_s": round(cpu_s, 1), "wall_s": round(wall_s, 1), **more, "settings": run.settings, **plain(result)}
     with atomic_path(run.path(out)) as temporary:
         temporary.write_text(_lines(record), encoding="utf-8")
+
+
+def same(run: Run, kind: str, settings: dict) -> bool:
+    """Whether these are the settings of a run."""
+    return kind == run.kind and filled(kind, settings) == filled(run.kind, run.settings)
+
+
+def filled(kind: str, settings: dict) -> dict:
+    """Settings with the defaults of those that did not exist when they were written."""
+    if kind != "learning":
+        return settings
+    defaults = RunSettings().model_dump(mode="json", exclude={"seed", "compare"})
+    return {"run": defaults | settings["run"], "learner": LearnerSettings().model_dump() | settings["learner"]}
 
 
 def read_record(path: Path) -> dict:

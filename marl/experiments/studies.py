@@ -22,11 +22,11 @@ class Study:
 
     Attributes:
         question: in a line.
-        runs: (scenes, seeds) -> runs, the most telling ones first.
+        runs: (scenes, seeds) -> runs, the most telling ones first; None where there is nothing to run.
     """
 
     question: str
-    runs: Callable[[list[str], int], list[Run]]
+    runs: Callable[[list[str], int], list[Run]] | None
 
 
 def curve(scenes: list[str], seeds: int) -> list[Run]:
@@ -104,8 +104,9 @@ def tuning(scenes: list[str], seeds: int) -> list[Run]:
     """What might bring model-aided learning nearer to the planner, one change at a time."""
     changes = {"as-it-is": {}, "lambda-0.6": {"td_lambda": 0.6}, "lambda-0.95": {"td_lambda": 0.95},
                "target-100": {"target_every": 100}, "epsilon-60k": {"epsilon_slots": 60_000},
-               "replay-800": {"replay": 800}, "guide": {}, "episodes-1600": {}}
-    run_changes = {"guide": {"guide": "planner"}, "episodes-1600": {"episodes": 1600}}
+               "replay-800": {"replay": 800}, "guide": {}, "measure": {}, "measure-guide": {}, "episodes-1600": {}}
+    run_changes = {"guide": {"guide": "planner"}, "measure": {"measure": "planner"},
+                   "measure-guide": {"measure": "planner", "guide": "planner"}, "episodes-1600": {"episodes": 1600}}
     return [learning("tuning", scene, "traced", seed, "qmix", changes=learner, name=name, **run_changes.get(name, {}))
             for seed in range(seeds) for scene in scenes for name, learner in changes.items()]
 
@@ -117,6 +118,7 @@ STUDIES = {
     "quality": Study("How good is the twin after how many real episodes?", quality),
     "pays": Study("Where does learning pay?", pays),
     "tuning": Study("What brings the learner nearer to the planner?", tuning),
+    "closeloop": Study("What does close-loop find? (a table of docs/results/*.json; nothing is run)", None),
 }
 
 
