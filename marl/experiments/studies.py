@@ -150,8 +150,8 @@ def with_settings(runs: list[Run], given: list[str]) -> list[Run]:
     """
     for text in given:
         name, equals, value = text.partition("=")
-        changed = [_changed(run, name, value) for run in runs]
-        if not equals or all(run is None for run in changed):
+        changed = [_changed(run, name, value) if equals else None for run in runs]
+        if all(run is None for run in changed):
             names = sorted({each for run in runs for group in _groups(run) for each in group})
             raise BadInput(f"--set {text}: give NAME=VALUE with one of {', '.join(names)}")
         runs = [new or old for new, old in zip(changed, runs)]

@@ -2,6 +2,7 @@
 
 from collections import defaultdict
 from itertools import groupby
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -44,7 +45,7 @@ def worlds(records: list[dict]) -> dict[tuple[str, str], dict[str, list[dict]]]:
     found: dict[tuple[str, str], dict[str, list[dict]]] = defaultdict(dict)
     for name, seeds in by_name(records).items():
         run = seeds[0]["settings"]["run"]
-        scene, truth = name.split("-")[0], run["truth"]
+        scene, truth = Path(run["scene"]).name, run["truth"]
         found[truth, scene][name.removeprefix(f"{scene}-{truth}-")] = seeds
     return dict(sorted(found.items(), key=lambda item: (item[0][0] != "traced", item[0][1])))
 
@@ -53,8 +54,8 @@ def scenes(records: list[dict]) -> dict[str, dict[str, list[dict]]]:
     """Scene -> name without it -> seeds, of the other runs."""
     found: dict[str, dict[str, list[dict]]] = defaultdict(dict)
     for name, seeds in by_name(records).items():
-        scene, rest = name.split("-", 1)
-        found[scene][rest] = seeds
+        scene = Path(seeds[0]["settings"]["scene"]).name
+        found[scene][name.removeprefix(f"{scene}-")] = seeds
     return dict(found)
 
 
