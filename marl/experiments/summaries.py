@@ -62,7 +62,8 @@ def scenes(records: list[dict]) -> dict[str, dict[str, list[dict]]]:
 def quantiles(errors_m: list[float | None]) -> tuple[float, float, float, float]:
     """Median, 90 % and worst of distances [m], and the share above 100 m; a device without estimate counts as far."""
     errors = np.array([np.inf if error is None else error for error in errors_m], dtype=float)
-    return (float(np.median(errors)), float(np.quantile(errors, 0.9, method="higher")), float(errors.max()),
+    method = "linear" if np.isfinite(errors).all() else "higher"  # nothing lies between a number and infinity
+    return (float(np.median(errors)), float(np.quantile(errors, 0.9, method=method)), float(errors.max()),
             float(np.mean(errors > 100)))
 
 

@@ -17,6 +17,7 @@ from marl.experiments.records import Run, finished, write_record
 from marl.threads import keep_memory, limit_threads
 from radiotwin.cli.console import complain, say, show_warnings_plainly
 from radiotwin.errors import BadInput, RunFailed
+from radiotwin.files import atomic_path
 
 KINDS = {"learning": ("learning", "learn"), "twin quality": ("twins", "judge_twin"),
          "trained in": ("twins", "train_in"), "disturbed": ("disturbances", "fly_disturbed")}
@@ -42,7 +43,8 @@ class Clock:
 
     def keep(self) -> None:
         """Write down what was needed so far; to be called where the run would go on from."""
-        self._path.write_text(" ".join(f"{each:.3f}" for each in self.seconds()))
+        with atomic_path(self._path) as temporary:
+            temporary.write_text(" ".join(f"{each:.3f}" for each in self.seconds()))
 
 
 def do_runs(runs: list[Run], out: Path, jobs: int) -> None:

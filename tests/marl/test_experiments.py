@@ -72,7 +72,8 @@ def test_a_killed_study_goes_on_and_repeats_nothing(curve, tmp_path, capsys):
     process = start([*words, "--out", "killed"], tmp_path)
     folder = tmp_path / "killed" / "curve"
     checkpoint = folder / "unfinished" / "small-segmented-planner-nn-s0" / "checkpoint.pt"
-    while process.poll() is None and not checkpoint.exists():  # the learner is done, the planner has flown
+    seconds = checkpoint.parent / "seconds"
+    while process.poll() is None and not seconds.exists():  # the learner is done, the planner has flown
         time.sleep(0.02)
     process.send_signal(signal.SIGKILL)
     process.communicate(timeout=60)
@@ -80,7 +81,7 @@ def test_a_killed_study_goes_on_and_repeats_nothing(curve, tmp_path, capsys):
     rounds = len(load_checkpoint(checkpoint)["rows"])
     finished = folder / "small-segmented-iql-truth-s0.json"
     before = finished.stat().st_mtime_ns
-    kept_s = float((checkpoint.parent / "seconds").read_text().split()[1])
+    kept_s = float(seconds.read_text().split()[1])
     capsys.readouterr()
     assert main([*words, "--resume", "--out", str(tmp_path / "killed")]) == 0
     out = capsys.readouterr().out

@@ -128,7 +128,7 @@ def test_curves_are_means_over_seeds_and_say_what_a_ratio_takes():
 
 
 def test_a_device_without_estimate_counts_as_far_away():
-    assert quantiles([1.0, 2.0, 3.0]) == (2.0, 3.0, 3.0, 0.0)
+    assert quantiles([1.0, 2.0, 3.0]) == pytest.approx((2.0, 2.8, 3.0, 0.0))
     median, most, worst, far = quantiles([1.0, 2.0, None, 150.0])
     assert (median, worst, far) == (76.0, np.inf, 0.5) and most == np.inf
 
