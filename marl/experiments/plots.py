@@ -71,11 +71,10 @@ def quality_figure(records: list[dict]) -> Figure:
             _line(left, curve, MODELS[name], number)
             errors = [quantiles([error for record in runs[name] for error in record["curve"][at]["location_errors_m"]])
                       for at in range(len(curve.x))]
-            right.plot(curve.x, [each[0] for each in errors], marker=MARKERS[number], color=colour,
-                       label=f"{MODELS[name]}: median")
-            right.plot(curve.x, [each[1] for each in errors], ":", color=colour, label=f"{MODELS[name]}: 90 %")
+            right.plot(curve.x, [each[0] for each in errors], marker=MARKERS[number], markersize=4, color=colour)
+            right.plot(curve.x, [each[1] for each in errors], ":", color=colour)
         left.set(ylabel="RMSE of the map [dB]", ylim=(0, None))
-        right.set(ylabel="error of unknown devices' positions [m]", yscale="log")
+        right.set(ylabel="error of positions [m]: median, dotted 90 %", yscale="log")
         for axes in (left, right):
             axes.set(xlabel="real episodes", xscale="log", title=f"{scene}, ray-traced truth")
             axes.set_xticks(curve.x, [f"{x:.0f}" for x in curve.x], minor=False)
