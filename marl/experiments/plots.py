@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from marl.experiments.summaries import over_seeds, quantiles, scenes, worlds
+from marl.experiments.summaries import over_seeds, quantiles, scenes, shown, worlds
 from marl.experiments.tables import LABELS, LEVELS, METHODS, MODELS, SCENARIOS, TWINS
 from marl.figures import COLOURS, LEVEL_STYLES, MARKERS
 
@@ -23,7 +23,7 @@ def curve_figure(records: list[dict]) -> Figure:
             if name in runs:
                 axes.axhline(over_seeds(runs[name]).mean[-1], color="black", linestyle=style, linewidth=1.1,
                              label=LABELS[name])
-        axes.set(xscale="log", ylim=(0, 1.02), xlabel="real episodes", ylabel=RATIO, title=f"{scene}, {truth} truth")
+        axes.set(xscale="log", ylim=(0, 1.02), xlabel="real episodes", ylabel=RATIO, title=shown(scene, truth))
         axes.grid(alpha=0.3)
     return _legend(figure, panels, 3)
 
@@ -39,7 +39,7 @@ def federation_figure(records: list[dict]) -> Figure:
                 replicas = 3 if name.startswith("fedqmix") and share else 1
                 _line(axes, curve._replace(x=curve.x / replicas), name, number)
             axes.set(xlabel="simulated episodes of a replica" if share else "simulated episodes of all replicas",
-                     ylabel=RATIO, title=f"{scene}, {truth} truth")
+                     ylabel=RATIO, title=shown(scene, truth))
             axes.grid(alpha=0.3)
     return _legend(figure, panels, 3)
 

@@ -22,6 +22,8 @@ TABLES = {"curve": tables.curve_table, "federation": tables.federation_table, "t
 FIGURES = {"curve": plots.curve_figure, "federation": plots.federation_figure, "twin": plots.twin_figure,
            "quality": plots.quality_figure, "pays": plots.pays_figure}
 
+FIGURE_DPI, TRAJECTORY_DPI = 100, 80  # so that no picture has more than 200 kB
+
 
 def write_report(study: str, question: str, out: Path, figures: Path) -> list[Path]:
     """Write OUT/STUDY.md and the study's figures.
@@ -51,7 +53,7 @@ def write_report(study: str, question: str, out: Path, figures: Path) -> list[Pa
     written = [_write(path, f"{head}{tables.provenance(records)}\n\n{TABLES[study](records)}\n")]
     if study in FIGURES:
         written.append(figures / f"{study}.png")
-        save(FIGURES[study](records), written[-1])
+        save(FIGURES[study](records), written[-1], FIGURE_DPI)
     if study == "curve":
         written += _trajectories(records, figures)
     return written
@@ -75,7 +77,7 @@ def _trajectories(records: list[dict], figures: Path) -> list[Path]:
             mission = make_mission(scene, segmented_truth(scene), known)
             written.append(figures / f"trajectories-{scene.config.name}.png")
             save(trajectories_figure(scene, mission, _flight(record["flight"], mission.devices, mission), 0, known),
-                 written[-1], dpi=80)
+                 written[-1], TRAJECTORY_DPI)
     return written
 
 

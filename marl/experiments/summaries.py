@@ -50,6 +50,11 @@ def worlds(records: list[dict]) -> dict[tuple[str, str], dict[str, list[dict]]]:
     return dict(sorted(found.items(), key=lambda item: (item[0][0] != "traced", item[0][1])))
 
 
+def shown(scene: str, truth: str) -> str:
+    """A world in words."""
+    return f"{scene.replace('paper_', 'the paper’s ')}, {'ray-traced' if truth == 'traced' else 'statistical'} truth"
+
+
 def scenes(records: list[dict]) -> dict[str, dict[str, list[dict]]]:
     """Scene -> name without it -> seeds, of the other runs."""
     found: dict[str, dict[str, list[dict]]] = defaultdict(dict)

@@ -2,7 +2,17 @@
 
 import numpy as np
 
-from marl.experiments.summaries import by_name, mean_of, number, over_seeds, quantiles, scenes, with_spread, worlds
+from marl.experiments.summaries import (
+    by_name,
+    mean_of,
+    number,
+    over_seeds,
+    quantiles,
+    scenes,
+    shown,
+    with_spread,
+    worlds,
+)
 
 LABELS = {"fedqmix-nn": "model-aided FedQMIX", "qmix-nn": "model-aided QMIX", "qmix-truth": "QMIX on real episodes",
           "iql-truth": "IQL on real episodes", "planner-nn": "planner in the NN twin",
@@ -38,18 +48,25 @@ def curve_table(records: list[dict]) -> str:
                          "" if name in LEVELS else number(curve.needed(target), 0), str(curve.seeds),
                          number(mean_of(runs[name], "cpu_s"), 0)])
         heads = ["", "real episodes", "collected at the end", f"real episodes to {target:.3f}", "seeds", "CPU s each"]
-        text = f"**{scene}, {truth} truth**\n\n{markdown(heads, rows)}"
-        aided, real = (curves[name].needed(target) if name in curves else np.nan
-                       for name in ("fedqmix-nn", "qmix-truth"))
-        if aided == aided and real == real:
-            text += (f"\n\nThe same {target:.3f} takes {aided:.0f} real episodes with a twin and FedQMIX and at most "
-                     f"{real:,.0f} without a twin: a factor of {real / aided:,.0f} or less.")
-        parts.append(text)
+        text = f"**{shown(scene, truth)}**\n\n{markdown(heads, rows)}"
+        parts.append(text + factors(curves, target))
     return "\n\n".join(parts) + (
         "\n\n±: standard deviation over seeds. \"Real episodes to\": the first round whose mean over seeds is as high; "
         f"the ratio is {ENOUGH:.0%} of what both model-aided FedQMIX and QMIX on real episodes reach at least. Rounds "
         "of training in the truth are 800 episodes and the flights that choose the policy, so there that column is an "
         "upper bound.")
+
+
+def factors(curves: dict, target: float) -> str:
+    """How many times as many real episodes QMIX needs without a twin."""
+    real = curves["qmix-truth"].needed(target) if "qmix-truth" in curves else np.nan
+    told = []
+    for name in ("fedqmix-nn", "qmix-nn", "planner-nn"):
+        if name in curves and real == real:
+            aided = curves[name].needed(target)
+            told.append(f"{LABELS[name]} {aided:.0f} (a factor of {real / aided:,.0f})" if aided == aided else
+                        f"{LABELS[name]} does not reach it in {curves[name].x[-1]:.0f}")
+    return f"\n\nQMIX without a twin takes {real:,.0f} or fewer for {target:.3f}; {'; '.join(told)}." if told else ""
 
 
 def common_ratio(curves: dict) -> float:
@@ -154,7 +171,7 @@ def tuning_table(records: list[dict]) -> str:
         rows = [[name, with_spread([record["curve"][-1]["truth_ratio"] for record in seeds]),
                  number(np.mean([record["curve"][-1]["location_error_worst_m"] for record in seeds]), 0),
                  str(len(seeds))] for name, seeds in runs.items()]
-        parts.append(f"**{scene}, {truth} truth, model-aided QMIX**\n\n"
+        parts.append(f"**{shown(scene, truth)}, model-aided QMIX**\n\n"
                      + markdown(["change", "collected", "worst position error at the end [m]", "seeds"], rows))
     return "\n\n".join(parts)
 

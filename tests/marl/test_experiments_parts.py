@@ -91,12 +91,14 @@ def test_every_run_of_every_study_has_its_own_file():
             assert {run.seed for run in runs} == {0, 1, 2}
 
 
-def test_runs_of_the_benchmark_are_taken_in_the_traced_truth_only(tmp_path):
+def test_runs_of_the_benchmark_are_taken_where_they_flew_over_the_same_map(tmp_path):
     run = learning("curve", "rbm", "traced", 1, "qmix")
     result, cpu_s, _, source = earlier.earlier_result(run, tmp_path)
     kept = json.loads((RESULTS / source).read_text())["runs"][1]
     assert result["curve"] == kept["rows"] and cpu_s == kept["cpu_s"]
     assert earlier.earlier_result(learning("curve", "rbm", "segmented", 1, "qmix"), tmp_path) is None
+    of_the_paper = earlier.earlier_result(learning("curve", "runs/paper_rbm", "segmented", 1, "qmix"), tmp_path)
+    assert of_the_paper[3] == "marl_rbm_segmented_qmix.json"
     assert earlier.earlier_result(learning("curve", "rbm", "traced", 9, "qmix"), tmp_path) is None
     assert earlier.earlier_result(learning("curve", "rbm", "traced", 1, "qmix", episodes=801), tmp_path) is None
 
