@@ -41,8 +41,7 @@ lint: $(INSTALLED)
 	$(BIN)/ruff check
 
 bench: llvm
-	for benchmark in line_of_sight channel_fit localize marl_speed trace; do \
-		$(BIN)/python benchmarks/$$benchmark.py || exit 1; done
+	$(BIN)/python benchmarks/run.py
 
 # The second run does nothing, until what is to be installed has changed.
 $(INSTALLED): pyproject.toml constraints.txt
