@@ -49,8 +49,7 @@ docs: $(INSTALLED)
 	cd build/docs && OMP_NUM_THREADS=1 $(abspath $(BIN))/mkdocs build --strict -f $(CURDIR)/mkdocs.yml -d $(CURDIR)/site
 
 bench: llvm
-	for benchmark in line_of_sight channel_fit localize marl_speed trace; do \
-		$(BIN)/python benchmarks/$$benchmark.py || exit 1; done
+	$(BIN)/python benchmarks/run.py
 
 # The second run does nothing, until what is to be installed has changed.
 $(INSTALLED): pyproject.toml constraints.txt

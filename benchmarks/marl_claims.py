@@ -16,6 +16,7 @@ import numpy as np
 
 import radiotwin
 from marl.algorithm import run_algorithm
+from marl.experiments.records import filled
 from marl.fedqmix import settings_of
 from marl.options import add_options
 from marl.settings import LearnerSettings, RunSettings
@@ -47,7 +48,7 @@ def main() -> None:
     settings = {"run": run.model_dump(mode="json", exclude={"seed", "compare"}) | {"scene": run.scene.name},
                 "learner": learner.model_dump(mode="json")}
     record = json.loads(arguments.out.read_text()) if arguments.out.exists() else {"settings": settings, "runs": []}
-    if record["settings"] != settings:
+    if filled("learning", record["settings"]) != settings:
         raise SystemExit(f"{arguments.out} holds other settings; give another --out")
     for seed in range(len(record["runs"]), arguments.seeds):
         started, cpu_before = time.perf_counter(), cpu_s()

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from marl.checkpoint import folder_content, load_checkpoint, restore_folder, save_checkpoint
-from marl.flights import Flights, HeuristicPolicy
+from marl.flights import Flights, HeuristicPolicy, Policy
 from marl.mission import Known
+from marl.planner import PlanPolicy, plan
 from marl.randomness import stream
 from marl.reality import Reality, known_by, learn_twin, location_errors_m
 from marl.settings import LearnerSettings, RunSettings
@@ -85,8 +86,7 @@ def run_algorithm(run: RunSettings, learner: LearnerSettings, scene: Scene, trut
             if run.twin == "truth":
                 mission = reality.mission(known)
             else:
-                # The first flight is random: nothing is known yet.
-                reality.fly(strategy.policy(rng) if number else HeuristicPolicy("random", rng), known)
+                reality.fly(_measuring(run, reality, twin, known, strategy, rng), known)
                 twin = learn_twin(reality, run.twin, run.seed, twin)
                 known = known if run.privileged else known_by(twin)
                 mission = reality.twin_mission(twin, known)
@@ -118,6 +118,16 @@ def run_algorithm(run: RunSettings, learner: LearnerSettings, scene: Scene, trut
         return Outcome(rows, blocks, flights, known, twin)
     finally:
         strategy.close()
+
+
+def _measuring(run: RunSettings, reality: Reality, twin: Twin | None, known: Known, strategy: Strategy,
+               rng: np.random.Generator) -> Policy:
+    """What flies the next real episode."""
+    if twin is None:  # nothing is known yet
+        return HeuristicPolicy("random", rng)
+    if run.measure == "planner":
+        return PlanPolicy(plan(reality.twin_mission(twin, known), run.planner_iterations, run.seed).actions)
+    return strategy.policy(rng)
 
 
 def _row(run: RunSettings, strategy: Strategy, uavs: int, number: int, in_twin: np.ndarray, real: np.ndarray,

@@ -41,7 +41,7 @@ def draw_trajectories(scene: Scene, mission: Mission, flights: Flights, flight: 
         known: positions that the UAVs believed in.
         path: of the PNG file.
     """
-    _save(trajectories_figure(scene, mission, flights, flight, known), path)
+    save(trajectories_figure(scene, mission, flights, flight, known), path)
 
 
 def trajectories_figure(scene: Scene, mission: Mission, flights: Flights, flight: int, known: Known) -> Figure:
@@ -78,7 +78,7 @@ def draw_curve(curves: dict[str, list[dict]], levels: dict[str, float], path: Pa
         levels: name -> ratio of what needs no learning.
         path: of the PNG file.
     """
-    _save(curve_figure(curves, levels), path)
+    save(curve_figure(curves, levels), path)
 
 
 def curve_figure(curves: dict[str, list[dict]], levels: dict[str, float]) -> Figure:
@@ -167,6 +167,7 @@ def _legend() -> list[Line2D]:
             Line2D([], [], color=IDLE_COLOUR, linewidth=2.4, label="no device serves the UAV")]
 
 
-def _save(figure: Figure, path: Path | str) -> None:
+def save(figure: Figure, path: Path | str, dpi: int = DPI) -> None:
+    """Write a figure as PNG, whole or not at all."""
     with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=DPI)
+        figure.savefig(temporary, dpi=dpi)

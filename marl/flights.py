@@ -33,7 +33,7 @@ class Flights:
 
     def ratio(self, mission: Mission) -> np.ndarray:
         """(E,) collected data of all the data that waited."""
-        return self.collected.sum(axis=(1, 2), dtype=float) / mission.data_units.sum()
+        return self.collected.sum(axis=(1, 2), dtype=float) / self.frames.data_units[:, 0].sum(axis=1, dtype=float)
 
 
 def track_table(scene: Scene, mission: Mission, flights: Flights, flight: int) -> pd.DataFrame:

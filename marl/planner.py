@@ -4,6 +4,7 @@ It knows the radio map and nothing else: where a device is does not matter, only
 its expectation: each slot counts with what it gives on average.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -26,10 +27,14 @@ class Plan(NamedTuple):
     Attributes:
         actions: (T, U) int8; feasible from take-off until all batteries are empty.
         ratio: expected share of the data that it collects in the map that it was planned in.
+        tour: (U, MOST_WAYPOINTS, 3) int64 waypoints (row, column, hovers) that the actions come of.
+        count: (U,) int64 waypoints of each UAV.
     """
 
     actions: np.ndarray
     ratio: float
+    tour: np.ndarray
+    count: np.ndarray
 
 
 class PlanPolicy:
@@ -57,20 +62,39 @@ def plan(mission: Mission, iterations: int, seed: int) -> Plan:
     """
     rng = stream(seed, "planning")
     value = expected_data(mission)
-    peaks = np.stack(np.unravel_index(value.reshape(*value.shape[:2], -1).argmax(axis=2), value.shape[2:]), axis=-1)
-    tour = np.zeros((mission.uavs, MOST_WAYPOINTS, 3), dtype=np.int64)  # row, column, hovers
+    tour = np.zeros((mission.uavs, MOST_WAYPOINTS, 3), dtype=np.int64)
     count = np.zeros(mission.uavs, dtype=np.int64)
+    with progress("planning", total=iterations) as advance:
+        return improve(mission, value, tour, count, iterations, rng, advance=advance)
+
+
+def improve(mission: Mission, value: np.ndarray, tour: np.ndarray, count: np.ndarray, iterations: int,
+            rng: np.random.Generator, *, only: int = -1, hot: float = HOT,
+            advance: Callable[[int], None] = lambda _: None) -> Plan:
+    """Search on from a tour.
+
+    Args:
+        mission: where the UAVs are, what they have left, and what is thought to be left at the devices.
+        value: `expected_data` of its map.
+        tour, count: see `Plan`; not changed.
+        iterations: plans that are tried.
+        rng: of the search.
+        only: the UAV whose tour is changed, while the others keep theirs; -1 for all.
+        hot: temperature at the start, in collection ratio.
+        advance: called with the number of plans tried.
+    """
+    peaks = np.stack(np.unravel_index(value.reshape(*value.shape[:2], -1).argmax(axis=2), value.shape[2:]), axis=-1)
+    tour, count = tour.copy(), count.copy()
     best_tour, best_count = tour.copy(), count.copy()
     actions = np.full((mission.longest, mission.uavs), NO_OP, dtype=np.int8)
     score = best = _fly_tour(mission, value, tour, count, actions)
-    with progress("planning", total=iterations) as advance:
-        for start in range(0, iterations, CHUNK):
-            stop = min(start + CHUNK, iterations)
-            score, best = _anneal(mission, value, peaks, tour, count, score, best_tour, best_count, best,
-                                  np.arange(start, stop) / iterations, actions, rng)
-            advance(stop - start)
+    for start in range(0, iterations, CHUNK):
+        stop = min(start + CHUNK, iterations)
+        score, best = _anneal(mission, value, peaks, tour, count, only, hot, score, best_tour, best_count, best,
+                              np.arange(start, stop) / iterations, actions, rng)
+        advance(stop - start)
     best = _fly_tour(mission, value, best_tour, best_count, actions)
-    return Plan(actions, float(best))
+    return Plan(actions, float(best), best_tour, best_count)
 
 
 def expected_data(mission: Mission) -> np.ndarray:
@@ -106,7 +130,7 @@ def _towards(mission, uav, row, column, to_row, to_column, mask):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _next_action(mission, uav, row, column, battery, tour, count, reached, hovered, mask):
+def next_action(mission, uav, row, column, battery, tour, count, reached, hovered, mask):
     """Follow the tour; where the battery does not allow that, or at its end, stay as long as possible, then go home.
 
     Returns:
@@ -152,7 +176,7 @@ def _fly_tour(mission, value, tour, count, actions):
             k = assigned[u]
             if k >= 0:
                 left[k] = max(left[k] - value[u, k, cell[u, 0], cell[u, 1]], 0.0)
-            action, reached[u], hovered[u] = _next_action(mission, u, cell[u, 0], cell[u, 1], battery[u], tour[u],
+            action, reached[u], hovered[u] = next_action(mission, u, cell[u, 0], cell[u, 1], battery[u], tour[u],
                                                           count[u], reached[u], hovered[u], mask)
             actions[slot, u] = action
             cell[u, 0] += MOVES[action, 0]
@@ -162,13 +186,16 @@ def _fly_tour(mission, value, tour, count, actions):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _anneal(mission, value, peaks, tour, count, score, best_tour, best_count, best, progress, actions, rng):
-    """Try a change at every step of `progress` (0 to 1); keep better ones, and worse ones with falling chance."""
+def _anneal(mission, value, peaks, tour, count, only, hot, score, best_tour, best_count, best, progress, actions, rng):
+    """Try a change at every step of `progress` (0 to 1); keep better ones, and worse ones with falling chance.
+
+    `only` is the UAV whose tour is changed, -1 for any; `hot` the temperature at the start.
+    """
     old_tour, old_count = tour.copy(), count.copy()
     for done in progress:
-        temperature = HOT * (COLD / HOT) ** done
+        temperature = hot * (COLD / hot) ** done
         old_tour[:], old_count[:] = tour, count
-        _change(tour, count, peaks, value.shape[2], value.shape[3], rng)
+        _change(tour, count, only, peaks, value.shape[2], value.shape[3], rng)
         new = _fly_tour(mission, value, tour, count, actions)
         if new >= score or rng.random() < np.exp((new - score) / temperature):
             score = new
@@ -181,9 +208,9 @@ def _anneal(mission, value, peaks, tour, count, score, best_tour, best_count, be
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _change(tour, count, peaks, rows, columns, rng):
+def _change(tour, count, only, peaks, rows, columns, rng):
     """One random change of one tour, or of two."""
-    u = rng.integers(0, len(count))
+    u = only if only >= 0 else rng.integers(0, len(count))
     n = count[u]
     kind = rng.random()
     if n < MOST_WAYPOINTS and (n == 0 or kind < 0.12):  # one more, where a device is heard best or anywhere
@@ -210,7 +237,7 @@ def _change(tour, count, peaks, rows, columns, rng):
         for i in range(3):
             tour[u, at, i], tour[u, other, i] = tour[u, other, i], tour[u, at, i]
     else:  # exchange with another UAV
-        v = rng.integers(0, len(count))
+        v = only if only >= 0 else rng.integers(0, len(count))
         if count[v] > 0:
             other = rng.integers(0, count[v])
             for i in range(3):

@@ -1,6 +1,7 @@
 """Replicas that learn side by side: one in this process, several in a process each.
 
 Processes, because three of them use two cores a quarter better than three threads do (`benchmarks/marl_speed.py`).
+Where this process may use one core only, they learn one after the other in it, which comes to the same.
 """
 
 import multiprocessing
@@ -10,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from marl.mission import Mission
 from marl.settings import LearnerSettings
-from marl.threads import keep_memory, limit_threads
+from marl.threads import keep_memory, limit_threads, usable_cores
 from marl.trainer import Trainer
 from radiotwin.errors import RunFailed
 
@@ -26,8 +27,9 @@ class Replicas:
     def __init__(self, count: int, settings: LearnerSettings, mission: Mission, horizon: int, seed: int,
                  device: str = "cpu"):
         arguments = [(settings, mission, horizon, seed, number, device) for number in range(count)]
-        self._replicas: list = [_Remote(*each) for each in arguments] if count > 1 else [_Local(*arguments[0])]
-        self._pool = ThreadPoolExecutor(count)  # only waits for the processes
+        here = count == 1 or usable_cores() == 1
+        self._replicas: list = [(_Local if here else _Remote)(*each) for each in arguments]
+        self._pool = ThreadPoolExecutor(1 if here else count)  # only waits for the processes, where there are any
 
     def call(self, method: str, *arguments, each: list | None = None) -> list:
         """Call a method of all trainers at once.

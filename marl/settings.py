@@ -66,6 +66,9 @@ class RunSettings(BaseModel):
                           description="episodes of training of each replica in a round; preset paper: 1000")
     guide: Literal["none", "planner"] = Field(
         "none", description="planner: some of the flights that a learner learns from follow a plan")
+    measure: Literal["policy", "planner"] = Field(
+        "policy", description="what flies the real episodes that a twin is learnt from: the present policy, or a plan "
+        "made in the twin; the first one is random")
     assignment: Literal["matching", "max-rate"] = Field(
         "matching", description="matching: strongest remaining pair first; max-rate: strictly each UAV's best device")
     privileged: bool = Field(False, description="agents see the true positions of the unknown devices")

@@ -1,6 +1,7 @@
 """Threads and memory of a process that trains."""
 
 import ctypes
+import os
 import sys
 
 import scipy.linalg  # noqa: F401  compiled code multiplies with its BLAS, which can only be limited once it is loaded
@@ -13,6 +14,11 @@ def limit_threads(count: int) -> None:
     costs more than it gives."""
     torch.set_num_threads(count)
     threadpoolctl.threadpool_limits(count)
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def keep_memory() -> None:

@@ -83,7 +83,10 @@ class Trainer:
     def _fly(self, count: int) -> Flights:
         guide = None if self._plan is None else (self._plan, self._follow(count))
         policy = AgentPolicy(self.learner.agent, self.epsilon, self._rng, self.learner.device, guide)
-        return fly(Environment(self.mission, count, self._rng), policy)
+        return fly(self._environment(count), policy)
+
+    def _environment(self, count: int) -> Environment:
+        return Environment(self.mission, count, self._rng)
 
     def _follow(self, count: int) -> np.ndarray:
         """Slots that each flight follows the plan: a quarter of the flights all the way, the others a random part,

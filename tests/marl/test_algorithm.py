@@ -172,3 +172,25 @@ def test_agents_see_estimates_in_the_twin_and_in_reality_alike(small_scene, monk
     seen.clear()
     execute(small_scene, run_settings(algorithm="qmix", privileged=True))
     np.testing.assert_allclose(seen[-1], true_m)
+
+
+def test_a_plan_in_the_latest_twin_may_fly_what_is_measured(small_scene, monkeypatch):
+    flown, planned = [], []
+    fly, plan = Reality.fly, marl.algorithm.plan
+
+    def seen(self, policy, known):
+        flown.append(fly(self, policy, known))
+        return flown[-1]
+
+    def noted(mission, iterations, seed):
+        planned.append(plan(mission, iterations, seed))
+        return planned[-1]
+
+    monkeypatch.setattr(Reality, "fly", seen)
+    monkeypatch.setattr(marl.algorithm, "plan", noted)
+    execute(small_scene, run_settings(algorithm="qmix", measure="planner"))
+    assert len(flown) == 3 and len(planned) == 2  # the first one is random
+    for flights, found in zip(flown[1:], planned):
+        slots = int(flights.length[0])
+        np.testing.assert_array_equal(flights.action[0, :slots], found.actions[:slots])
+    assert not np.array_equal(planned[0].actions, planned[1].actions)  # the twin has learnt in between

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import marl.replicas
 from marl.federation import average
 from marl.mission import Known, make_mission
 from marl.replicas import Replicas
@@ -67,7 +68,8 @@ def test_federating_all_averages_moments_and_target_networks(mission):
     assert {name.split(".")[0] for name in some} == {"agent", "mixer"}
 
 
-def test_processes_learn_the_same_as_this_one(mission):
+def test_processes_learn_the_same_as_this_one(mission, monkeypatch):
+    monkeypatch.setattr(marl.replicas, "usable_cores", lambda: 2)
     here = [Trainer(SETTINGS, mission, 100, 0, stream) for stream in range(2)]
     replicas = Replicas(2, SETTINGS, mission, 100, 0)
     try:
@@ -86,5 +88,16 @@ def test_processes_learn_the_same_as_this_one(mission):
         replicas._replicas[0]._process.join()
         with pytest.raises(RunFailed, match="--resume"):
             replicas.call("train", 4)
+    finally:
+        replicas.close()
+
+
+def test_on_one_core_replicas_learn_in_this_process(mission, monkeypatch):
+    monkeypatch.setattr(marl.replicas, "usable_cores", lambda: 1)
+    here = [Trainer(SETTINGS, mission, 100, 0, stream) for stream in range(2)]
+    replicas = Replicas(2, SETTINGS, mission, 100, 0)
+    try:
+        assert replicas.call("train", 8) == [trainer.train(8) for trainer in here]
+        assert not any(hasattr(replica, "_process") for replica in replicas._replicas)
     finally:
         replicas.close()

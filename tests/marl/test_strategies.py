@@ -73,7 +73,7 @@ def test_a_teacher_changes_its_plan_only_for_one_that_is_clearly_better(tiny, mo
     plans = [np.full((mission.longest, mission.uavs), number, np.int8) for number in (0, 5)]
     strategy = make_strategy(RUN.model_copy(update={"guide": "planner"}), LEARNER, mission, 2, "cpu")
     new, seen = iter(plans), iter(shares)
-    monkeypatch.setattr(marl.strategies, "plan", lambda *_: Plan(next(new), 0.0))
+    monkeypatch.setattr(marl.strategies, "plan", lambda *_: Plan(next(new), 0.0, None, None))
     monkeypatch.setattr(marl.strategies, "evaluate", lambda *_: Seen(next(seen)))
     strategy._actions = strategy._better_plan(mission)
     np.testing.assert_array_equal(strategy._better_plan(mission), plans[kept])

@@ -1,0 +1,104 @@
+"""`python -m marl.experiments`: run a study, and make its table and figures."""
+
+import argparse
+import signal
+import sys
+from pathlib import Path
+
+from marl.experiments.records import finished
+from marl.experiments.studies import STUDIES, with_settings
+from radiotwin.cli.console import complain, say, show_warnings_plainly
+from radiotwin.errors import BadInput, RunFailed
+
+OUT, FIGURES = Path("docs/results/experiments"), Path("docs/results/figures")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line; returns the exit status: 0 done, 1 failed while running, 2 bad input, 130 interrupted."""
+    studies = "\n".join(f"  {name:11} {study.question}" for name, study in STUDIES.items())
+    parser = argparse.ArgumentParser(
+        prog="python -m marl.experiments", allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter,
+        description="Run a study: every finished run is a JSON file, and the table and the figures are made of these "
+                    f"alone.\n\nstudies:\n{studies}\n  {'all':11} one after the other")
+    parser.add_argument("name", metavar="NAME", help="of the study")
+    parser.add_argument("--seeds", metavar="INTEGER", default="3", help="how many, from 0 [3]")
+    parser.add_argument("--scenes", metavar="A,B", default="rbm,rdm", help="folders, or names in scenes/ [rbm,rdm]")
+    parser.add_argument("--only", metavar="A,B", help="only runs whose name has one of these parts in it")
+    parser.add_argument("--set", metavar="NAME=VALUE", action="append", default=[], dest="settings",
+                        help="change a setting in all runs that have it; may be repeated")
+    parser.add_argument("--resume", action="store_true", help="keep what is finished, go on with what was stopped")
+    parser.add_argument("--report", action="store_true", help="run nothing: only make table and figures")
+    parser.add_argument("--jobs", metavar="INTEGER", default="1", help="runs side by side, a core each [1]")
+    parser.add_argument("--out", type=Path, default=OUT, help=f"folder of the JSON files and tables [{OUT}]")
+    given = parser.parse_args(arguments)
+    try:
+        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+        show_warnings_plainly()
+        _run(given)
+        return 0
+    except BadInput as error:
+        complain(str(error))
+        return 2
+    except RunFailed as error:
+        complain(str(error))
+        return 1
+    except KeyboardInterrupt:
+        complain("interrupted; what is finished is kept: the same command with --resume goes on")
+        return 130
+
+
+def _run(given: argparse.Namespace) -> None:
+    if given.name not in (*STUDIES, "all"):
+        raise BadInput(f"study {given.name!r} is unknown; allowed are {', '.join(STUDIES)}, all")
+    seeds, jobs = _count("--seeds", given.seeds), _count("--jobs", given.jobs)
+    scenes = given.scenes.split(",")
+    plans = {}
+    for name in STUDIES if given.name == "all" else [given.name]:
+        if STUDIES[name].runs is None:
+            plans[name] = []
+            continue
+        runs = STUDIES[name].runs(scenes, seeds)
+        if given.only:
+            runs = [run for run in runs if any(part in run.name for part in given.only.split(","))]
+        if not runs:
+            raise BadInput(f"--only {given.only}: no run of {name} has that in its name; they are "
+                           f"{', '.join(sorted({run.name for run in STUDIES[name].runs(scenes, 1)}))}")
+        plans[name] = with_settings(runs, given.settings)
+    if not given.report:
+        _check_scenes(scenes)
+    for name, runs in plans.items():
+        if runs and not given.report:
+            from marl.experiments.work import do_runs  # torch and all: not for --help
+
+            done = sum(finished(run, given.out) for run in runs)
+            started = any(run.unfinished(given.out).is_dir() for run in runs)
+            if (done or started) and not given.resume:
+                raise BadInput(f"{given.out / name} holds {done} finished runs of this study"
+                               f"{' and some that were stopped' if started else ''}; --resume keeps them and goes on, "
+                               "--out names another folder, --report only makes table and figures")
+            do_runs(runs, given.out, jobs)
+
+        from marl.experiments.report import write_report
+
+        figures = FIGURES if given.out == OUT else given.out / "figures"
+        for path in write_report(name, STUDIES[name].question, given.out, figures):
+            say(f"wrote {path}")
+
+
+def _count(option: str, text: str) -> int:
+    if not text.isdecimal() or not 1 <= int(text) <= 1000:
+        raise BadInput(f"{option} {text}: allowed is a whole number from 1 to 1000")
+    return int(text)
+
+
+def _check_scenes(scenes: list[str]) -> None:
+    """Complain about a scene before hours of work, not after them."""
+    from marl.experiments.learning import scene_folder
+    from radiotwin.scene import Scene
+
+    for scene in scenes:
+        Scene.load(scene_folder(scene))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

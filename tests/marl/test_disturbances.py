@@ -1,0 +1,43 @@
+"""Flights that do not go as was thought."""
+
+import numpy as np
+
+from marl.disturbances import Disturbance, DisturbedEnvironment
+from marl.environment import Environment
+from marl.flights import HeuristicPolicy, fly
+
+
+def flown(mission, disturbance, flights=200):
+    rng = np.random.default_rng(0)
+    return fly(DisturbedEnvironment(mission, flights, rng, disturbance), HeuristicPolicy("greedy", rng))
+
+
+def test_nothing_happens_without_a_disturbance(tiny):
+    mission = tiny(0)
+    calm = fly(Environment(mission, 20, np.random.default_rng(0)), HeuristicPolicy("greedy", np.random.default_rng(1)))
+    np.testing.assert_array_equal(flown(mission, Disturbance(), 20).collected, calm.collected)
+
+
+def test_volumes_are_drawn_evenly_and_the_ratio_is_of_what_there_was(tiny):
+    mission = tiny(0, snr_db=60.0, battery=(200, 200))
+    flights = flown(mission, Disturbance(volume_spread=1.0), 2000)
+    share = flights.frames.data_units[:, 0] / mission.data_units
+    assert share.min() >= 0 and share.max() <= 2
+    np.testing.assert_allclose(share.mean(axis=0), 1, atol=0.05)
+    np.testing.assert_allclose(share.std(axis=0), 1 / 3**0.5, atol=0.05)
+    np.testing.assert_allclose(flights.ratio(mission), 1, atol=1e-5)  # all is collected, however much it was
+
+
+def test_one_uav_is_lost_stands_still_and_collects_no_more(tiny):
+    mission = tiny(0, uavs=2, battery=(40, 40))
+    flights = flown(mission, Disturbance(loss=1.0))
+    full = mission.battery[None]
+    spent = (flights.frames.battery == 0).argmax(axis=1)  # (E, U) first slot without battery
+    lost = spent.argmin(axis=1)
+    assert (full == 40).all() and 0.3 < lost.mean() < 0.7
+    for flight, uav in enumerate(lost):
+        slot = spent[flight, uav]
+        assert 1 <= slot <= mission.longest // 2
+        assert (flights.collected[flight, slot:, uav] == 0).all()
+        assert (flights.frames.cell[flight, slot:, uav] == flights.frames.cell[flight, slot, uav]).all()
+        assert flights.collected[flight, slot:, 1 - uav].shape[0] > 0
