@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from radiotwin.closeloop.bases import FittedBase
 from radiotwin.closeloop.model import Side
@@ -99,7 +100,7 @@ def locate(model: Corrected, records: Records, area_m: tuple[float, float, float
         around_m = np.stack(np.meshgrid(steps_m, steps_m), axis=-1).reshape(-1, 2)
         fine_m = (coarse_m[best, None] + around_m).reshape(-1, 2)
         share = _share(model.temper * _log_likelihood(model, mine, fine_m))
-        yield _place(int(device), fine_m, share, width_m / FINER, len(mine))
+        yield _place(int(device), fine_m, share, width_m / FINER, len(mine), cdist(fine_m, fine_m))
         tell()
 
 
@@ -130,6 +131,7 @@ def calibrated_temper(models: list[Corrected], held_out: list[Records], area_m: 
     if len(np.unique(np.concatenate([records.device for records in held_out]))) < LEAST_DEVICES:
         return 1.0
     coarse_m, width_m = _grid(area_m)
+    apart_m = cdist(coarse_m, coarse_m)
     tasks = [(model, records, device) for model, records in zip(models, held_out)
              for device in np.flatnonzero(np.bincount(records.device) >= LEAST_LINKS)]
     chosen = np.random.default_rng(seed).permutation(len(tasks))[:MOST_TASKS]
@@ -138,7 +140,7 @@ def calibrated_temper(models: list[Corrected], held_out: list[Records], area_m: 
         model, records, device = tasks[number]
         log_likelihood = _log_likelihood(model, records.select(records.device == device), coarse_m)
         for i, temper in enumerate(TEMPERS):
-            place = _place(int(device), coarse_m, _share(temper * log_likelihood), width_m, 0)
+            place = _place(int(device), coarse_m, _share(temper * log_likelihood), width_m, 0, apart_m)
             inside[i] += np.hypot(*(records.device_m[device, :2] - (place.x_m, place.y_m))) <= place.radius_m
     enough = np.flatnonzero(inside >= CREDIBLE * len(chosen))
     return float(TEMPERS[enough[0]] if len(enough) else TEMPERS[-1])
@@ -192,8 +194,9 @@ def _share(log_likelihood: np.ndarray) -> np.ndarray:
     return share / share.sum()
 
 
-def _place(device: int, places_m: np.ndarray, share: np.ndarray, width_m: float, links: int) -> Place:
-    apart_m = np.linalg.norm(places_m[:, None] - places_m[None], axis=2)
+def _place(device: int, places_m: np.ndarray, share: np.ndarray, width_m: float, links: int,
+           apart_m: np.ndarray) -> Place:
+    """Of places (c, 2) with shares (c,) of the probability, apart (c, c) [m]."""
     best = int((apart_m @ share).argmin())
     order = np.argsort(apart_m[best])
     reached = int(np.searchsorted(np.cumsum(share[order]), CREDIBLE))

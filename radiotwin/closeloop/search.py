@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from scipy.special import logsumexp
 
 from radiotwin.closeloop.bases import Base
 from radiotwin.closeloop.folds import Folds, evidence_blocks
@@ -15,6 +14,7 @@ from radiotwin.closeloop.records import Records
 from radiotwin.closeloop.regression import Solution, detected_db, expect, nll_at
 from radiotwin.closeloop.shadowing import NAME as SHADOWING
 from radiotwin.closeloop.shadowing import Shadowing
+from radiotwin.closeloop.significance import gain_p, sign_flip_p
 from radiotwin.effects.base import Effect
 from radiotwin.effects.position_errors import site_of
 
@@ -27,7 +27,6 @@ SIGNIFICANCE = 0.01
 CONSISTENT = 0.1
 SUPPORTED = 0.1
 CLEARLY_NATS = np.log(100.0)  # how much likelier the data must be than with another effect, to tell it from that one
-FLIPS = 4_000
 MOST_EFFECTS = 12
 MOST_OF_A_KIND = 4  # in one step
 WORTH_A_LOOK_NATS = 10.0
@@ -375,28 +374,3 @@ def rmse_db(model: Model, rows: np.ndarray) -> float:
     """Held-out root mean square error of the detected links among `rows` [dB]."""
     error = (model.whole.records.level_db - model.held_out_mean_db())[rows]
     return float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else np.nan
-
-
-def gain_p(gains: np.ndarray) -> float:
-    """Bound on the chance of such held-out gains (folds,) [nats] if the effect is not there.
-
-    A likelihood ratio whose parameters were fitted elsewhere is at most 1 on average then, and so is its mean over the
-    folds; by Markov's inequality (Wasserman, Ramdas and Balakrishnan 2020, 'Universal inference', PNAS 117(29), the
-    cross-fit test).
-    """
-    return float(np.exp(-max(logsumexp(gains) - np.log(len(gains)), 0.0)))
-
-
-def sign_flip_p(gains: np.ndarray, seed: int) -> float:
-    """Chance of a sum this large if each piece of evidence were as likely to speak against as for it."""
-    rng = np.random.default_rng(seed)
-    gains = gains[gains != 0]
-    if not len(gains):
-        return 1.0
-    most = max(int(4e6 // len(gains)), 100)
-    larger, done = 0, 0
-    while done < FLIPS:
-        count = min(most, FLIPS - done)
-        larger += int(((rng.integers(0, 2, (count, len(gains))) * 2 - 1) @ gains >= gains.sum()).sum())
-        done += count
-    return (larger + 1) / (FLIPS + 1)

@@ -5,7 +5,7 @@ import pytest
 
 from radiotwin.closeloop.report import make_report
 from radiotwin.closeloop.run import close_loop
-from radiotwin.closeloop.search import gain_p, sign_flip_p
+from radiotwin.closeloop.significance import gain_p, sign_flip_p
 from radiotwin.errors import BadInput
 
 
