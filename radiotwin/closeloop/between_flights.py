@@ -81,8 +81,8 @@ def _stands_out(model: Model, look) -> bool:
 
 def _with(model: Model, effect: Effect, setting: Setting) -> Model:
     """A model with one more effect in every side, its setting given."""
-    def extended(side: Side) -> tuple[Side, Solution]:
+    def extended(side: Side, fit: Solution) -> tuple[Side, Solution]:
         other = side.with_parts([*side.parts, side.part(effect, setting)])
-        return other, other.fit()
-    whole, *sides = [extended(side) for side in model.sides]
+        return other, other.fit(fit)
+    whole, *sides = [extended(side, fit) for side, fit in zip(model.sides, model.fits)]
     return Model(whole[0], [side for side, _ in sides], [whole[1], *(fit for _, fit in sides)], model.index)

@@ -202,7 +202,7 @@ def add(side: Side, effect: Effect, solution: Solution, like: Setting | None = N
     best = None
     for part in parts:
         tried = side.with_parts([*side.parts, part])
-        fitted = tried.fit()
+        fitted = tried.fit(solution)
         if best is None or fitted.objective < best[1].objective:
             best = tried, fitted
     if best is None or solution.objective - best[1].objective < WORTH_REFINING_NATS:

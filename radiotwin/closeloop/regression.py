@@ -129,10 +129,11 @@ class Solution:
 
 
 def solve(problem: Problem, start: Solution | None = None) -> Solution:
-    """The maximum of the posterior."""
+    """The maximum of the posterior. A start may know fewer coefficients: the others come last, and are 0 there."""
     p, groups = len(problem.spread_db), int(problem.group.max()) + 1
-    if start is not None and len(start.coefficients) == p:
-        beta, scale_db = start.coefficients.copy(), start.scale_db.copy()
+    if start is not None and len(start.coefficients) <= p and len(start.scale_db) == groups:
+        beta = np.concatenate([start.coefficients, np.zeros(p - len(start.coefficients))])
+        scale_db = start.scale_db.copy()
     else:
         beta, scale_db = _least_squares(problem), np.full(groups, FIRST_SCALE_DB)
     precision = 1.0 / np.square(problem.spread_db)
