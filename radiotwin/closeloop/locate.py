@@ -18,9 +18,9 @@ from radiotwin.closeloop.regression import Solution, expect, nll, residual_db
 from radiotwin.effects.base import Effect, Setting
 
 COARSE_CELLS = 1500
-FINER = 4  # times
-MOST_FINE = 40  # coarse cells that are looked at again
-LEAST_SHARE = 1e-4
+FINE_CELLS = 640  # at most
+FINEST = 4  # times
+HELD = 0.999  # of the probability, by the cells that are looked at again
 NODES = 7
 CREDIBLE = 0.9
 LEAST_LINKS = 3
@@ -93,14 +93,9 @@ def locate(model: Corrected, records: Records, area_m: tuple[float, float, float
         if len(mine) < LEAST_LINKS:
             tell()
             continue
-        coarse = _share(model.temper * _log_likelihood(model, mine, coarse_m))
-        best = np.argsort(-coarse)[:MOST_FINE]
-        best = best[coarse[best] > LEAST_SHARE * coarse[best[0]]]
-        steps_m = (np.arange(FINER) + 0.5) * width_m / FINER - width_m / 2
-        around_m = np.stack(np.meshgrid(steps_m, steps_m), axis=-1).reshape(-1, 2)
-        fine_m = (coarse_m[best, None] + around_m).reshape(-1, 2)
+        fine_m, fine_width_m = _finer(_log_likelihood(model, mine, coarse_m), model.temper, coarse_m, width_m)
         share = _share(model.temper * _log_likelihood(model, mine, fine_m))
-        yield _place(int(device), fine_m, share, width_m / FINER, len(mine), cdist(fine_m, fine_m))
+        yield _place(int(device), fine_m, share, fine_width_m, len(mine), cdist(fine_m, fine_m))
         tell()
 
 
@@ -131,16 +126,17 @@ def calibrated_temper(models: list[Corrected], held_out: list[Records], area_m: 
     if len(np.unique(np.concatenate([records.device for records in held_out]))) < LEAST_DEVICES:
         return 1.0
     coarse_m, width_m = _grid(area_m)
-    apart_m = cdist(coarse_m, coarse_m)
     tasks = [(model, records, device) for model, records in zip(models, held_out)
              for device in np.flatnonzero(np.bincount(records.device) >= LEAST_LINKS)]
     chosen = np.random.default_rng(seed).permutation(len(tasks))[:MOST_TASKS]
     inside = np.zeros(len(TEMPERS))
     for number in chosen:
         model, records, device = tasks[number]
-        log_likelihood = _log_likelihood(model, records.select(records.device == device), coarse_m)
+        mine = records.select(records.device == device)
+        fine_m, fine_width_m = _finer(_log_likelihood(model, mine, coarse_m), TEMPERS[-1], coarse_m, width_m)
+        log_likelihood, apart_m = _log_likelihood(model, mine, fine_m), cdist(fine_m, fine_m)
         for i, temper in enumerate(TEMPERS):
-            place = _place(int(device), coarse_m, _share(temper * log_likelihood), width_m, 0, apart_m)
+            place = _place(int(device), fine_m, _share(temper * log_likelihood), fine_width_m, 0, apart_m)
             inside[i] += np.hypot(*(records.device_m[device, :2] - (place.x_m, place.y_m))) <= place.radius_m
     enough = np.flatnonzero(inside >= CREDIBLE * len(chosen))
     return float(TEMPERS[enough[0]] if len(enough) else TEMPERS[-1])
@@ -187,6 +183,19 @@ def _log_likelihood(model: Corrected, mine: Records, places_m: np.ndarray) -> np
         moved = replace(problem, gain_db=problem.gain_db + node * spread_db)
         values.append(np.log(weight) - nll(moved, model.solution).reshape(cells, links).sum(axis=1))
     return np.logaddexp.reduce(values, axis=0)
+
+
+def _finer(log_likelihood: np.ndarray, temper: float, coarse_m: np.ndarray,
+           width_m: float) -> tuple[np.ndarray, float]:
+    """Centres (c, 2) of finer cells where nearly all of the probability is, and their width [m]: the fewer the coarse
+    cells (k,) that hold it, the finer."""
+    share = _share(temper * log_likelihood)
+    order = np.argsort(-share)
+    held = order[:int(np.searchsorted(np.cumsum(share[order]), HELD)) + 1]
+    times = int(np.clip(np.sqrt(FINE_CELLS / len(held)), 1, FINEST))
+    steps_m = (np.arange(times) + 0.5) * width_m / times - width_m / 2
+    around_m = np.stack(np.meshgrid(steps_m, steps_m), axis=-1).reshape(-1, 2)
+    return (coarse_m[held, None] + around_m).reshape(-1, 2), width_m / times
 
 
 def _share(log_likelihood: np.ndarray) -> np.ndarray:
