@@ -21,7 +21,7 @@ _NAMES = {
 }
 CONVENTIONS = "CF-1.11"
 GRID_MAPPING = "crs"
-_CF = {
+_CF: dict[str, dict[str, str | np.ndarray]] = {
     "x": {"axis": "X", "standard_name": "projection_x_coordinate"},
     "y": {"axis": "Y", "standard_name": "projection_y_coordinate"},
     "z": {"axis": "Z", "standard_name": "height", "positive": "up"},
