@@ -6,6 +6,7 @@ zero.
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from radiotwin.tables import Origin
 
@@ -21,7 +22,7 @@ def to_local(origin: Origin, longitude_deg: np.ndarray, latitude_deg: np.ndarray
     return _plane(origin)(np.asarray(longitude_deg, dtype=float), np.asarray(latitude_deg, dtype=float))
 
 
-def to_geographic(origin: Origin, x_m: np.ndarray, y_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def to_geographic(origin: Origin, x_m: ArrayLike, y_m: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
     """Longitude and latitude of points in the local frame [degrees], (n,) each."""
     return _plane(origin)(np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float), inverse=True)
 

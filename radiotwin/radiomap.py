@@ -1,5 +1,6 @@
 """The radio map: gain at every lattice position for every device. Everything else is a way to make or use one."""
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -20,7 +21,7 @@ _NAMES = {
 }
 CONVENTIONS = "CF-1.11"
 GRID_MAPPING = "crs"
-_CF = {
+_CF: dict[str, dict[str, str | np.ndarray]] = {
     "x": {"axis": "X", "standard_name": "projection_x_coordinate"},
     "y": {"axis": "Y", "standard_name": "projection_y_coordinate"},
     "z": {"axis": "Z", "standard_name": "height", "positive": "up"},
@@ -85,7 +86,8 @@ class RadioMap:
 
         [1] https://cfconventions.org, version 1.11
         """
-        encoding = {name: {"zlib": True, "complevel": 4} for name in self.dataset.data_vars}
+        encoding: dict[Hashable, dict[str, int | None]] = {
+            name: {"zlib": True, "complevel": 4} for name in self.dataset.data_vars}
         encoding |= {axis: {"_FillValue": None} for axis in "xyz"}
         with atomic_path(path) as temporary:
             _with_conventions(self.dataset).to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
@@ -115,16 +117,16 @@ def _with_conventions(dataset: xr.Dataset) -> xr.Dataset:
     for name, attributes in _CF.items():
         if name in dataset.variables:
             dataset[name] = dataset[name].assign_attrs(attributes)
-    origin = [dataset.attrs.get(f"origin_{name}_deg") for name in ("latitude", "longitude")]
-    if None in origin:
+    latitude, longitude = (dataset.attrs.get(f"origin_{name}_deg") for name in ("latitude", "longitude"))
+    if latitude is None or longitude is None:
         return dataset
     from pyproj import CRS
 
-    crs = CRS(local_crs(Origin(latitude_deg=float(origin[0]), longitude_deg=float(origin[1]))))
+    crs = CRS(local_crs(Origin(latitude_deg=float(latitude), longitude_deg=float(longitude))))
     dataset[GRID_MAPPING] = xr.Variable((), np.int32(0), crs.to_cf())
-    for name in dataset.data_vars:
-        if name != GRID_MAPPING:
-            dataset[name] = dataset[name].assign_attrs(grid_mapping=GRID_MAPPING)
+    for variable in dataset.data_vars:
+        if variable != GRID_MAPPING:
+            dataset[variable] = dataset[variable].assign_attrs(grid_mapping=GRID_MAPPING)
     return dataset
 
 
@@ -133,7 +135,7 @@ def _without_conventions(dataset: xr.Dataset) -> xr.Dataset:
     dataset = dataset.drop_vars(GRID_MAPPING, errors="ignore")
     dataset.attrs.pop("Conventions", None)
     for name in dataset.variables:
-        for key in ("grid_mapping", *_CF.get(name, ())):
+        for key in ("grid_mapping", *_CF.get(str(name), ())):
             dataset[name].attrs.pop(key, None)
             dataset[name].encoding.pop(key, None)
     return dataset

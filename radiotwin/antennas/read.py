@@ -42,7 +42,9 @@ def read_pattern(path: Path | str) -> Pattern:
 
 
 def _read_msi(path: Path) -> Pattern:
-    gain_dbi, cuts, cut = None, {}, None
+    gain_dbi: float | None = None
+    cuts: dict[str, dict[float, float]] = {}
+    cut: dict[float, float] | None = None
     for row, line in enumerate(path.read_text(encoding="latin-1").splitlines(), start=1):
         words = line.split()
         if not words:

@@ -280,8 +280,8 @@ def _refine_members(side: Side, fitted: Solution, part: Part, variation: Variati
         there = changed(records, numbers)
         if not at_receiver:
             return there.term.offset_db
-        return sum(part.effect.bend(np.full(len(records), level_db), records, there.setting, there.term.extra)[0]
-                   for level_db in EXTREMES_DB)
+        return sum((part.effect.bend(np.full(len(records), level_db), records, there.setting, there.term.extra)[0]
+                    for level_db in EXTREMES_DB), start=np.zeros(len(records)))
 
     for member in variation.members or ():
         moved = numbers.copy()

@@ -40,6 +40,7 @@ def write_kmz(radio_map: RadioMap, scene: Scene, path: Path) -> None:
         scene: with an origin.
         path: of the KMZ file.
     """
+    assert scene.config.origin is not None
     ET.register_namespace("", KML)
     ET.register_namespace("gx", GX)
     values_db = radio_map.gain_db[np.isfinite(radio_map.gain_db)]
@@ -86,6 +87,7 @@ def _radio_buttons(folder: ET.Element) -> None:
 
 def _corners(radio_map: RadioMap, scene: Scene) -> str:
     """Longitude and latitude of the outer corners of the cells: south-west, south-east, north-east, north-west."""
+    assert scene.config.origin is not None
     half_m, lattice = cell_m(radio_map, scene) / 2, radio_map.lattice
     west, east = lattice.x_m[0] - half_m, lattice.x_m[-1] + half_m
     south, north = lattice.y_m[0] - half_m, lattice.y_m[-1] + half_m

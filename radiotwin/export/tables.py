@@ -1,6 +1,7 @@
 """Radio maps as numbers: NetCDF, CSV, NumPy."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -32,7 +33,7 @@ def write_csv(radio_map: RadioMap, scene: Scene, path: Path) -> None:
 def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:
     """`numpy.load` reads it without pickling: gain_db, los and sigma_db (device, z, y, x), device, z_m, y_m, x_m."""
     dataset, lattice = radio_map.dataset, radio_map.lattice
-    arrays = {name: dataset[name].values for name in ("gain_db", "los", "sigma_db") if name in dataset}
+    arrays: dict[str, Any] = {name: dataset[name].values for name in ("gain_db", "los", "sigma_db") if name in dataset}
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, device=np.array(radio_map.devices), z_m=lattice.z_m, y_m=lattice.y_m,
                             x_m=lattice.x_m, **arrays)

@@ -23,7 +23,7 @@ from radiotwin.scene import checks
 from radiotwin.scene.build import BuildOptions, Declared, check_target, finish_scene
 from radiotwin.scene.importer import RESERVED_NAMES, ImportedCity
 from radiotwin.scene.material_mapping import safe_name, unique_name
-from radiotwin.scene.materials import itu_material
+from radiotwin.scene.materials import Material, itu_material
 from radiotwin.scene.placement import choose_extent
 from radiotwin.scene.problems import Problem, listed
 from radiotwin.scene.report import BuildReport
@@ -78,7 +78,9 @@ def map_name(source: Path | str) -> str:
     >>> map_name("data/old town.osm.pbf")
     'old_town'
     """
-    return scene_name(f"{str(source)[: -len(map_suffix(source))]}.osm")
+    suffix = map_suffix(source)
+    assert suffix is not None, "only for what `map_suffix` calls a map"
+    return scene_name(f"{str(source)[: -len(suffix)]}.osm")
 
 
 def build_scene_from_map(source: Path | str, out_folder: Path | str, map_options: MapOptions = MapOptions(),
@@ -105,7 +107,9 @@ def build_scene_from_map(source: Path | str, out_folder: Path | str, map_options
                            "folder")
     if not path.is_file():
         raise BadInput(f"{path} is not a file; give a map ({', '.join(READERS)})")
-    found = READERS[map_suffix(path)](path)
+    suffix = map_suffix(path)
+    assert suffix is not None, "only for what `map_suffix` calls a map"
+    found = READERS[suffix](path)
     features = _within(found.features, map_options.bbox_deg, path)
     origin = _origin(features, map_options.bbox_deg)
     prisms, problems = make_prisms(features, origin, map_options.materials, map_options.default_height_m)
@@ -198,8 +202,10 @@ def _city(prisms: list[Prism], extent_m: tuple[float, float, float, float], tabl
     x0, y0 = np.minimum(bounds[:, :2].min(axis=0), extent_m[::2]) - GROUND_MARGIN_M
     x1, y1 = np.maximum(bounds[:, 2:].max(axis=0), extent_m[1::2]) + GROUND_MARGIN_M
     ground = np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
-    names, materials, meshes = ["ground"], [itu_material(table.ground)], [ground]
-    taken, shape_of = {*RESERVED_NAMES, "ground"}, {}
+    names, meshes = ["ground"], [ground]
+    materials: list[Material | None] = [itu_material(table.ground)]
+    taken = {*RESERVED_NAMES, "ground"}
+    shape_of: dict[int, str] = {}
     for block in make_blocks(prisms):
         name = unique_name(safe_name(prisms[block.members[0]].name), taken)
         shape_of |= dict.fromkeys(block.members, name)

@@ -9,9 +9,11 @@ import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import shapely
+from shapely.geometry.base import BaseGeometry
 
 from radiotwin.errors import BadInput
 from radiotwin.footprints.features import Feature, MapFile, is_building
@@ -80,9 +82,10 @@ def read_geopackage(path: Path) -> MapFile:
     return found
 
 
-def _polygons(path: Path, number: int, geometry: Mapping):
+def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None:
     """The polygons of a GeoJSON geometry; None where it has none."""
-    kind, rings = geometry.get("type"), geometry.get("coordinates")
+    kind = geometry.get("type")
+    rings: Any = geometry.get("coordinates")  # whatever the file has; a TypeError says that it is no list
     if kind not in ("Polygon", "MultiPolygon"):
         return None
     try:
@@ -109,11 +112,11 @@ def _crs_name(path: Path, data: Mapping) -> str:
                        ) from None
 
 
-def _features(path: Path, rows: Iterable[tuple[str, Mapping, object]], crs: str | None) -> MapFile:
-    rows = [(name, _tags(properties), area) for name, properties, area in rows]
-    marked = any("building" in tags or "building:part" in tags for _, tags, _ in rows)
+def _features(path: Path, rows: Iterable[tuple[str, Mapping, BaseGeometry | None]], crs: str | None) -> MapFile:
+    tagged = [(name, _tags(properties), area) for name, properties, area in rows]
+    marked = any("building" in tags or "building:part" in tags for _, tags, _ in tagged)
     features, unusable = [], []
-    for name, tags, area in rows:
+    for name, tags, area in tagged:
         if marked and not is_building(tags):
             continue
         if area is None or area.geom_type not in ("Polygon", "MultiPolygon", "GeometryCollection"):
@@ -129,7 +132,7 @@ def _features(path: Path, rows: Iterable[tuple[str, Mapping, object]], crs: str 
 
 def _tags(properties: Mapping) -> dict[str, str]:
     """Columns as tags; empty cells are none."""
-    tags = {}
+    tags: dict[str, str] = {}
     for key, value in properties.items():
         if value is None or (isinstance(value, float) and not np.isfinite(value)):
             continue

@@ -19,7 +19,7 @@ LEAST_NODES = 4  # of a ring: a triangle, and the first node again
 
 @dataclass
 class Way:
-    nodes: Sequence[int]
+    nodes: list[int]
     tags: dict[str, str] = field(default_factory=dict)
 
 
@@ -48,7 +48,10 @@ class OsmElements:
 
 def assemble(elements: OsmElements) -> MapFile:
     """Buildings and building parts, ways first; what is cut off or not closed is left out and said."""
-    cut, unclosed, features, used = [], [], [], set()
+    cut: list[str] = []
+    unclosed: list[str] = []
+    features: list[Feature] = []
+    used: set[int] = set()
     for number, relation in elements.relations.items():
         tags = _relation_tags(relation, elements)
         if tags is None:

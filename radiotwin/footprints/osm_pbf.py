@@ -30,6 +30,7 @@ def read_osm_pbf(path: Path) -> OsmElements:
     try:
         for relation in osmium.FileProcessor(file, osmium.osm.RELATION).with_filter(
                 osmium.filter.TagFilter(("type", "multipolygon"))):
+            assert isinstance(relation, osmium.osm.Relation)
             members = [(member.ref, member.role) for member in relation.members if member.type == "w"]
             elements.relations[relation.id] = Relation(members, dict(relation.tags))
         built = osmium.FileProcessor(file, osmium.osm.WAY).with_filter(osmium.filter.KeyFilter(*KEYS))
@@ -41,6 +42,7 @@ def read_osm_pbf(path: Path) -> OsmElements:
         nodes = {node for way in elements.ways.values() for node in way.nodes}
         if nodes:
             for node in osmium.FileProcessor(file, osmium.osm.NODE).with_filter(osmium.filter.IdFilter(nodes)):
+                assert isinstance(node, osmium.osm.Node)
                 if node.location.valid():
                     elements.places[node.id] = node.location.lon, node.location.lat
     except RuntimeError as error:

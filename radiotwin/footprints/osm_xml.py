@@ -51,6 +51,7 @@ class _Reader:
             self.open = self.elements.relations[self._integer(attributes, "id", line)] = Relation()
 
     def _content(self, tag: str, attributes: dict[str, str], line: int) -> None:
+        assert self.open is not None
         if tag == "tag":
             self.open.tags[attributes.get("k", "")] = attributes.get("v", "")
         elif tag == "nd" and isinstance(self.open, Way):

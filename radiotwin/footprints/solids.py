@@ -11,7 +11,7 @@ from radiotwin.footprints.heights import Height, height_of
 from radiotwin.footprints.material_table import MaterialTable
 from radiotwin.geodesy import to_local
 from radiotwin.scene.materials import Material
-from radiotwin.scene.problems import Problem, listed
+from radiotwin.scene.problems import Problem, Severity, listed
 from radiotwin.tables import Origin
 
 GRID_M = 0.01  # corners are rounded to it, so that walls that are meant to lie on one another do
@@ -78,7 +78,7 @@ def make_prisms(features: Sequence[Feature], origin: Origin, table: MaterialTabl
 class _Notes:
     """Findings of one kind, gathered."""
 
-    _KINDS = {
+    _KINDS: dict[str, tuple[Severity, str]] = {
         "invalid": ("fixed", "outline(s) cut or touched themselves: taken apart"),
         "no area": ("warning", "building(s) have no area: left out"),
         "sliver": ("warning", f"sliver(s), under {SLIVER_AREA_M2:g} m² or {SLIVER_WIDTH_M:g} m wide: left out"),

@@ -11,7 +11,7 @@ import numpy as np
 from radiotwin.antennas import Antenna, Pattern, read_pattern
 from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.config import SceneConfig, read_config
+from radiotwin.scene.config import DeviceConfig, SceneConfig, UavConfig, read_config
 from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.own_files import require_within
 
@@ -79,12 +79,13 @@ class Scene:
     @cached_property
     def uav_antenna(self) -> Antenna | None:
         """Antenna of all UAVs, the mean over the headings that they may have; None: isotropic."""
-        names = {uav.antenna for uav in self.config.uavs} - {None}
+        names = {uav.antenna for uav in self.config.uavs if uav.antenna is not None}
         return Antenna(self._pattern(names.pop()).around()) if names else None
 
     def copy_antennas(self, folder: Path) -> None:
         """Copy the files of all antennas into another scene folder, to where `scene.toml` looks for them."""
-        for name in sorted({end.antenna for end in (*self.config.devices, *self.config.uavs)} - {None}):
+        ends: list[DeviceConfig | UavConfig] = [*self.config.devices, *self.config.uavs]
+        for name in sorted({end.antenna for end in ends if end.antenna is not None}):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(self.folder / name, folder / name)
 

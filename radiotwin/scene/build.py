@@ -229,6 +229,7 @@ class _Plan:
 
 
 def _plan(city: ImportedCity, declared: Declared, options: BuildOptions) -> _Plan:
+    assert city.surfaces is not None  # without an error among the problems
     surfaces, solid = city.surfaces, ~city.ground
     if declared.extent is None:
         bounds = building_bounds(surfaces, solid)

@@ -36,6 +36,7 @@ def scene_shapes(scene: Scene) -> list[CityShape]:
         raise BadInput("\n".join(problem.message for problem in problems if problem.severity == "error"))
     shapes = []
     for shape, material in zip(declared.shapes, materials):
+        assert material is not None  # without an error among the problems
         raw = load_shape(shape)
         mesh = trimesh.Trimesh(raw.vertices, raw.faces, process=False)
         shapes.append(CityShape(shape.name.removeprefix("mesh-"), mesh, material))

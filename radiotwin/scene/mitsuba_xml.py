@@ -189,7 +189,10 @@ def parse_xml(path: Path) -> Node:
         open_nodes[-1].children.append(node)
         open_nodes.append(node)
 
-    parse_elements(path, start, lambda tag: open_nodes.pop())
+    def end(tag: str) -> None:
+        open_nodes.pop()
+
+    parse_elements(path, start, end)
     return top.children[0]
 
 

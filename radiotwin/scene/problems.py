@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+Severity = Literal["error", "warning", "fixed"]
+
 
 @dataclass(frozen=True)
 class Problem:
@@ -16,7 +18,7 @@ class Problem:
         message: what was found, and what to do or what was done.
     """
 
-    severity: Literal["error", "warning", "fixed"]
+    severity: Severity
     shape: str
     message: str
 

@@ -131,6 +131,7 @@ def read_points(path: Path | str, origin: Origin | None = None) -> np.ndarray:
                        "give x_m and y_m")
     points = np.column_stack([_numbers(path, raw, name) for name in wanted])
     if geographic:
+        assert origin is not None  # said above
         points[:, :2] = np.column_stack(to_local(origin, points[:, 1], points[:, 0]))
     return points
 
