@@ -27,15 +27,18 @@ class DisturbedEnvironment(Environment):
     def __init__(self, mission: Mission, flights: int, rng: np.random.Generator, disturbance: Disturbance):
         super().__init__(mission, flights, rng)
         self._disturbance = disturbance
+        self._slot, self._lost, self._lost_in = np.zeros((3, flights), dtype=np.int64)
 
-    def reset(self) -> Frame:
-        """See `Environment.reset`; with this flight's data volumes."""
-        frame, mission, rng = super().reset(), self.mission, self._rng
-        flights, (volume_spread, loss) = len(frame.cell), self._disturbance
-        frame.data_units[:] = mission.data_units * rng.uniform(1 - volume_spread, 1 + volume_spread,
-                                                               frame.data_units.shape)
-        self._slot, self._lost = 0, rng.integers(0, mission.uavs, flights)
-        self._lost_in = np.where(rng.random(flights) < loss, rng.integers(1, mission.longest // 2 + 1, flights), -1)
+    def reset(self, which: np.ndarray | None = None) -> Frame:
+        """See `Environment.reset`; with these flights' data volumes."""
+        frame, mission, rng = super().reset(which), self.mission, self._rng
+        new = np.arange(len(frame.cell)) if which is None else np.flatnonzero(which)
+        flights, (volume_spread, loss) = len(new), self._disturbance
+        frame.data_units[new] = mission.data_units * rng.uniform(1 - volume_spread, 1 + volume_spread,
+                                                                 (flights, frame.data_units.shape[1]))
+        self._slot[new], self._lost[new] = 0, rng.integers(0, mission.uavs, flights)
+        self._lost_in[new] = np.where(rng.random(flights) < loss, rng.integers(1, mission.longest // 2 + 1, flights),
+                                      -1)
         return frame
 
     def step(self, action: np.ndarray) -> np.ndarray:

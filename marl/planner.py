@@ -28,13 +28,13 @@ class Plan(NamedTuple):
         actions: (T, U) int8; feasible from take-off until all batteries are empty.
         ratio: expected share of the data that it collects in the map that it was planned in.
         tour: (U, MOST_WAYPOINTS, 3) int64 waypoints (row, column, hovers) that the actions come of.
-        count: (U,) int64 waypoints of each UAV.
+        visits: (U,) int64 number of waypoints of each UAV.
     """
 
     actions: np.ndarray
     ratio: float
     tour: np.ndarray
-    count: np.ndarray
+    visits: np.ndarray
 
 
 class PlanPolicy:

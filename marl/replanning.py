@@ -33,12 +33,12 @@ class ReplanPolicy:
         self._mission, self._linked, self._every, self._iterations, self._rng = believed, linked, every, iterations, rng
         self._value = expected_data(believed)
         self._first = plan(believed, first_iterations, seed)
-        self._expected = _expected_flight(believed, self._value, self._first.tour, self._first.count)
+        self._expected = _expected_flight(believed, self._value, self._first.tour, self._first.visits)
 
     def start(self, mission: Mission, flights: int) -> None:
         first, uavs = self._first, mission.uavs
         self._slot = 0
-        self._tour, self._count = np.tile(first.tour, (flights, 1, 1, 1)), np.tile(first.count, (flights, 1))
+        self._tour, self._count = np.tile(first.tour, (flights, 1, 1, 1)), np.tile(first.visits, (flights, 1))
         self._reached, self._hovered = np.zeros((2, flights, uavs), dtype=np.int64)
         # (E, U, K): what each UAV saw last, and when; never is slot 0, when all was as the mission says
         self._seen = np.tile(mission.data_units, (flights, uavs, 1))
@@ -77,7 +77,7 @@ class ReplanPolicy:
                 others = np.arange(len(tours)) != u
                 where[others], charge[others] = (array[self._slot][others] for array in self._expected[:2])
                 for v in np.flatnonzero(others):
-                    believed[v] = _rest(self._first.tour[v], self._first.count[v],
+                    believed[v] = _rest(self._first.tour[v], self._first.visits[v],
                                         *(array[self._slot, v] for array in self._expected[3:]))
                 self._take(flight, [u], self._improved(where, charge, self._left(flight, u), believed, u))
 
@@ -98,7 +98,7 @@ class ReplanPolicy:
     def _take(self, flight: int, uavs, found) -> None:
         if found is not None:
             for u in uavs:
-                self._tour[flight, u], self._count[flight, u] = found.tour[u], found.count[u]
+                self._tour[flight, u], self._count[flight, u] = found.tour[u], found.visits[u]
                 self._reached[flight, u] = self._hovered[flight, u] = 0
 
 

@@ -5,7 +5,7 @@ import signal
 import sys
 from pathlib import Path
 
-from marl.experiments.records import finished
+from marl.experiments.records import Run, finished
 from marl.experiments.studies import STUDIES, with_settings
 from radiotwin.cli.console import complain, say, show_warnings_plainly
 from radiotwin.errors import BadInput, RunFailed
@@ -52,17 +52,18 @@ def _run(given: argparse.Namespace) -> None:
         raise BadInput(f"study {given.name!r} is unknown; allowed are {', '.join(STUDIES)}, all")
     seeds, jobs = _count("--seeds", given.seeds), _count("--jobs", given.jobs)
     scenes = given.scenes.split(",")
-    plans = {}
+    plans: dict[str, list[Run]] = {}
     for name in STUDIES if given.name == "all" else [given.name]:
-        if STUDIES[name].runs is None:
+        make_runs = STUDIES[name].runs
+        if make_runs is None:
             plans[name] = []
             continue
-        runs = STUDIES[name].runs(scenes, seeds)
+        runs = make_runs(scenes, seeds)
         if given.only:
             runs = [run for run in runs if any(part in run.name for part in given.only.split(","))]
         if not runs:
             raise BadInput(f"--only {given.only}: no run of {name} has that in its name; they are "
-                           f"{', '.join(sorted({run.name for run in STUDIES[name].runs(scenes, 1)}))}")
+                           f"{', '.join(sorted({run.name for run in make_runs(scenes, 1)}))}")
         plans[name] = with_settings(runs, given.settings)
     if not given.report:
         _check_scenes(scenes)

@@ -15,7 +15,7 @@ def closeloop_table(folder: Path = RESULTS) -> str:
     heads = ["hidden", "seed", "named first", "also named", "recovered", "before [dB]", "after", "oracle"]
     verdicts = [case["verdict"] for case in nothing.values()]
     parts = [f"**Hidden effects in traced cities** ({len(cases)} cases; RMSE of held-out links)\n\n"
-             + markdown(heads, [_case_row(*name.split(":"), case) for name, case in cases.items()]),
+             + markdown(heads, [_case_row(name, case) for name, case in cases.items()]),
              f"**Nothing is hidden**, levels drawn from the fitted base: verdict `none` in {verdicts.count('none')} of "
              f"{len(verdicts)}.",
              "**Real measurements**\n\n" + markdown(
@@ -27,7 +27,8 @@ def closeloop_table(folder: Path = RESULTS) -> str:
     return "\n\n".join(parts)
 
 
-def _case_row(family: str, seed: str, case: dict) -> list[str]:
+def _case_row(name: str, case: dict) -> list[str]:
+    family, seed = name.split(":")
     named = [name for name in case["named"] if name != "correlated_shadowing"]  # interpolation explains nothing
     hidden = {effect["name"] for effect in case["hidden"]}
     first = "–" if not named else f"`{named[0]}`" + (" ✓" if named[0] in hidden else "")

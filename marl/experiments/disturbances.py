@@ -74,6 +74,7 @@ def fly_disturbed(settings: dict, seed: int, folder: Path, keep: Callable[[], No
     judged = make_world(scene, settings["scenario"], linked, settings["truths"], stream(seed, "truth evaluation", 1))
     curve: list[dict] = []
     rng = stream(seed, "decisions")
+    policy: Policy
     if method == "policy":
         learned = make_world(scene, settings["scenario"], linked, settings["truths"], stream(seed, "learning", 1))
         policy, curve = train(learned, settings["episodes"], settings["epsilon_slots"], settings["flights"], seed)
@@ -145,7 +146,8 @@ def train(world: World, episodes: int, epsilon_slots: int, flights: int, seed: i
     trainer = DisturbedTrainer(settings, world.believed, episodes, seed)
     trainer.disturbance = world.disturbance
     best = Learner(settings, world.believed, seed).agent
-    highest, curve = -1.0, []
+    highest = -1.0
+    curve: list[dict] = []
     with progress("training", total=episodes) as advance:
         while trainer.episodes < episodes:
             trainer.enter(world.real[len(curve) % len(world.real)])

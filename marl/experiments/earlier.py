@@ -28,9 +28,9 @@ def earlier_result(run: Run, out: Path) -> tuple[dict, float, float, str] | None
             return result, record["cpu_s"], record["wall_s"], f"{record['study']}/{path.name}"
     if run.kind == "learning":
         wanted = _as_the_benchmark_says(run)
-        for path in sorted(BENCHMARKS.glob("marl_*.json")) if wanted else ():
+        for path in sorted(BENCHMARKS.glob("marl_*.json")) if wanted is not None else ():
             record = json.loads(path.read_text(encoding="utf-8"))
-            for done in record["runs"] if same(wanted, "learning", record["settings"]) else ():
+            for done in record["runs"] if wanted and same(wanted, "learning", record["settings"]) else ():
                 if done["seed"] == run.seed:
                     return {"curve": done["rows"]}, done["cpu_s"], done["wall_s"], path.name
     return None

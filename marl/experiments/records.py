@@ -135,7 +135,7 @@ def code_version() -> str:
     """The first digits of a hash of the sources of both packages: the same for the same code, committed or not."""
     digest = hashlib.sha256()
     for package in (marl, radiotwin):
-        root = Path(package.__file__).parent
+        root = Path(str(package.__file__)).parent
         for path in sorted(root.rglob("*.py")):
             digest.update(path.relative_to(root.parent).as_posix().encode() + path.read_bytes())
     return digest.hexdigest()[:12]

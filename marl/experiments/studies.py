@@ -35,7 +35,7 @@ def curve(scenes: list[str], seeds: int) -> list[Run]:
     for seed in range(seeds):
         for truth in TRUTHS:
             for scene in scenes:
-                here = {"study": "curve", "scene": scene, "truth": truth, "seed": seed}
+                here: dict[str, Any] = {"study": "curve", "scene": scene, "truth": truth, "seed": seed}
                 runs += [learning(algorithm="fedqmix", **here), learning(algorithm="qmix", **here),
                          learning(algorithm="qmix", twin="truth", **here),
                          learning(algorithm="iql", twin="truth", **here), learning(algorithm="planner", **here)]
@@ -102,10 +102,11 @@ def pays(scenes: list[str], seeds: int) -> list[Run]:
 
 def tuning(scenes: list[str], seeds: int) -> list[Run]:
     """What might bring model-aided learning nearer to the planner, one change at a time."""
-    changes = {"as-it-is": {}, "lambda-0.6": {"td_lambda": 0.6}, "lambda-0.95": {"td_lambda": 0.95},
+    changes: dict[str, dict[str, Any]] = {
+               "as-it-is": {}, "lambda-0.6": {"td_lambda": 0.6}, "lambda-0.95": {"td_lambda": 0.95},
                "target-100": {"target_every": 100}, "epsilon-60k": {"epsilon_slots": 60_000},
                "replay-800": {"replay": 800}, "guide": {}, "measure": {}, "measure-guide": {}, "episodes-1600": {}}
-    run_changes = {"guide": {"guide": "planner"}, "measure": {"measure": "planner"},
+    run_changes: dict[str, dict[str, Any]] = {"guide": {"guide": "planner"}, "measure": {"measure": "planner"},
                    "measure-guide": {"measure": "planner", "guide": "planner"}, "episodes-1600": {"episodes": 1600}}
     return [learning("tuning", scene, "traced", seed, "qmix", changes=learner, name=name, **run_changes.get(name, {}))
             for seed in range(seeds) for scene in scenes for name, learner in changes.items()]

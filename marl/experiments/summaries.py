@@ -3,7 +3,7 @@
 from collections import defaultdict
 from itertools import groupby
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -67,7 +67,8 @@ def scenes(records: list[dict]) -> dict[str, dict[str, list[dict]]]:
 def quantiles(errors_m: list[float | None]) -> tuple[float, float, float, float]:
     """Median, 90 % and worst of distances [m], and the share above 100 m; a device without estimate counts as far."""
     errors = np.array([np.inf if error is None else error for error in errors_m], dtype=float)
-    method = "linear" if np.isfinite(errors).all() else "higher"  # nothing lies between a number and infinity
+    # Nothing lies between a number and infinity.
+    method: Literal["linear", "higher"] = "linear" if np.isfinite(errors).all() else "higher"
     return (float(np.median(errors)), float(np.quantile(errors, 0.9, method=method)), float(errors.max()),
             float(np.mean(errors > 100)))
 

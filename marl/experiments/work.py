@@ -39,7 +39,8 @@ class Clock:
 
     def seconds(self) -> tuple[float, float]:
         now = _cpu_s(), time.perf_counter()
-        return tuple(before + there - start for before, there, start in zip(self._before, now, self._start))
+        cpu_s, wall_s = (before + there - start for before, there, start in zip(self._before, now, self._start))
+        return cpu_s, wall_s
 
     def keep(self) -> None:
         """Write down what was needed so far; to be called where the run would go on from."""

@@ -178,7 +178,7 @@ def _lost(parts: list[Part], records: Records | None) -> np.ndarray | float:
     return 1.0 - kept
 
 
-def _unsure_db(parts: list[Part], rows: np.ndarray) -> np.ndarray | float:
+def _unsure_db(parts: list[Part], rows: np.ndarray | slice) -> np.ndarray | float:
     """(n,) standard deviation of what the parts add to links of which nothing was learned; 0 where there is none."""
     return np.sqrt(sum(part.term.unsure_db[rows] ** 2 for part in parts if part.term.unsure_db is not None))
 
