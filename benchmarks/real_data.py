@@ -71,7 +71,7 @@ def powder_frs(data: Path) -> dict:
     folder = data / "powder_frs"
     loop, summary = _close(read_measurements(folder / "measurements.csv.gz"), "flight")
     noise_db = pd.read_csv(folder / "noise_only.csv").groupby("rx_id")["noise_db"].median()
-    floors_db = {name.split("[")[1][:-1]: parameter.value for parameters in loop.parameters()
+    floors_db = {name.split("[")[1][:-1]: parameter.value for parameters in loop.parameters
                  for name, parameter in parameters.items() if name.startswith("floor[")}
     off_db = [floor - noise_db[name] for name, floor in floors_db.items() if name in noise_db]
     return summary | {

@@ -68,8 +68,9 @@ class ResidualField:
         for number in numbers:
             mask = series == number
             points = position_m[mask], residual[mask], kind[mask]
-            self.fields[int(number)] = _merged(*points, most)
-            some.append(_some(_merged(*points, len(residual)), rng))
+            every = _merged(*points, SAME_POINT_M)
+            some.append(_some(every, rng))
+            self.fields[int(number)] = every if len(every.residual) <= most else _coarsened(*points, most)
         self._fit_correlation(some, len(np.unique(kind)) > 1)
         self._factor()
         return self
@@ -163,18 +164,23 @@ class ResidualField:
             self._solved[number] = factor, cho_solve((factor, True), field.residual)
 
 
-def _merged(position_m: np.ndarray, residual: np.ndarray, kind: np.ndarray, most: int) -> _Field:
-    """Repeated visits of one point become their mean; so do neighbours, in cells just wide enough, of more points."""
-    width_m = SAME_POINT_M
-    while True:
-        cells = np.column_stack([np.round(position_m / width_m), kind])
-        _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
-        if len(count) <= most or width_m > np.ptp(position_m, axis=0).max():
-            break
-        width_m *= COARSER
+def _merged(position_m: np.ndarray, residual: np.ndarray, kind: np.ndarray, width_m: float) -> _Field:
+    """Visits of one cell become their mean."""
+    cells = np.column_stack([np.round(position_m / width_m), kind])
+    _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     cell = cell.ravel()
     means = [np.bincount(cell, values) / count for values in (*position_m.T, residual, kind)]
     return _Field(np.column_stack(means[:3]), means[3], means[4].round().astype(int), count)
+
+
+def _coarsened(position_m: np.ndarray, residual: np.ndarray, kind: np.ndarray, most: int) -> _Field:
+    """The same in cells just wide enough for so many points."""
+    width_m = SAME_POINT_M
+    while True:
+        width_m *= COARSER
+        field = _merged(position_m, residual, kind, width_m)
+        if len(field.residual) <= most or width_m > np.ptp(position_m, axis=0).max():
+            return field
 
 
 def _some(field: _Field, rng: np.random.Generator) -> _Field:

@@ -37,7 +37,7 @@ def draw_effects(loop: Loop, ground: Ground, folder: Path) -> None:
     """Write `effect_RANK_NAME.png` for each kept effect; those of an earlier run go."""
     for old in folder.glob("effect_*.png"):
         old.unlink()
-    for number, (part, parameters) in enumerate(zip(loop.after.whole.parts, loop.parameters())):
+    for number, (part, parameters) in enumerate(zip(loop.after.whole.parts, loop.parameters)):
         acting = acting_alone(loop, number, part, parameters)
         _draw(acting, ground, folder / f"effect_{number + 1}_{part.effect.name}.png")
     if loop.after.shadowing:

@@ -84,9 +84,9 @@ def draw_waterfall(report: dict, path: Path) -> None:
 def draw_drivers(loop: Loop, path: Path) -> None:
     """Mean held-out residual against the strongest variables before and after, and what the effects add there."""
     records = loop.after.whole.records
-    values = variables(records, loop.before.held_out_mean_db())
+    values = variables(records, loop.before.held_out_mean_db)
     names = _strongest(loop, values)
-    residual_db = [records.level_db - model.held_out_mean_db() for model in (loop.before, loop.after)]
+    residual_db = [records.level_db - model.held_out_mean_db for model in (loop.before, loop.after)]
     seen = np.isfinite(residual_db[0]) & np.isfinite(residual_db[1])
     block = evidence_blocks(records)
     columns = {1: 1, 2: 2, 4: 2}.get(len(names), 3)

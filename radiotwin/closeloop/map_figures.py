@@ -122,7 +122,7 @@ def draw_residual_map(loop: Loop, ground: Ground, path: Path) -> None:
     if loop.after is not loop.before:
         names = [plainly(entry.name) for entry in loop.search.log if entry.kept]
         panels.append((f"after: with {listed(names) if len(names) < 3 else f'{len(names)} effects'}", loop.after))
-    grids = [ground.cells(records.level_db - model.held_out_mean_db()) for _, model in panels]
+    grids = [ground.cells(records.level_db - model.held_out_mean_db) for _, model in panels]
     figure = new_figure(5.4 * len(panels) + 0.9, ground.height_in(4.9) + 1.3)
     most_db = range_db(grids[0][2])
     for number, ((title, model), grid) in enumerate(zip(panels, grids)):
@@ -141,7 +141,7 @@ def draw_residual_map(loop: Loop, ground: Ground, path: Path) -> None:
 
 def draw_level_map(loop: Loop, ground: Ground, path: Path) -> None:
     """Mean level at the places of the end that moves: measured, as expected of held-out links, and the difference."""
-    records, mean_db = loop.after.whole.records, loop.after.held_out_mean_db()
+    records, mean_db = loop.after.whole.records, loop.after.held_out_mean_db
     seen = np.isfinite(records.level_db) & np.isfinite(mean_db)
     if not seen.any():
         return

@@ -21,7 +21,7 @@ def make_report(loop: Loop) -> dict:
                 "confused_with": list(part.effect.confused_with), "indistinguishable_from": rivals,
                 "evidence": {"heldout_nll_gain": entry.nll_gain, "p_value": entry.p_value}}
                for rank, (entry, part, parameters, rivals) in enumerate(
-                   zip(kept, loop.after.whole.parts, loop.parameters(), loop.search.rivals), start=1)]
+                   zip(kept, loop.after.whole.parts, loop.parameters, loop.search.rivals), start=1)]
     if loop.after.shadowing:
         effects.append(_shadowing(kept[-1], loop.after, len(effects) + 1))
     candidates = [{"name": entry.name, "step": entry.step + 1, "heldout_rmse_db": entry.rmse_db,
@@ -37,7 +37,7 @@ def make_report(loop: Loop) -> dict:
         "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base, "verdict": loop.verdict,
         "effects": effects, "candidates": candidates,
         "heldout": {"by": loop.folds.by, "folds": loop.folds.count,
-                    "n": int(np.isfinite(loop.after.held_out_nll()).sum())},
+                    "n": int(np.isfinite(loop.after.held_out_nll).sum())},
         "error": error, "baselines": baselines,
         "structure_before": [vars(driver) for driver in loop.drivers_before],
         "remaining": {"structured": bool(remaining), "drivers": [vars(driver) for driver in remaining]},
@@ -47,7 +47,7 @@ def make_report(loop: Loop) -> dict:
 def scores(model: Model, rows: np.ndarray | None = None) -> dict[str, float]:
     """Held-out errors of links (all, or those of a mask), as `errors` gives them, and the mean negative log-likelihood
     of detected and blank ones [nats]."""
-    level_db, mean_db, nll = model.whole.records.level_db, model.held_out_mean_db(), model.held_out_nll()
+    level_db, mean_db, nll = model.whole.records.level_db, model.held_out_mean_db, model.held_out_nll
     rows = np.ones(len(level_db), dtype=bool) if rows is None else rows
     return errors(level_db[rows], mean_db[rows]) | {
         "nll": float(np.nanmean(nll[rows])) if np.isfinite(nll[rows]).any() else np.nan}

@@ -17,7 +17,7 @@ def residual_table(loop: Loop) -> pd.DataFrame:
     """
     records = loop.after.whole.records
     device_m = records.device_m[records.device]
-    before_db, after_db = (records.level_db - model.held_out_mean_db() for model in (loop.before, loop.after))
+    before_db, after_db = (records.level_db - model.held_out_mean_db for model in (loop.before, loop.after))
     return pd.DataFrame({
         "time_s": records.time_s, "flight": np.array(records.flight_names)[records.flight],
         "receiver": np.array(records.receiver_names)[records.receiver],

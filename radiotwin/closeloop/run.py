@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -71,8 +72,9 @@ class Loop:
             return "effect"
         return "unexplained" if parts or self.after.shadowing or significant(self.drivers_before) else "none"
 
+    @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:
-        """Of each kept effect."""
+        """Of each kept effect; their intervals take a fit for each end."""
         whole = self.after.whole
         return [part.effect.parameters(whole.records, part.setting, found)
                 for part, found in zip(whole.parts, whole.found(self.after.fits[0]))]
@@ -124,7 +126,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     tell("looking at what is left")
     drivers_after = _drivers(search.model, seed) if search.model is not before else drivers_before
     if significant(drivers_after):
-        values = variables(search.model.whole.records, search.model.held_out_mean_db())
+        values = variables(search.model.whole.records, search.model.held_out_mean_db)
         trends: list[Effect] = [UnexplainedTrend(driver.variable) for driver in significant(drivers_after)
                   if values[driver.variable].dtype.kind == "f"]  # labels have no order that a curve could follow
         search_effects(search, trends[:MOST_TRENDS], seed, tell)
@@ -136,8 +138,8 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
 
 
 def _drivers(model: Model, seed: int) -> list[Driver]:
-    mean_db = model.held_out_mean_db()
-    scale_db = model.held_out(lambda side, fit: side.expect(fit).scale_db)
+    mean_db = model.held_out_mean_db
+    scale_db = model.held_out_expected[1]
     return find_drivers(model.whole.records, model.whole.records.level_db - mean_db, scale_db, mean_db, seed)
 
 

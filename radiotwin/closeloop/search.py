@@ -11,7 +11,7 @@ from radiotwin.closeloop.bases import Base
 from radiotwin.closeloop.folds import Folds, evidence_blocks
 from radiotwin.closeloop.model import Side, add, exactly
 from radiotwin.closeloop.records import Records
-from radiotwin.closeloop.regression import Solution, detected_db, expect, nll_at
+from radiotwin.closeloop.regression import Solution, detected_db, nll_at
 from radiotwin.closeloop.shadowing import NAME as SHADOWING
 from radiotwin.closeloop.shadowing import Shadowing
 from radiotwin.closeloop.significance import gain_p, sign_flip_p
@@ -75,7 +75,6 @@ class Model:
     fits: list[Solution]
     index: np.ndarray
     shadowing: list[Shadowing] = field(default_factory=list)
-    _known: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def sides(self) -> list[Side]:
@@ -98,32 +97,29 @@ class Model:
             shift[mine], left[mine] = shadowing.at(self.folds[number].records.select(mine))
         return shift, left
 
+    @cached_property
+    def held_out_expected(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) expected reading [dB], and (n,) its error scale [dB], with shadowing; NaN where there is none."""
+        mean_db, scale_db = np.full((2, len(self.index)), np.nan)
+        for number, (side, fit) in enumerate(zip(self.folds, self.fits[1:])):
+            mine, expected = self.index == number, side.expect(fit)
+            mean_db[mine], scale_db[mine] = expected.mean_db[mine], expected.scale_db[mine]
+        shift, left = self.held_out_shadowing
+        return mean_db + shift * scale_db, scale_db * left
+
+    @cached_property
     def held_out_nll(self) -> np.ndarray:
         """(n,) negative log-likelihood [nats]; NaN where there is none."""
-        shift, left = self.held_out_shadowing
+        mean_db, scale_db = self.held_out_expected
+        return self.held_out(lambda side, fit: np.where(
+            side.usable, nll_at(side.problem(slice(None)), mean_db, scale_db), np.nan))
 
-        def of(side: Side, fit: Solution) -> np.ndarray:
-            problem = side.problem(slice(None))
-            expected = expect(problem, fit)
-            mean_db = expected.mean_db + shift * expected.scale_db
-            return np.where(side.usable, nll_at(problem, mean_db, expected.scale_db * left), np.nan)
-        return self._once("nll", of)
-
+    @cached_property
     def held_out_mean_db(self) -> np.ndarray:
         """(n,) expected level of a link that is detected [dB]; NaN where there is none."""
-        shift, left = self.held_out_shadowing
-
-        def of(side: Side, fit: Solution) -> np.ndarray:
-            expected = side.expect(fit)
-            mean_db = expected.mean_db + shift * expected.scale_db
-            scale_db = expected.scale_db * left
-            return np.where(side.usable, detected_db(mean_db, scale_db, side.limit_db, side.dof), np.nan)
-        return self._once("mean_db", of)
-
-    def _once(self, name: str, of: Callable[[Side, Solution], np.ndarray]) -> np.ndarray:
-        if name not in self._known:
-            self._known[name] = self.held_out(of)
-        return self._known[name]
+        mean_db, scale_db = self.held_out_expected
+        return self.held_out(lambda side, fit: np.where(
+            side.usable, detected_db(mean_db, scale_db, side.limit_db, side.dof), np.nan))
 
 
 def make_model(records: Records, base: Base, folds: Folds) -> Model:
@@ -341,7 +337,7 @@ def _weigh(model: Model, extended: Model, judged: Judged, block: np.ndarray | No
            nlos_only: bool = False) -> Judged:
     """What held-out links say of an extended model; with the reason where it is to be refused. Without pieces of
     evidence (n,) it may hang on a few places."""
-    gain = model.held_out_nll() - extended.held_out_nll()
+    gain = model.held_out_nll - extended.held_out_nll
     usable, los = np.isfinite(gain), model.whole.records.los
     design_effect = model.whole.view(model.fits[0]).design_effect
 
@@ -372,5 +368,5 @@ def _weigh(model: Model, extended: Model, judged: Judged, block: np.ndarray | No
 
 def rmse_db(model: Model, rows: np.ndarray) -> float:
     """Held-out root mean square error of the detected links among `rows` [dB]."""
-    error = (model.whole.records.level_db - model.held_out_mean_db())[rows]
+    error = (model.whole.records.level_db - model.held_out_mean_db)[rows]
     return float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else np.nan
