@@ -1,19 +1,19 @@
 """`python -m marl.fedqmix`: model-aided federated QMIX (Algorithm 1 of the paper), and what it is held against."""
 
 import argparse
-import signal
 import sys
 from pathlib import Path
 
+from marl.command import exit_status
 from marl.options import add_options, checked
 from marl.settings import EPISODES, LEARNERS, PRESETS, LearnerSettings, RunSettings
-from radiotwin.cli.console import complain, say, show_warnings_plainly
+from radiotwin.cli.console import say
 from radiotwin.cli.output import output
-from radiotwin.errors import BadInput, RunFailed
+from radiotwin.errors import BadInput
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0 done, 1 failed while running, 2 bad input, 130 interrupted."""
+    """Run the command line; returns the exit status (see `exit_status`)."""
     parser = argparse.ArgumentParser(
         prog="python -m marl.fedqmix", allow_abbrev=False,
         description="Train UAVs to harvest data inside a twin that is learnt from few real flights, and judge them in "
@@ -26,21 +26,7 @@ def main(arguments: list[str] | None = None) -> int:
     add_options(parser, RunSettings, "run", without=set())
     add_options(parser, LearnerSettings, "learning (defaults: those of the preset fast)", without={"mix"})
     given = parser.parse_args(arguments)
-    try:
-        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-        show_warnings_plainly()
-        with output(given.quiet, given.json):
-            _run(given)
-        return 0
-    except BadInput as error:
-        complain(str(error))
-        return 2
-    except RunFailed as error:
-        complain(str(error))
-        return 1
-    except KeyboardInterrupt:
-        complain("interrupted; the finished rounds are kept: the same command with --resume goes on")
-        return 130
+    return exit_status(lambda: _run(given), "the finished rounds are kept")
 
 
 def settings_of(given: argparse.Namespace) -> tuple[RunSettings, LearnerSettings]:
@@ -63,13 +49,14 @@ def settings_of(given: argparse.Namespace) -> tuple[RunSettings, LearnerSettings
 
 
 def _run(given: argparse.Namespace) -> None:
-    run, learner = settings_of(given)
+    with output(given.quiet, given.json):
+        run, learner = settings_of(given)
 
-    from marl.session import Session  # torch and all: not for --help
+        from marl.session import Session  # torch and all: not for --help
 
-    out = given.out or Path("runs") / f"{run.scene.name}-{run.truth}-{run.twin}-{run.algorithm}-{run.seed}"
-    Session(run, learner, out, given.resume).execute()
-    say(f"wrote {out}")
+        out = given.out or Path("runs") / f"{run.scene.name}-{run.truth}-{run.twin}-{run.algorithm}-{run.seed}"
+        Session(run, learner, out, given.resume).execute()
+        say(f"wrote {out}")
 
 
 if __name__ == "__main__":

@@ -37,6 +37,27 @@ class Plan(NamedTuple):
     visits: np.ndarray
 
 
+class TourFlight(NamedTuple):
+    """Where UAVs that follow tours are, and what they work with.
+
+    Attributes:
+        cell: (U, 2) int64 row and column.
+        battery: (U,) int64 slots that are left.
+        left: (K,) data units that are expected to be left.
+        reached, hovered: (U,) int64 waypoints behind each UAV, and hovers flown at the next one.
+        strength, assigned, mask: room for the choice of devices and actions, which a slot overwrites.
+    """
+
+    cell: np.ndarray
+    battery: np.ndarray
+    left: np.ndarray
+    reached: np.ndarray
+    hovered: np.ndarray
+    strength: np.ndarray
+    assigned: np.ndarray
+    mask: np.ndarray
+
+
 class PlanPolicy:
     """Flies the (T, U) actions of a plan, in all flights the same."""
 
@@ -158,14 +179,19 @@ def next_action(mission, uav, row, column, battery, tour, count, reached, hovere
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _fly_tour(mission, value, tour, count, actions):
-    """Expected share of the data that a tour collects; its actions are written into `actions`."""
+def take_off(mission, devices):
+    """The UAVs before the first slot."""
+    uavs = len(mission.battery)
+    return TourFlight(mission.start.copy(), mission.battery.copy(), mission.data_units.copy(),
+                      np.zeros(uavs, np.int64), np.zeros(uavs, np.int64), np.empty((uavs, devices)),
+                      np.empty(uavs, np.int16), np.empty(ACTION_COUNT, np.bool_))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def fly_on(mission, value, tour, count, flight, actions):
+    """As many slots along the tours as `actions` (T, U) has room for, with the data that is expected."""
+    cell, battery, left, reached, hovered, strength, assigned, mask = flight
     uavs, devices = value.shape[:2]
-    cell, battery = mission.start.copy(), mission.battery.copy()
-    left = mission.data_units.copy()
-    reached, hovered = np.zeros(uavs, np.int64), np.zeros(uavs, np.int64)
-    assigned, strength = np.empty(uavs, np.int16), np.empty((uavs, devices))
-    mask = np.empty(ACTION_COUNT, np.bool_)
     for slot in range(len(actions)):
         for u in range(uavs):
             for k in range(devices):
@@ -182,7 +208,14 @@ def _fly_tour(mission, value, tour, count, actions):
             cell[u, 0] += MOVES[action, 0]
             cell[u, 1] += MOVES[action, 1]
             battery[u] -= COSTS[action]
-    return 1.0 - left.sum() / mission.data_units.sum()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _fly_tour(mission, value, tour, count, actions):
+    """Expected share of the data that a tour collects; its actions are written into `actions`."""
+    flight = take_off(mission, value.shape[1])
+    fly_on(mission, value, tour, count, flight, actions)
+    return 1.0 - flight.left.sum() / mission.data_units.sum()
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

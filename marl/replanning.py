@@ -3,9 +3,9 @@
 import numpy as np
 from numba import njit
 
-from marl.environment import ACTION_COUNT, Frame, assign
-from marl.mission import COSTS, MOVES, Mission
-from marl.planner import expected_data, improve, next_action, plan
+from marl.environment import ACTION_COUNT, Frame
+from marl.mission import Mission
+from marl.planner import expected_data, fly_on, improve, next_action, plan, take_off
 
 WARM = 0.005  # temperature of a search that goes on from a plan: it is kept unless another is better
 
@@ -133,25 +133,9 @@ def _expected_flight(mission, value, tour, count):
     cells, batteries = np.empty((slots, uavs, 2), np.int64), np.empty((slots, uavs), np.int64)
     lefts = np.empty((slots, devices))
     reacheds, hovereds = np.empty((slots, uavs), np.int64), np.empty((slots, uavs), np.int64)
-    cell, battery, left = mission.start.copy(), mission.battery.copy(), mission.data_units.copy()
-    reached, hovered = np.zeros(uavs, np.int64), np.zeros(uavs, np.int64)
-    assigned, strength = np.empty(uavs, np.int16), np.empty((uavs, devices))
-    mask = np.empty(ACTION_COUNT, np.bool_)
+    flight, actions = take_off(mission, devices), np.empty((1, uavs), np.int8)
     for slot in range(slots):
-        cells[slot], batteries[slot], lefts[slot] = cell, battery, left
-        reacheds[slot], hovereds[slot] = reached, hovered
-        for u in range(uavs):
-            for k in range(devices):
-                worth = value[u, k, cell[u, 0], cell[u, 1]]
-                strength[u, k] = worth if battery[u] > 0 and left[k] > 0 and worth > 0 else -np.inf
-        assign(strength, mission.max_rate, assigned)
-        for u in range(uavs):
-            k = assigned[u]
-            if k >= 0:
-                left[k] = max(left[k] - value[u, k, cell[u, 0], cell[u, 1]], 0.0)
-            action, reached[u], hovered[u] = next_action(mission, u, cell[u, 0], cell[u, 1], battery[u], tour[u],
-                                                         count[u], reached[u], hovered[u], mask)
-            cell[u, 0] += MOVES[action, 0]
-            cell[u, 1] += MOVES[action, 1]
-            battery[u] -= COSTS[action]
+        cells[slot], batteries[slot], lefts[slot] = flight.cell, flight.battery, flight.left
+        reacheds[slot], hovereds[slot] = flight.reached, flight.hovered
+        fly_on(mission, value, tour, count, flight, actions)
     return cells, batteries, lefts, reacheds, hovereds

@@ -1,20 +1,20 @@
 """`python -m marl.experiments`: run a study, and make its table and figures."""
 
 import argparse
-import signal
 import sys
 from pathlib import Path
 
+from marl.command import exit_status
 from marl.experiments.records import Run, finished
 from marl.experiments.studies import STUDIES, with_settings
-from radiotwin.cli.console import complain, say, show_warnings_plainly
-from radiotwin.errors import BadInput, RunFailed
+from radiotwin.cli.console import say
+from radiotwin.errors import BadInput
 
 OUT, FIGURES = Path("docs/results/experiments"), Path("docs/results/figures")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0 done, 1 failed while running, 2 bad input, 130 interrupted."""
+    """Run the command line; returns the exit status (see `exit_status`)."""
     studies = "\n".join(f"  {name:11} {study.question}" for name, study in STUDIES.items())
     parser = argparse.ArgumentParser(
         prog="python -m marl.experiments", allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter,
@@ -31,20 +31,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--jobs", metavar="INTEGER", default="1", help="runs side by side, a core each [1]")
     parser.add_argument("--out", type=Path, default=OUT, help=f"folder of the JSON files and tables [{OUT}]")
     given = parser.parse_args(arguments)
-    try:
-        signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
-        show_warnings_plainly()
-        _run(given)
-        return 0
-    except BadInput as error:
-        complain(str(error))
-        return 2
-    except RunFailed as error:
-        complain(str(error))
-        return 1
-    except KeyboardInterrupt:
-        complain("interrupted; what is finished is kept: the same command with --resume goes on")
-        return 130
+    return exit_status(lambda: _run(given), "what is finished is kept")
 
 
 def _run(given: argparse.Namespace) -> None:

@@ -3,7 +3,6 @@
 import os
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from radiotwin.measurements import Measurements, read_measurements
@@ -25,17 +24,6 @@ def folder():
             pytest.skip(f"{DATA / name} is not there: docs/real-data.md says where to get it; name its folder in "
                         "RADIOTWIN_DATA")
         return DATA / name
-    return of
-
-
-@pytest.fixture(scope="session")
-def permuted():
-    """Measurements whose levels have changed places within each device."""
-    def of(measurements: Measurements, seed: int) -> Measurements:
-        table, rng = measurements.table.copy(), np.random.default_rng(seed)
-        column = measurements.level_column
-        table[column] = table.groupby("device")[column].transform(lambda levels: rng.permutation(levels.to_numpy()))
-        return Measurements(table, measurements.devices)
     return of
 
 
