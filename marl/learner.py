@@ -13,6 +13,7 @@ from marl.flights import Flights
 from marl.mission import Mission
 from marl.networks import Agent, Mixer
 from marl.settings import LearnerSettings
+from radiotwin.channel.adam import Adam
 
 GRADIENT_NORM = 10.0
 
@@ -35,7 +36,7 @@ class Learner:
         if settings.mix:
             self.mixer = Mixer(state_size(mission), mission.uavs, settings.mixing_width, generator).to(device)
         self.target_agent, self.target_mixer = copy.deepcopy(self.agent), copy.deepcopy(self.mixer)
-        self.optimiser = torch.optim.Adam(self.parameters(), lr=settings.learning_rate, foreach=True)
+        self.optimiser = Adam(self.parameters())
 
     def parameters(self) -> list[Tensor]:
         """Weights of agent and mixer."""
@@ -68,11 +69,9 @@ class Learner:
         if self.mixer:
             chosen = self.mixer(chosen, state)
         loss = ((chosen - target) * valid).square().sum() / (valid.sum() * chosen[0, 0].numel())
-        self.optimiser.param_groups[0]["lr"] = learning_rate
-        self.optimiser.zero_grad()
-        loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.parameters(), GRADIENT_NORM)
-        self.optimiser.step()
+        gradients = torch.autograd.grad(loss, self.parameters())
+        norm = torch.stack([gradient.norm() for gradient in gradients]).norm()
+        self.optimiser.step([gradient * (GRADIENT_NORM / norm).clamp(max=1.0) for gradient in gradients], learning_rate)
         self.updates += 1
         if self.updates % settings.target_every == 0:
             self.copy_to_target()
@@ -122,10 +121,9 @@ class Learner:
             (f"{module}.{name}", parameter) for module, network in modules.items() if network
             for name, parameter in network.named_parameters()]
         if self.settings.federate_all:
-            # The moments exist after the first update, in all replicas alike.
-            named += [(f"{moment}.{number}", self.optimiser.state[parameter][moment])
-                      for number, parameter in enumerate(self.parameters()) if self.optimiser.state[parameter]
-                      for moment in ("exp_avg", "exp_avg_sq")]
+            moments = {"mean": self.optimiser.mean, "square": self.optimiser.square}
+            named += [(f"{moment}.{number}", tensor) for moment, tensors in moments.items()
+                      for number, tensor in enumerate(tensors)]
         return named
 
     def state(self) -> dict:

@@ -12,6 +12,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 from rich.console import Console
+from scipy.constants import speed_of_light
 
 from radiotwin import llvm
 
@@ -35,7 +36,7 @@ scene.add(sionna.rt.Receiver("receiver", [100, 0, 10]))
 real, imaginary = sionna.rt.PathSolver(deterministic=True)(scene, max_depth=0).a
 print(10 * np.log10(float((np.square(real) + np.square(imaginary)).sum())))
 """
-_FREE_SPACE_GAIN_DB = 20 * math.log10(299_792_458 / 2.4e9 / (4 * math.pi * 100))  # Friis, the same link
+_FREE_SPACE_GAIN_DB = 20 * math.log10(speed_of_light / 2.4e9 / (4 * math.pi * 100))  # Friis, the same link
 _TESTED_VERSIONS = "install the versions of sionna-rt, mitsuba and drjit that constraints.txt names"
 
 

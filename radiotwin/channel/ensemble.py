@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from radiotwin.channel.adam import Adam
 from radiotwin.channel.likelihood import gaussian_nll_torch
 from radiotwin.progress import progress
 
@@ -73,33 +74,6 @@ def _start(generator: torch.Generator) -> dict[str, torch.Tensor]:
     return weights
 
 
-class _AdamW:
-    """Adam (Kingma and Ba 2015, algorithm 1) with decoupled weight decay on the matrices (Loshchilov and Hutter 2019).
-
-    Here because torch.optim takes two seconds to import.
-    """
-
-    def __init__(self, tensors: dict[str, torch.Tensor]) -> None:
-        self.tensors = [tensor.requires_grad_() for tensor in tensors.values()]
-        self.decay = [WEIGHT_DECAY if name.startswith("w") else 0.0 for name in tensors]
-        self.mean = [torch.zeros_like(tensor) for tensor in self.tensors]
-        self.square = [torch.zeros_like(tensor) for tensor in self.tensors]
-        self.count = 0
-
-    def step(self, loss: torch.Tensor, rate: float) -> None:
-        gradients = torch.autograd.grad(loss, self.tensors)
-        self.count += 1
-        unbias_mean, unbias_square = 1.0 - 0.9**self.count, 1.0 - 0.999**self.count
-        with torch.no_grad():
-            for tensor, gradient, mean, square, decay in zip(
-                self.tensors, gradients, self.mean, self.square, self.decay, strict=True
-            ):
-                mean.lerp_(gradient, 0.1)
-                square.lerp_(gradient.square(), 0.001)
-                tensor.mul_(1.0 - rate * decay)
-                tensor.addcdiv_(mean, (square / unbias_square).sqrt_().add_(1e-8), value=-rate / unbias_mean)
-
-
 def train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Weights by name, (members, ...) each, and the (n,) output for every link of the member that never saw it.
 
@@ -119,7 +93,8 @@ def _train(data: TrainingData, generator: torch.Generator) -> tuple[dict[str, np
     share = held_out.sum(1).clamp(min=1)
 
     weights, log_sigma = _start(generator), torch.zeros(MEMBERS, 2)
-    optimiser = _AdamW({**weights, "log_sigma": log_sigma})
+    learnt = [tensor.requires_grad_() for tensor in (*weights.values(), log_sigma)]
+    optimiser = Adam(learnt, [WEIGHT_DECAY if name.startswith("w") else 0.0 for name in (*weights, "log_sigma")])
     best = {name: tensor.detach().clone() for name, tensor in weights.items()}
     best_loss = torch.full((MEMBERS,), torch.inf)
     last_better = 0
@@ -147,7 +122,8 @@ def _train(data: TrainingData, generator: torch.Generator) -> tuple[dict[str, np
             rows = order[at : at + BATCH]
             at += BATCH
             loss = torch.where(held_out[:, rows], 0.0, loss_of(rows)).mean(1).sum()
-            optimiser.step(loss, LEARNING_RATE * (0.51 + 0.49 * math.cos(math.pi * step / STEPS)))
+            rate = LEARNING_RATE * (0.51 + 0.49 * math.cos(math.pi * step / STEPS))
+            optimiser.step(torch.autograd.grad(loss, learnt), rate)
             advance(1)
     with torch.no_grad():
         unseen = forward(best, inputs)[fold, torch.arange(len(target))]

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 
 from radiotwin.closeloop.records import Records
 from radiotwin.errors import BadInput
@@ -85,7 +86,7 @@ def evidence_blocks(records: Records) -> np.ndarray:
     keys = np.column_stack([*ends, records.receiver, records.flight])
     if len(records.device_names) <= 1000:
         keys = np.column_stack([keys, records.device])
-    return np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+    return pd.DataFrame(keys).groupby(list(range(keys.shape[1]))).ngroup().to_numpy()
 
 
 def _flights_are_alike(records: Records) -> bool:

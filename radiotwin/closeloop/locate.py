@@ -94,8 +94,8 @@ def locate(model: Corrected, records: Records, area_m: tuple[float, float, float
             tell()
             continue
         fine_m, fine_width_m = _finer(_log_likelihood(model, mine, coarse_m), model.temper, coarse_m, width_m)
-        share = _share(model.temper * _log_likelihood(model, mine, fine_m))
-        yield _place(int(device), fine_m, share, fine_width_m, len(mine), cdist(fine_m, fine_m))
+        yield _place(int(device), fine_m, _log_likelihood(model, mine, fine_m), model.temper, fine_width_m, len(mine),
+                     cdist(fine_m, fine_m))
         tell()
 
 
@@ -136,7 +136,7 @@ def calibrated_temper(models: list[Corrected], held_out: list[Records], area_m: 
         fine_m, fine_width_m = _finer(_log_likelihood(model, mine, coarse_m), TEMPERS[-1], coarse_m, width_m)
         log_likelihood, apart_m = _log_likelihood(model, mine, fine_m), cdist(fine_m, fine_m)
         for i, temper in enumerate(TEMPERS):
-            place = _place(int(device), fine_m, _share(temper * log_likelihood), fine_width_m, 0, apart_m)
+            place = _place(int(device), fine_m, log_likelihood, temper, fine_width_m, 0, apart_m)
             inside[i] += np.hypot(*(records.device_m[device, :2] - (place.x_m, place.y_m))) <= place.radius_m
     enough = np.flatnonzero(inside >= CREDIBLE * len(chosen))
     return float(TEMPERS[enough[0]] if len(enough) else TEMPERS[-1])
@@ -145,7 +145,7 @@ def calibrated_temper(models: list[Corrected], held_out: list[Records], area_m: 
 def device_spread_db(side: Side, fit: Solution) -> float:
     """Standard deviation of what the training links of a device have in common [dB], beyond what single links make of
     their mean (method of moments)."""
-    problem = side.problem(side.train)
+    problem = side.training
     expected = expect(problem, fit)
     slope = np.broadcast_to(expected.slope, problem.level_db.shape)
     # At a receiver that passes little on a device's own level does not show.
@@ -203,12 +203,13 @@ def _share(log_likelihood: np.ndarray) -> np.ndarray:
     return share / share.sum()
 
 
-def _place(device: int, places_m: np.ndarray, share: np.ndarray, width_m: float, links: int,
+def _place(device: int, places_m: np.ndarray, log_likelihood: np.ndarray, temper: float, width_m: float, links: int,
            apart_m: np.ndarray) -> Place:
-    """Of places (c, 2) with shares (c,) of the probability, apart (c, c) [m]."""
-    best = int((apart_m @ share).argmin())
+    """Of places (c, 2) with a likelihood (c,), apart (c, c) [m]. The likelihood as it is says where, the tempered one
+    how surely."""
+    best = int((apart_m @ _share(log_likelihood)).argmin())
     order = np.argsort(apart_m[best])
-    reached = int(np.searchsorted(np.cumsum(share[order]), CREDIBLE))
+    reached = int(np.searchsorted(np.cumsum(_share(temper * log_likelihood)[order]), CREDIBLE))
     radius_m = apart_m[best][order[min(reached, len(order) - 1)]] + width_m / 2
     return Place(device, float(places_m[best, 0]), float(places_m[best, 1]), float(radius_m), links)
 

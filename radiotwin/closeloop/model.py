@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
+from radiotwin.closeloop import regression
 from radiotwin.closeloop.bases import ANY_LEVEL_DB, FittedBase
 from radiotwin.closeloop.records import Records
 from radiotwin.closeloop.regression import Expected, Problem, Solution, covariance, expect, nll, residual_db, solve
@@ -85,9 +86,14 @@ class Side:
             records.level_db[rows], self.limit_db[rows],
             self.base_db[rows], self.base_columns[rows], _bend(parts, "paths", mine, rows),
             sum((term.offset_db[rows] for term in terms), np.zeros(len(self.base_db[rows]))),
-            np.hstack([np.zeros((len(self.base_db[rows]), 0)), *(term.columns[rows] for term in terms)]),
+            regression.design([term.columns[rows] for term in terms], len(self.base_db[rows])),
             np.concatenate([self.base_spread, *(term.spread_db for term in terms)]), self.group[rows],
             _bend(parts, "receiver", mine, rows), self.dof, _lost(parts, mine), _unsure_db(parts, rows))
+
+    @cached_property
+    def training(self) -> Problem:
+        """The regression on the training links."""
+        return self.problem(self.train)
 
     @cached_property
     def limit_db(self) -> np.ndarray:
@@ -100,7 +106,7 @@ class Side:
 
     def fit(self, start: Solution | None = None) -> Solution:
         """Fit to the training links."""
-        return solve(self.problem(self.train), start)
+        return solve(self.training, start)
 
     def expect(self, solution: Solution) -> Expected:
         """What is expected of all links."""
@@ -108,9 +114,8 @@ class Side:
 
     def view(self, solution: Solution) -> View:
         """The training links as an effect sees them."""
-        problem = self.problem(self.train)
-        expected = expect(problem, solution)
-        return View(self.records.select(self.train), residual_db(problem, solution), expected.scale_db,
+        expected = expect(self.training, solution)
+        return View(self.records.select(self.train), residual_db(self.training, solution), expected.scale_db,
                     expected.mean_db, self.base.shifted_db,
                     tuple((part.effect.name, part.setting) for part in self.parts))
 
@@ -123,7 +128,7 @@ class Side:
     def found(self, solution: Solution) -> list[Found]:
         """Of each part: what was fitted, and how surely, in view of how many links count as one."""
         design_effect = self.view(solution).design_effect
-        spread = design_effect * covariance(self.problem(self.train), solution)
+        spread = design_effect * covariance(self.training, solution)
         return [Found(solution.coefficients[place], spread[place, place],
                       np.sqrt(design_effect) * self._setting_sides(number, solution))
                 for number, place in enumerate(self.places)]

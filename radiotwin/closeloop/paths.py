@@ -5,10 +5,11 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+from scipy.constants import speed_of_light
 
 from radiotwin.closeloop.records import Records
 from radiotwin.paths import path_powers
-from radiotwin.paths.powers import COMPONENTS, SECTORS, SPEED_OF_LIGHT_M_S
+from radiotwin.paths.powers import COMPONENTS, SECTORS
 from radiotwin.scene.citymap import CityMap
 
 GRID_M = 1.0  # estimated positions of devices, which no estimate tells better, are rounded to it and share their paths
@@ -38,7 +39,7 @@ def free_space(records: Records) -> np.ndarray:
     the straight line is all that is known."""
     if records.city is None:
         return np.zeros(len(records))
-    return (SPEED_OF_LIGHT_M_S / records.frequency_hz / (4 * np.pi * records.distance_m)) ** 2
+    return (speed_of_light / records.frequency_hz / (4 * np.pi * records.distance_m)) ** 2
 
 
 def through_antenna_db(power: np.ndarray, gain: np.ndarray, scattered: np.ndarray, mean_gain: float) -> np.ndarray:

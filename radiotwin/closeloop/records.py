@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 import pandas as pd
+from scipy.constants import speed_of_light
 
 from radiotwin.closeloop.oddities import (
     LEAST_ROWS,
@@ -147,7 +148,7 @@ class Records:
         greatest = np.full(len(self), np.nan)
         if self.city is None or np.isnan(self.frequency_hz):
             return greatest
-        wavelength_m = 299_792_458.0 / self.frequency_hz
+        wavelength_m = speed_of_light / self.frequency_hz
         for start in range(0, len(self), ROWS_AT_ONCE):
             rows = slice(start, start + ROWS_AT_ONCE)
             a_m, b_m = self.device_m[self.device[rows], None], self.receiver_m[rows, None]

@@ -15,6 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import csr_array, issparse
 from scipy.special import gammaln, stdtr
 
 LEAST_SCALE_DB = 0.05
@@ -23,10 +24,17 @@ ITERATIONS = 40
 TOLERANCE = 1e-3  # nats
 CURVATURE = 1e-6  # least, so that every step is defined
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(7)  # of levels that may arrive
+MOSTLY_ZERO = 0.2  # of a design at most is not zero where it is kept sparse
 OWN_SHARE = 0.5  # of the error scale, which a receiver's own noise has where it passes nothing on
 
 Bend = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 """Mean level [dB] -> what becomes of it [dB], and the slope of that."""
+
+
+def design(parts: list[np.ndarray], links: int) -> np.ndarray | csr_array:
+    """Columns (n, …) side by side; sparse where most is zero, as effects of single receivers are."""
+    columns = np.hstack([np.zeros((links, 0)), *parts])
+    return csr_array(columns) if np.count_nonzero(columns) < MOSTLY_ZERO * columns.size else columns
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +48,7 @@ class Problem:
         law_columns: (n, p0) design of the base's part that is fitted.
         paths: what is added to the base's power on the way; None = nothing.
         gain_db: (n,) part of the effects that is given.
-        gain_columns: (n, p1) design of the effects' part that is fitted.
+        gain_columns: (n, p1) design of the effects' part that is fitted, see `design`.
         spread_db: (p0 + p1,) prior standard deviation of each coefficient around zero; inf = free.
         group: (n,) index of the error scale.
         receiver: what the receiver does to the level that arrives; None = nothing.
@@ -55,7 +63,7 @@ class Problem:
     law_columns: np.ndarray
     paths: Bend | None
     gain_db: np.ndarray
-    gain_columns: np.ndarray
+    gain_columns: np.ndarray | csr_array
     spread_db: np.ndarray
     group: np.ndarray
     receiver: Bend | None
@@ -63,26 +71,23 @@ class Problem:
     lost: np.ndarray | float = 0.0
     unsure_db: np.ndarray | float = 0.0
 
-    def arriving(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(n,) expected level before the receiver [dB], and (n, p) its derivative in the coefficients.
+    def arriving(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """(n,) expected level before the receiver [dB], and (n,) its slope in the law; None where that is one.
 
         paths(law) + gains: gains act on all paths, whatever they are.
         """
-        split = self.law_columns.shape[1]
+        split, slope = self.law_columns.shape[1], None
         level_db = self.law_db + self.law_columns @ coefficients[:split]
-        columns = self.law_columns
         if self.paths is not None:
             level_db, slope = self.paths(level_db)
-            columns = columns * slope[:, None]
-        level_db = level_db + self.gain_db + self.gain_columns @ coefficients[split:]
-        return level_db, np.hstack([columns, self.gain_columns])
+        return level_db + self.gain_db + self.gain_columns @ coefficients[split:], slope
 
     def expect(self, coefficients: np.ndarray, scale_db: np.ndarray) -> "Expected":
         """What is read, for error scales (groups,) [dB]."""
-        arriving_db, columns = self.arriving(coefficients)
+        arriving_db, law_slope = self.arriving(coefficients)
         scale = np.hypot(scale_db[self.group], self.unsure_db)
         if self.receiver is None:
-            return Expected(arriving_db, scale, columns, np.ones(1), np.zeros(1), np.ones(1))
+            return Expected(arriving_db, scale, law_slope, np.ones(1), np.zeros(1), np.ones(1))
         mean, square, slope, both = np.zeros((4, len(arriving_db)))
         for node, weight in zip(NODES, WEIGHTS / WEIGHTS.sum()):
             level_db, passed = self.receiver(arriving_db + node * scale)
@@ -96,7 +101,7 @@ class Problem:
         share = 1 - own / scale**2  # so that what passes unbent keeps its scale
         total = own + share * variance
         growth = share * (both - mean * (slope - 1)) / total
-        return Expected(arriving_db + mean, np.sqrt(total), columns, slope, growth, variance / total)
+        return Expected(arriving_db + mean, np.sqrt(total), law_slope, slope, growth, variance / total)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +110,7 @@ class Expected:
 
     Attributes:
         mean_db, scale_db: (n,) of the reading.
-        columns: (n, p) derivative of the arriving level in the coefficients.
+        law_slope: (n,) of the arriving level in the law; None where it is one.
         slope: (n,) of the mean in the arriving level; or one for all.
         growth: (n,) of log(scale) in it [1/dB]; or one for all.
         passed: (n,) share of scale_db² that has come through the receiver; or one for all.
@@ -113,7 +118,7 @@ class Expected:
 
     mean_db: np.ndarray
     scale_db: np.ndarray
-    columns: np.ndarray
+    law_slope: np.ndarray | None
     slope: np.ndarray
     growth: np.ndarray
     passed: np.ndarray
@@ -204,10 +209,24 @@ def residual_db(problem: Problem, solution: Solution) -> np.ndarray:
 def _least_squares(problem: Problem) -> np.ndarray:
     seen = np.isfinite(problem.level_db)
     expected = problem.expect(np.zeros(len(problem.spread_db)), np.full(int(problem.group.max()) + 1, FIRST_SCALE_DB))
-    mean, columns = expected.mean_db, expected.columns * expected.slope[:, None]
-    precision = np.square(FIRST_SCALE_DB / problem.spread_db) + 1e-6
-    return np.linalg.solve(columns[seen].T @ columns[seen] + np.diag(precision),
-                           columns[seen].T @ (problem.level_db - mean)[seen])
+    pull = np.where(seen, expected.slope * (problem.level_db - expected.mean_db), 0.0)
+    slope, squares = _moments(problem, expected, pull, np.where(seen, expected.slope**2, 0.0))
+    return np.linalg.solve(squares + np.diag(np.square(FIRST_SCALE_DB / problem.spread_db) + 1e-6), slope)
+
+
+def _moments(problem: Problem, expected: Expected, pull: np.ndarray,
+             weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """X' pull (p,) and X' diag(weight) X (p, p), X being the derivative of the arriving level in the coefficients."""
+    law, gains = problem.law_columns, problem.gain_columns
+    if expected.law_slope is not None:
+        law = law * expected.law_slope[:, None]
+    weighted = law * weight[:, None]
+    between = gains.T @ weighted
+    squares = gains.T @ (gains * weight[:, None])
+    if issparse(squares):
+        squares = squares.toarray()
+    return (np.concatenate([law.T @ pull, gains.T @ pull]),
+            np.block([[law.T @ weighted, between.T], [between, squares]]))
 
 
 def nll_at(problem: Problem, mean: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -237,8 +256,8 @@ def _slope_and_hessian(problem: Problem, expected: Expected, precision: np.ndarr
     growth, dof = expected.growth, problem.dof
     pull = slope * expected.slope + spread * growth
     bending = curvature * expected.slope**2 + 2 * dof / (dof + 3) * growth**2  # (Lange et al. 1989, Fisher information)
-    hessian = (expected.columns.T * bending) @ expected.columns + np.diag(precision + 1e-9)
-    return expected.columns.T @ pull, hessian
+    toward, hessian = _moments(problem, expected, pull, bending)
+    return toward, hessian + np.diag(precision + 1e-9)
 
 
 def _derivatives(problem: Problem, expected: Expected):

@@ -38,7 +38,7 @@ class Shadowing:
     @classmethod
     def fit(cls, side: Side, solution: Solution, seed: int) -> "Shadowing":
         """Learn from the training links of a side what its base and effects leave over."""
-        problem = side.problem(side.train)
+        problem = side.training
         z = np.clip(residual_db(problem, solution) / expect(problem, solution).scale_db, -MOST_Z, MOST_Z)
         sigma = max(float(z.std()), 1e-6)
         shadowing = cls(ResidualField(), sigma, receivers_move(side.records))

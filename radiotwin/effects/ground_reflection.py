@@ -8,9 +8,9 @@ surface', Proc. IRE 41). Heights that are known to σ only smear the fringes by 
 """
 
 import numpy as np
+from scipy.constants import speed_of_light
 
 from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, some
-from radiotwin.effects.missing_obstacle import LIGHT_M_S
 from radiotwin.paths.coefficients import VACUUM_PERMITTIVITY_F_M, fresnel
 from radiotwin.scene.materials import permittivity
 
@@ -48,7 +48,7 @@ class GroundReflection(Effect):
         rows = some(np.flatnonzero(view.records.los), ENOUGH_LINKS)
         part, weight = view.records.select(rows), view.weight[rows]
         share = view.records.los.sum() / max(len(rows), 1)
-        wavelength_m = LIGHT_M_S / part.frequency_hz
+        wavelength_m = speed_of_light / part.frequency_hz
 
         def squares(offset_db):
             rest = view.residual_db[rows] - offset_db
@@ -114,7 +114,7 @@ def two_ray_db(device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float
     heights_m = [np.maximum(end_m[:, 2] - ground_m, LEAST_HEIGHT_M) for end_m in (device_m, receiver_m)]
     flat_m = np.hypot(*(receiver_m - device_m)[:, :2].T)
     direct_m, bounced_m = (np.maximum(np.hypot(flat_m, heights_m[1] + sign * heights_m[0]), 1.0) for sign in (-1, 1))
-    wave_number = 2 * np.pi * frequency_hz / LIGHT_M_S
+    wave_number = 2 * np.pi * frequency_hz / speed_of_light
     real, conductivity_s_m, _ = permittivity("medium_dry_ground", frequency_hz)
     ground = complex(real, -conductivity_s_m / (2 * np.pi * frequency_hz * VACUUM_PERMITTIVITY_F_M))
     sine = np.minimum((heights_m[0] + heights_m[1]) / bounced_m, 1.0)

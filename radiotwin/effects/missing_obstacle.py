@@ -11,6 +11,7 @@ from functools import lru_cache
 
 import numpy as np
 import trimesh
+from scipy.constants import speed_of_light
 
 from radiotwin.effects.base import QUANTILE_90, Effect, Parameter, Term, Variation, View
 from radiotwin.effects.boxes import (
@@ -27,7 +28,6 @@ from radiotwin.effects.boxes import (
 )
 from radiotwin.scene.citymap import CityMap
 
-LIGHT_M_S = 299_792_458.0
 LEAST_NATS = 6.0
 NEAR_M = 25.0  # links that pass farther from it are not worked out anew
 LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)
@@ -77,7 +77,7 @@ class MissingObstacle(Effect):
             value[hit] for value in crossing[1:])
         over_m, first_m, second_m = np.maximum(enter_over_m, leave_over_m), before_m + between_m / 2, \
             behind_m + between_m / 2
-        wavelength_m = LIGHT_M_S / records.frequency_hz
+        wavelength_m = speed_of_light / records.frequency_hz
         mine = records.select(rows)
         scattered_db = at(mine.with_los(np.zeros(len(rows), bool))) - at(mine)
         power = 10 ** (np.minimum(scattered_db + setting["scattered_db"], 0) / 10) if records.city is not None else 0.0

@@ -48,7 +48,7 @@ class NoiseFloor(Effect):
         floor = np.full(len(records.receiver_names), usual)
         for receiver, floor_db in setting["receivers"].items():
             floor[int(receiver)] = floor_db
-        return floored(level_db, floor[records.receiver])
+        return _with_power(level_db, np.exp(floor * NEPERS)[records.receiver])
 
     def vary(self, setting) -> Variation:
         receivers = list(setting["receivers"])
@@ -68,6 +68,10 @@ class NoiseFloor(Effect):
 
 def floored(level_db, floor_db):
     """What is read, and the slope of it."""
+    return _with_power(level_db, np.exp(floor_db * NEPERS))
+
+
+def _with_power(level_db: np.ndarray, floor_power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     power = np.maximum(np.exp(level_db * NEPERS), LEAST_POWER)
-    total = power + np.exp(floor_db * NEPERS)
+    total = power + floor_power
     return np.log(total) / NEPERS, power / total

@@ -6,10 +6,10 @@ explains.
 """
 
 import numpy as np
+from scipy.constants import speed_of_light
 
 from radiotwin.closeloop.paths import paths_of
 from radiotwin.effects.base import LEAST_POWER, NEPERS, Effect, Parameter, Term, Variation, View
-from radiotwin.effects.missing_obstacle import LIGHT_M_S
 
 STRENGTHS_DB = (0.0, -4.0, -8.0)
 MOST_LINKS = 60_000
@@ -31,7 +31,7 @@ class _Paths(Effect):
 
     def propose(self, view: View) -> list[dict]:
         records = view.records
-        direct_db = 20 * np.log10(LIGHT_M_S / records.frequency_hz / (4 * np.pi * records.distance_m))
+        direct_db = 20 * np.log10(speed_of_light / records.frequency_hz / (4 * np.pi * records.distance_m))
         rows = records.los & np.isfinite(view.residual_db) & np.isfinite(records.level_db)
         # Levels may be powers of unknown transmitters: links with line of sight tell what stands for a gain of 0 dB.
         level_db = float(np.median((records.level_db - direct_db)[rows])) if rows.sum() > 20 else 0.0

@@ -7,10 +7,10 @@ of a mobile radio signal", IEEE Trans. Veh. Technol. 34(1), 1985), and 36 to 50 
 
 import numpy as np
 import pandas as pd
+from scipy.constants import speed_of_light
 
 WAVELENGTHS = (20, 40)
 TRACK = ["receiver", "device", "flight"]
-SPEED_OF_LIGHT_M_S = 299_792_458.0
 
 
 def average(links: pd.DataFrame, length_m: float, how: str) -> pd.DataFrame:
@@ -38,7 +38,7 @@ def average(links: pd.DataFrame, length_m: float, how: str) -> pd.DataFrame:
 
 def in_wavelengths(length_m: float, frequency_hz: float) -> float:
     """A length in wavelengths."""
-    return length_m * frequency_hz / SPEED_OF_LIGHT_M_S
+    return length_m * frequency_hz / speed_of_light
 
 
 def _walk(links: pd.DataFrame, track: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:

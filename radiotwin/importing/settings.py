@@ -22,7 +22,19 @@ def check_position(given: set[str], prefix: str) -> None:
                          f"of {prefix}altitude, {prefix}height, {prefix}z; given are {', '.join(sorted(given))}")
 
 
-class Columns(Table):
+class Position(Table):
+    """Where a quantity of a place stands."""
+
+    latitude: Spec | None = None
+    longitude: Spec | None = None
+    altitude: Spec | None = None
+    height: Spec | None = None
+    x: Spec | None = None
+    y: Spec | None = None
+    z: Spec | None = None
+
+
+class Columns(Position):
     """Quantity -> where it stands. Angles in degrees; `height` and `z` count from the scene's ground datum, `altitude`
     from wherever the altitude of the origin does."""
 
@@ -31,13 +43,6 @@ class Columns(Table):
     receiver: Spec = "always receiver"
     flight: Spec = "always flight"
     time: Spec | None = None
-    latitude: Spec | None = None
-    longitude: Spec | None = None
-    altitude: Spec | None = None
-    height: Spec | None = None
-    x: Spec | None = None
-    y: Spec | None = None
-    z: Spec | None = None
     device_latitude: Spec | None = None
     device_longitude: Spec | None = None
     device_altitude: Spec | None = None
@@ -63,7 +68,7 @@ class Columns(Table):
         return self
 
 
-class Wide(Table):
+class Wide(Position):
     """Levels of several receivers or devices in one row: every column that fits `level` is one of them.
 
     `*` in `level` stands for any text; in the other values it stands for that same text, or for the whole name of the
@@ -73,13 +78,6 @@ class Wide(Table):
     level: Spec | list[Spec]
     receiver: Spec | None = None
     device: Spec | None = None
-    latitude: Spec | None = None
-    longitude: Spec | None = None
-    altitude: Spec | None = None
-    height: Spec | None = None
-    x: Spec | None = None
-    y: Spec | None = None
-    z: Spec | None = None
 
     @model_validator(mode="after")
     def _consistent(self):

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, fields
 
 import numpy as np
+from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.paths.candidates import search_of
@@ -13,7 +14,6 @@ from radiotwin.paths.images import MOST_TURNS, Buffer, Candidates, find_paths
 from radiotwin.progress import progress
 from radiotwin.scene.citymap import CityMap
 
-SPEED_OF_LIGHT_M_S = 299_792_458.0
 POLARISATIONS = {"average": AVERAGE, "vertical": VERTICAL}
 # In the shadow of a dense city (scenes/rbm) gains scatter around a ray tracer's by 5.5, 2.5, 1.5 and 1.4 dB with up to
 # 2, 3, 4 and 5 turns, and each turn more takes about a third more time.
@@ -82,7 +82,7 @@ def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, dev
     device_m, receiver_m = np.asarray(device_m, dtype=float), np.ascontiguousarray(receiver_m, dtype=float)
     device = np.asarray(device)
     _check(device_m, receiver_m, device, frequency_hz, polarisation, depth, chunk)
-    wave_number = 2 * np.pi * frequency_hz / SPEED_OF_LIGHT_M_S
+    wave_number = 2 * np.pi * frequency_hz / speed_of_light
     powers = np.zeros((len(COMPONENTS), len(receiver_m)))
     powers[0] = _direct(city, device_m[device], receiver_m, wave_number)
     departures, arrivals = np.zeros((2, len(receiver_m), SECTORS, 3))

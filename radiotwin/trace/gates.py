@@ -1,10 +1,9 @@
 """Checks that every traced map must pass before it is kept."""
 
 import numpy as np
+from scipy.constants import speed_of_light
 
 from radiotwin.errors import RunFailed
-
-SPEED_OF_LIGHT_M_S = 299_792_458.0
 
 # The power of an LoS link is that of the direct path plus that of each reflected or diffracted one. None of them
 # is stronger than the direct path, as each is longer and loses power where it turns; over a city there are
@@ -26,7 +25,7 @@ def free_space_gain_db(distance_m: np.ndarray, frequency_hz: float) -> np.ndarra
         distance_m: distances [m], any shape.
         frequency_hz: frequency [Hz].
     """
-    return 20 * np.log10(SPEED_OF_LIGHT_M_S / (4 * np.pi * frequency_hz * np.asarray(distance_m)))
+    return 20 * np.log10(speed_of_light / (4 * np.pi * frequency_hz * np.asarray(distance_m)))
 
 
 def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, frequency_hz: float,

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from scipy.constants import speed_of_light
 
 from radiotwin.antennas import Antenna
 from radiotwin.errors import BadInput
@@ -12,7 +13,6 @@ from radiotwin.geodesy import to_local
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
 from radiotwin.tables import Origin
-from radiotwin.trace.gates import SPEED_OF_LIGHT_M_S
 from radiotwin.trace.run import device_indices
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import PathGains
@@ -79,7 +79,7 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings, o
         require_writable(out_path)
     index = device_indices(scene, devices)
     inside = scene.city.inside(points_m)
-    wavelength_m = SPEED_OF_LIGHT_M_S / scene.config.radio.frequency_hz
+    wavelength_m = speed_of_light / scene.config.radio.frequency_hz
     antennas = [scene.device_antennas[device] for device in index]
     gain_db = trace_gains(scene, scene.device_m[index], points_m, settings, antennas)
     tables = []

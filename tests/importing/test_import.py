@@ -166,7 +166,7 @@ def test_odd_heights_headings_and_swapped_sites(bring_in, tmp_path):
     ({"latitude": "x", "longitude": "y"}, "a,0,0,-80\n", {}, "a position is either"),
     ({"device": None}, "a,0,0,-80\n", {}, "columns.device is missing"),
     ({"level": None}, "a,0,0,-80\n", {}, "columns.level is missing"),
-    ({"colour": "x"}, "a,0,0,-80\n", {}, "columns.colour: unknown; allowed are level, device"),
+    ({"colour": "x"}, "a,0,0,-80\n", {}, "columns.colour: unknown; allowed are .*level, device"),
     ({"device": "by position"}, "a,0,0,-80\n", {}, "by position.*needs"),
     ({"flight": "by day"}, "a,0,0,-80\n", {}, "by day.*needs"),
     ({"frequency_hz": "always 3"}, "a,0,0,-80\n", {}, "'3' is no frequency"),

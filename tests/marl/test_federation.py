@@ -62,8 +62,8 @@ def test_replicas_share_no_memory_after_averaging(mission, federate_all):
 
 def test_federating_all_averages_moments_and_target_networks(mission):
     weights = trainers(mission, SETTINGS.model_copy(update={"federate_all": True}))[0].weights()
-    assert {name.split(".")[0] for name in weights} == {"agent", "mixer", "target_agent", "target_mixer", "exp_avg",
-                                                        "exp_avg_sq"}
+    assert {name.split(".")[0] for name in weights} == {"agent", "mixer", "target_agent", "target_mixer", "mean",
+                                                        "square"}
     some = trainers(mission, SETTINGS.model_copy(update={"federate_all": False}))[0].weights()
     assert {name.split(".")[0] for name in some} == {"agent", "mixer"}
 

@@ -3,15 +3,16 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.paths import path_powers
 from radiotwin.paths.coefficients import concrete_permittivity, fresnel
-from radiotwin.paths.powers import COMPONENTS, SPEED_OF_LIGHT_M_S
+from radiotwin.paths.powers import COMPONENTS
 from radiotwin.scene.citymap import CityMap
 
 FREQUENCY_HZ = 2.4e9
-WAVELENGTH_M = SPEED_OF_LIGHT_M_S / FREQUENCY_HZ
+WAVELENGTH_M = speed_of_light / FREQUENCY_HZ
 
 
 def one_link(city, device_m, receiver_m, **settings):
