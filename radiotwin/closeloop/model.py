@@ -288,12 +288,12 @@ def _refine_members(side: Side, fitted: Solution, part: Part, variation: Variati
         return sum((part.effect.bend(np.full(len(records), level_db), records, there.setting, there.term.extra)[0]
                     for level_db in EXTREMES_DB), start=np.zeros(len(records)))
 
+    every = np.flatnonzero(side.train)
+    trained = side.records.select(every)
     for member in variation.members or ():
         moved = numbers.copy()
         moved[member] += variation.steps[member]
-        rows = np.flatnonzero(side.train)
-        trained = side.records.select(rows)
-        rows = some(rows[done_db(trained, moved) != done_db(trained, numbers)], MEMBER_REFINED_ON)
+        rows = some(every[done_db(trained, moved) != done_db(trained, numbers)], MEMBER_REFINED_ON)
         if not len(rows):
             continue
         latest = None

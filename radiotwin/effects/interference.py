@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, some
-from radiotwin.effects.noise_floor import floored
+from radiotwin.effects.base import NEPERS, Effect, Parameter, Term, Variation, View, some
+from radiotwin.effects.noise_floor import with_power
 
 LEAST_PLACES = 20
 PLACE_M = 10.0  # places closer together count as one
@@ -61,10 +61,11 @@ class Interference(Effect):
 
     def term(self, records, setting, at) -> Term:
         nothing = Term.of_offset(np.zeros(len(records)))
-        return replace(nothing, extra=interference_db(records.receiver_m, setting["place_m"], setting["level_db"]))
+        power_db = interference_db(records.receiver_m, setting["place_m"], setting["level_db"])
+        return replace(nothing, extra=np.exp(power_db * NEPERS))
 
     def bend(self, level_db, records, setting, extra):
-        return floored(level_db, extra)
+        return with_power(level_db, extra)
 
     def vary(self, setting) -> Variation:
         level_db, within_m = setting["level_db"], np.array(setting["within_m"])

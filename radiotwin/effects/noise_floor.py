@@ -4,6 +4,8 @@ Powers of signal and noise add: reading = 10 log10(10^(signal / 10) + 10^(floor 
 those of a known reference signal do not (ITU-R SM.1753, 'Methods for measurements of radio noise').
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from radiotwin.effects.base import LEAST_POWER, NEPERS, Effect, Parameter, Term, Variation, View, measured
@@ -39,16 +41,16 @@ class NoiseFloor(Effect):
         return [{"receivers": floors} for floors in (found, *tried)]
 
     def term(self, records, setting, at) -> Term:
-        return Term.of_offset(np.zeros(len(records)))
-
-    def bend(self, level_db, records, setting, extra):
         floors = list(setting["receivers"].values())
         # A receiver of which nothing is known has the usual one.
         usual = np.median(floors) if len(floors) >= LEAST_RECEIVERS else -np.inf
         floor = np.full(len(records.receiver_names), usual)
         for receiver, floor_db in setting["receivers"].items():
             floor[int(receiver)] = floor_db
-        return _with_power(level_db, np.exp(floor * NEPERS)[records.receiver])
+        return replace(Term.of_offset(np.zeros(len(records))), extra=np.exp(floor * NEPERS)[records.receiver])
+
+    def bend(self, level_db, records, setting, extra):
+        return with_power(level_db, extra)
 
     def vary(self, setting) -> Variation:
         receivers = list(setting["receivers"])
@@ -68,10 +70,11 @@ class NoiseFloor(Effect):
 
 def floored(level_db, floor_db):
     """What is read, and the slope of it."""
-    return _with_power(level_db, np.exp(floor_db * NEPERS))
+    return with_power(level_db, np.exp(floor_db * NEPERS))
 
 
-def _with_power(level_db: np.ndarray, floor_power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def with_power(level_db: np.ndarray, floor_power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The same for a floor's power, in units of that of 0 dB."""
     power = np.maximum(np.exp(level_db * NEPERS), LEAST_POWER)
     total = power + floor_power
     return np.log(total) / NEPERS, power / total

@@ -4,6 +4,7 @@ Rapp's model of a solid-state amplifier (Rapp 1991, 'Effects of HPA-nonlinearity
 input / (1 + (input / saturation)^(2p))^(1 / 2p), in amplitudes; here in decibels.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -47,13 +48,15 @@ class ReceiverSaturation(Effect):
         return [{"receivers": found}] if found else []
 
     def term(self, records, setting, at) -> Term:
-        return Term.of_offset(np.zeros(len(records)))
+        by_receiver = np.full((len(records.receiver_names), 2), np.inf)
+        for receiver, numbers in setting["receivers"].items():
+            by_receiver[int(receiver)] = numbers
+        return replace(Term.of_offset(np.zeros(len(records))), extra=by_receiver[records.receiver])
 
     def bend(self, level_db, records, setting, extra):
         bent, slope = level_db.copy(), np.ones_like(level_db)
-        for receiver, (saturation_db, smoothness) in setting["receivers"].items():
-            mine = records.receiver == int(receiver)
-            bent[mine], slope[mine] = _compress(level_db[mine], saturation_db, smoothness)
+        mine = np.isfinite(extra[:, 0])
+        bent[mine], slope[mine] = _compress(level_db[mine], *extra[mine].T)
         return bent, slope
 
     def vary(self, setting) -> Variation:
