@@ -125,9 +125,9 @@ def _devices(run: Run) -> list[str]:
             continue
         error_m = ((estimate[0] - true[0]) ** 2 + (estimate[1] - true[1]) ** 2) ** 0.5 if true else float("nan")
         radius_m = device["radius_m"] if device["radius_m"] is not None else float("nan")
-        rows.append([device["name"], "" if device["located"] else "not located: the data do not say where it is",
+        rows.append([device["name"], "yes" if device["located"] else "no: the data do not say where it is",
                      float(estimate[0]), float(estimate[1]), error_m, radius_m])
-    columns = ["device", "", "x [m]", "y [m]", "error [m]", "90 % radius [m]"]
+    columns = ["device", "located", "x [m]", "y [m]", "error [m]", "90 % radius [m]"]
     return ["<h2>Devices that were to be found</h2>", table("", columns, rows, left=2)] if rows else []
 
 

@@ -2,30 +2,73 @@
 // The 3D picture: the city and a slice in WebGL (three.js), and over it a plain canvas with everything that must stay
 // readable at any distance: devices, paths, labels. Coordinates are metres, x east, y north, z up.
 
+// Shaders of a few lines: those of three.js's own materials take a second each to compile without a graphics card.
+const PLACE = `precision highp float;
+uniform mat4 modelViewMatrix, projectionMatrix;
+attribute vec3 position;`;
+const COLOURED = {
+  vertexShader: `${PLACE}
+    attribute vec3 color;
+    uniform float size;  // of dots, in pixels
+    varying vec3 shown;
+    void main() {
+      shown = color;
+      gl_PointSize = size;
+      gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
+    }`,
+  fragmentShader: "precision mediump float; varying vec3 shown; void main() { gl_FragColor = vec4(shown, 1.0); }"};
+const CELLS = {
+  vertexShader: `${PLACE}
+    attribute vec2 uv;
+    varying vec2 cell;
+    void main() {
+      cell = uv;
+      gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
+    }`,
+  fragmentShader: `precision highp float;
+    uniform sampler2D cells;
+    varying vec2 cell;
+    void main() {
+      vec4 colour = texture2D(cells, cell);
+      gl_FragColor = vec4(colour.rgb, 0.72 * colour.a);
+    }`};
+const GROUND = [0.945, 0.953, 0.957];
+const DOT_PIXELS = 6;
+const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
+
+// Pixels that are drawn for each one of the page, along a side. Edges are smooth where a graphics card draws two. Without
+// a card one is enough, and antialiasing, which WebGL would do itself, would take four times as long for each triangle.
+function sharpness(gl) {
+  const names = gl.getExtension("WEBGL_debug_renderer_info");
+  const by = gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
+  return SOFTWARE.test(by) ? window.devicePixelRatio : Math.max(window.devicePixelRatio, 2);
+}
+
 class Stage {
   constructor(place, data) {
     this.place = place;
     this.data = data;
-    this.renderer = new THREE.WebGLRenderer({antialias: true});
-    this.renderer.setPixelRatio(window.devicePixelRatio);
+    this.renderer = new THREE.WebGLRenderer();
+    this.renderer.setPixelRatio(sharpness(this.renderer.context));
     this.renderer.setClearColor(0xffffff);
     this.overlay = document.createElement("canvas");
     place.append(this.renderer.domElement, this.overlay);
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(35, 1, 1, 1e6);
     this.camera.up.set(0, 0, 1);
+    this.coloured = new THREE.RawShaderMaterial({...COLOURED, side: THREE.DoubleSide,
+                                                 uniforms: {size: {value: DOT_PIXELS * this.renderer.getPixelRatio()}}});
     this.city = data.city ? this.addCity(data.city) : new THREE.Object3D();
     this.addGround();
     this.slice = this.addSlice();
-    this.dots = new THREE.Points(new THREE.BufferGeometry(),
-                                 new THREE.PointsMaterial({size: 6, sizeAttenuation: false, vertexColors: THREE.VertexColors}));
-    this.dots.frustumCulled = false;
+    this.dots = new THREE.Points(new THREE.BufferGeometry(), this.coloured);
+    this.dots.frustumCulled = this.dots.visible = false;
     this.scene.add(this.dots);
     this.drawings = [];  // functions of the overlay's context, called after each frame
+    this.fit();
     this.look("oblique");
     this.listen();
-    new ResizeObserver(() => this.resize()).observe(place);
-    this.resize();
+    new ResizeObserver(() => { if (this.fit()) this.draw(); }).observe(place);
   }
 
   addCity({x, y, z, i, j, k}) {
@@ -46,22 +89,23 @@ class Stage {
     const geometry = new THREE.BufferGeometry();
     geometry.addAttribute("position", new THREE.BufferAttribute(place, 3));
     geometry.addAttribute("color", new THREE.BufferAttribute(colour, 3));
-    const mesh = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({vertexColors: THREE.VertexColors, side: THREE.DoubleSide}));
+    const mesh = new THREE.Mesh(geometry, this.coloured);
     this.scene.add(mesh);
     return mesh;
   }
 
   addGround() {
     const [x0, x1, y0, y1] = this.data.bounds;
-    const ground = new THREE.Mesh(new THREE.PlaneBufferGeometry(x1 - x0, y1 - y0),
-                                  new THREE.MeshBasicMaterial({color: 0xf1f3f4, side: THREE.DoubleSide}));
+    const plane = new THREE.PlaneBufferGeometry(x1 - x0, y1 - y0);
+    plane.addAttribute("color", new THREE.BufferAttribute(new Float32Array([GROUND, GROUND, GROUND, GROUND].flat()), 3));
+    const ground = new THREE.Mesh(plane, this.coloured);
     ground.position.set((x0 + x1) / 2, (y0 + y1) / 2, -0.3);
     this.scene.add(ground);
   }
 
   addSlice() {
-    const slice = new THREE.Mesh(new THREE.PlaneBufferGeometry(1, 1), new THREE.MeshBasicMaterial({
-      transparent: true, opacity: 0.72, side: THREE.DoubleSide, depthWrite: false}));
+    const slice = new THREE.Mesh(new THREE.PlaneBufferGeometry(1, 1), new THREE.RawShaderMaterial({
+      ...CELLS, uniforms: {cells: {value: null}}, transparent: true, side: THREE.DoubleSide, depthWrite: false}));
     slice.visible = false;
     this.scene.add(slice);
     return slice;
@@ -69,11 +113,10 @@ class Stage {
 
   // A slice of coloured cells: RGBA bytes (ny, nx), south first, and where the middle of the first cell is.
   showSlice(rgba, nx, ny, west, south, step, z) {
-    this.slice.material.map?.dispose();
-    const texture = new THREE.DataTexture(rgba, nx, ny, THREE.RGBAFormat);  // nearest cell, no mean over cells
-    texture.needsUpdate = true;
-    this.slice.material.map = texture;
-    this.slice.material.needsUpdate = true;
+    const {cells} = this.slice.material.uniforms;
+    cells.value?.dispose();
+    cells.value = new THREE.DataTexture(rgba, nx, ny, THREE.RGBAFormat);  // nearest cell, no mean over cells
+    cells.value.needsUpdate = true;
     this.slice.scale.set(nx * step, ny * step, 1);
     this.slice.position.set(west + (nx - 1) * step / 2, south + (ny - 1) * step / 2, z);
     this.slice.visible = true;
@@ -93,8 +136,16 @@ class Stage {
   look(from) {
     const [x0, x1, y0, y1] = this.data.bounds;
     this.middle = new THREE.Vector3((x0 + x1) / 2, (y0 + y1) / 2, 0.3 * this.data.top_m);
-    this.far = 1.9 * Math.max(x1 - x0, y1 - y0);
-    [this.turn, this.lift] = from === "above" ? [-Math.PI / 2, Math.PI / 2 - 1e-3] : [-Math.PI / 2 + 0.45, 0.72];
+    const wide = x1 - x0, deep = y1 - y0, {aspect} = this.camera, most = Math.max(wide, deep);
+    if (from === "above") {
+      [this.turn, this.lift] = [-Math.PI / 2, Math.PI / 2 - 1e-3];
+      this.far = Math.max(2.1 * deep, 2.3 * wide / aspect);
+    } else {
+      [this.turn, this.lift] = [-Math.PI / 2 + 0.45, 0.72];
+      this.far = most * Math.max(1.65, 2.7 / aspect);
+      this.middle.x += 0.08 * most * Math.cos(this.turn);  // what is near looks larger
+      this.middle.y += 0.08 * most * Math.sin(this.turn);
+    }
     this.redraw();
   }
 
@@ -139,12 +190,14 @@ class Stage {
     this.middle.y += metres * (-cos * dx - sin * dy);
   }
 
-  resize() {
+  fit() {  // both canvases to their place; whether that changed anything
     const {clientWidth: width, clientHeight: height} = this.place;
+    if (width === this.width && height === this.height) return false;
+    Object.assign(this, {width, height});
     this.renderer.setSize(width, height);
     Object.assign(this.overlay, {width: width * window.devicePixelRatio, height: height * window.devicePixelRatio});
     this.camera.aspect = width / Math.max(height, 1);
-    this.draw();
+    return true;
   }
 
   redraw() {  // once a frame, however much has changed

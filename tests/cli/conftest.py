@@ -1,41 +1,60 @@
-"""Runs the installed command as a user would."""
+"""Runs the command line: in this process, where importing the package once serves all, or as it is installed."""
 
+import contextlib
+import io
 import os
 import shlex
 import signal
 import subprocess
 import sys
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from radiotwin.cli import console, main
+
 COMMAND = Path(sys.executable).with_name("radiotwin")
+COLUMNS = 100
+
+
+@contextlib.contextmanager
+def as_in_a_process_of_its_own(words: list[str], cwd: Path) -> Iterator[None]:
+    """What the command changes of the whole process is put back."""
+    argv, folder, interrupt, show = sys.argv, Path.cwd(), signal.getsignal(signal.SIGINT), warnings.showwarning
+    width = console.console.width
+    try:
+        sys.argv, console.console.width = ["radiotwin", *words], COLUMNS
+        os.chdir(cwd)
+        with warnings.catch_warnings():  # whatever was shown once would not be shown again
+            warnings.simplefilter("default")
+            yield
+    finally:
+        os.chdir(folder)
+        sys.argv, console.console.width, warnings.showwarning = argv, width, show
+        signal.signal(signal.SIGINT, interrupt)
 
 
 @pytest.fixture(scope="session")
 def run():
+    """Run the command on a line of words in a folder."""
     def run(words: str, cwd: Path) -> subprocess.CompletedProcess:
-        return subprocess.run([str(COMMAND), *shlex.split(words)], cwd=cwd, capture_output=True, text=True,
-                              timeout=300, env=os.environ | {"COLUMNS": "100"})
+        out, error, status = io.StringIO(), io.StringIO(), 0
+        with as_in_a_process_of_its_own(shlex.split(words), cwd), contextlib.redirect_stdout(out), \
+                contextlib.redirect_stderr(error):
+            try:
+                main()
+            except SystemExit as end:
+                status = end.code or 0
+        return subprocess.CompletedProcess(words, status, out.getvalue(), error.getvalue())
     return run
 
 
-@pytest.fixture
-def run_here(monkeypatch, capsys):
-    """The same within this process, which saves seconds: for many cases of bad input."""
-    def run_here(words: str, cwd: Path) -> subprocess.CompletedProcess:
-        from radiotwin.cli import main
-
-        monkeypatch.chdir(cwd)
-        monkeypatch.setattr(sys, "argv", ["radiotwin", *shlex.split(words)])
-        before = signal.getsignal(signal.SIGINT)
-        try:
-            main()
-            status = 0
-        except SystemExit as end:
-            status = end.code
-        finally:
-            signal.signal(signal.SIGINT, before)
-        said = capsys.readouterr()
-        return subprocess.CompletedProcess(words, status, said.out, said.err)
-    return run_here
+@pytest.fixture(scope="session")
+def run_installed():
+    """The same with the command as it is installed: seconds more for each."""
+    def run_installed(words: str, cwd: Path) -> subprocess.CompletedProcess:
+        return subprocess.run([str(COMMAND), *shlex.split(words)], cwd=cwd, capture_output=True, text=True,
+                              timeout=300, env=os.environ | {"COLUMNS": str(COLUMNS)})
+    return run_installed

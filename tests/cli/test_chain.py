@@ -72,8 +72,8 @@ def test_map_exports_agree(chain, run):
     assert (chain / "twin.png").read_bytes()[:4] == b"\x89PNG"
 
 
-def test_a_seed_gives_the_same_twin(chain, run):
-    assert run("fit survey/measurements.csv.gz --scene scene -o again", cwd=chain).returncode == 0
+def test_a_seed_gives_the_same_twin_in_another_process(chain, run_installed):
+    assert run_installed("fit survey/measurements.csv.gz --scene scene -o again", cwd=chain).returncode == 0
     for name in ("twin.json", "channel.safetensors"):
         assert (chain / "again" / name).read_bytes() == (chain / "twin" / name).read_bytes()
 

@@ -2,15 +2,10 @@
 
 import json
 import shutil
-import signal
-import sys
-import warnings
 
 import numpy as np
 import pandas as pd
 import pytest
-
-from radiotwin.cli import main
 
 DEVICES, RECEIVERS, FLIGHTS, SLOTS = 4, 2, 4, 12
 WHOLE = ["closeloop.html", "closeloop.json"]
@@ -38,26 +33,15 @@ def survey(device_m, blocked=None, seed=0):
 
 
 @pytest.fixture
-def close_loop(tmp_path, monkeypatch, capsys):
-    """Run the command on tables: exit status, standard output and error. In this process, as starting another for each
-    of these cases would take longer than all of them."""
+def close_loop(run, tmp_path):
+    """Run the command on tables: exit status, standard output and error."""
     def close_loop(links, devices, words="", prepare=None):
         links.to_csv(tmp_path / "measurements.csv", index=False)
         devices.to_csv(tmp_path / "devices.csv", index=False)
         if prepare:
             prepare(tmp_path)
-        monkeypatch.chdir(tmp_path)
-        monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
-        monkeypatch.setattr(sys, "argv", ["radiotwin", "close-loop", "measurements.csv", "--out", "result",
-                                          *words.split()])
-        before, status = signal.getsignal(signal.SIGINT), 0
-        try:
-            main()
-        except SystemExit as end:
-            status = end.code or 0
-        finally:
-            signal.signal(signal.SIGINT, before)
-        return status, *capsys.readouterr()
+        done = run(f"close-loop measurements.csv --out result {words}", tmp_path)
+        return done.returncode, done.stdout, done.stderr
     return close_loop
 
 

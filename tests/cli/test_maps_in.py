@@ -44,11 +44,11 @@ BAD = {
 
 
 @pytest.mark.parametrize("what", BAD)
-def test_a_broken_map_is_refused(run_here, tmp_path, what):
+def test_a_broken_map_is_refused(run, tmp_path, what):
     name, text, options, parts = BAD[what]
     (tmp_path / name).write_text(text)
     given = name.replace("b.osm", "a.osm")
-    result = run_here(f"build-scene {given} -o scene {options}", cwd=tmp_path)
+    result = run(f"build-scene {given} -o scene {options}", cwd=tmp_path)
     said = result.stderr
     assert result.returncode == 2 and "Traceback" not in said and said.count("radiotwin:") == 1, said
     for part in parts:

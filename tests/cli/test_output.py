@@ -62,8 +62,8 @@ def test_every_command_has_its_options():
     assert all("seed" in options[name] for name in AT_RANDOM)
 
 
-def test_the_real_command(run, tmp_path):
-    done = run("build-scene preset:small -o city --json", tmp_path)
+def test_the_real_command(run_installed, run, tmp_path):
+    done = run_installed("build-scene preset:small -o city --json", tmp_path)
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     assert document["scene"]["devices"] == 7 and document["scene"]["materials"][0]["name"]

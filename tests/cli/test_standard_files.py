@@ -25,26 +25,26 @@ def folder(small_scene, tmp_path):
 
 
 @pytest.mark.parametrize("out", ["out", "city.glb", "city.gltf", "city.obj"])
-def test_scenes_out(run_here, folder, out):
-    result = run_here(f"export-scene scene -o {out}", cwd=folder)
+def test_scenes_out(run, folder, out):
+    result = run(f"export-scene scene -o {out}", cwd=folder)
     assert result.returncode == 0 and f"wrote {out}" in result.stdout, result.stderr
     assert (folder / out).exists()
 
 
 @pytest.mark.parametrize("suffix", ["nc", "csv", "npz", "tif", "kmz", "png"])
-def test_maps_out(run_here, folder, suffix):
-    result = run_here(f"map map.nc --scene scene -o part.{suffix} --devices d1 --altitudes 60", cwd=folder)
+def test_maps_out(run, folder, suffix):
+    result = run(f"map map.nc --scene scene -o part.{suffix} --devices d1 --altitudes 60", cwd=folder)
     assert result.returncode == 0, result.stderr
     assert f"wrote part.{suffix}: 1 devices on (1, 16, 16) positions" in result.stdout
     assert (folder / f"part.{suffix}").stat().st_size > 500
 
 
 @pytest.mark.llvm
-def test_gains_at_points(run_here, folder):
+def test_gains_at_points(run, folder):
     (folder / "points.csv").write_text("x_m,y_m,z_m\n80,60,30\n80,40,1.5\n80,60,-3\n80,60,200\n")
     base = "gains scene --points points.csv --devices d0 --quality fast"
     for way in ("power", "coherent"):
-        result = run_here(f"{base} --sum {way} -o {way}.csv", cwd=folder)
+        result = run(f"{base} --sum {way} -o {way}.csv", cwd=folder)
         assert result.returncode == 0, result.stderr
         assert "4 links, 2 with a gain" in result.stdout and "1 below the ground" in result.stdout
     power, coherent = (pd.read_csv(folder / f"{way}.csv", keep_default_na=False) for way in ("power", "coherent"))
@@ -76,11 +76,11 @@ BAD = {
 
 
 @pytest.mark.parametrize("words", BAD)
-def test_bad_requests(run_here, folder, words):
+def test_bad_requests(run, folder, words):
     import re
 
     (folder / "p.csv").write_text("x_m,y_m,z_m\n1,2,3\n")
     before = sorted(folder.rglob("*"))
-    result = run_here(words, cwd=folder)
+    result = run(words, cwd=folder)
     assert result.returncode == 2 and re.search(BAD[words], result.stderr), result.stderr
     assert result.stderr.count("radiotwin:") == 1 and sorted(folder.rglob("*")) == before
