@@ -1,6 +1,7 @@
 """The documentation site builds without a single warning."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,10 @@ def test_the_site_builds(tmp_path):
         env=os.environ | {"EXECUTE_EXAMPLES": "false", "NO_MKDOCS_2_WARNING": "1"})
     assert result.returncode == 0, result.stderr
     reference = (tmp_path / "site" / "reference" / "index.html").read_text(encoding="utf-8")
-    for name in ("radiotwin.twin.fit_twin", "radiotwin.radiomap.RadioMap.read", "marl.parallel_env.HarvestEnv"):
+    for name in ("radiotwin.twin.fit_twin", "radiotwin.radiomap.RadioMap.read", "marl.parallel_env.HarvestEnv",
+                 "radiotwin.footprints.build.build_scene_from_map"):
         assert f'id="{name}"' in reference
+    results = (tmp_path / "site" / "results" / "index.html").read_text(encoding="utf-8")
+    for picture in re.findall(r'<img [^>]*src="([^"]+)"', results):
+        assert (tmp_path / "site" / "results" / picture).is_file(), picture
     assert "rt.trace_map" in (tmp_path / "site" / "examples" / "city_to_map" / "index.html").read_text(encoding="utf-8")

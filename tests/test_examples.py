@@ -1,8 +1,7 @@
 """The examples run as they are, and say what their text says."""
 
 import re
-import subprocess
-import sys
+import runpy
 from pathlib import Path
 
 import pytest
@@ -10,37 +9,40 @@ import pytest
 EXAMPLES = Path(__file__).parents[1] / "examples"
 
 
-def run(name, folder):
-    result = subprocess.run([sys.executable, str(EXAMPLES / f"{name}.py")], cwd=folder, capture_output=True, text=True,
-                            timeout=300)
-    assert result.returncode == 0, result.stderr
-    return result.stdout
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    """Run an example in a folder of its own, in this process; what it printed."""
+    def run(name):
+        monkeypatch.chdir(tmp_path)
+        runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
+        return capsys.readouterr().out
+    return run
 
 
-def test_city_to_map(tmp_path):
-    out = run("city_to_map", tmp_path)
+def test_city_to_map(run, tmp_path):
+    out = run("city_to_map")
     assert "7 devices" in out and " dB\n" in out
     for name in ("map.csv", "map.png", "report.html", "map.nc"):
         assert (tmp_path / "city_to_map" / name).stat().st_size > 1000
 
 
-def test_find_devices(tmp_path):
-    out = run("find_devices", tmp_path)
+def test_find_devices(run, tmp_path):
+    out = run("find_devices")
     medians = {row.split()[0]: float(row.split()[2]) for row in out.splitlines() if "log_distance" in row}
     assert medians["segmented_log_distance"] < 0.5 * medians["log_distance"]
     assert len(re.findall(r"^d\d: .* within", out, re.MULTILINE)) == 4
     assert (tmp_path / "find_devices" / "twin" / "twin.json").is_file()
 
 
-def test_close_the_loop(tmp_path):
-    out = run("close_the_loop", tmp_path)
+def test_close_the_loop(run):
+    out = run("close_the_loop")
     assert "verdict: effect" in out and "receiver_gain_offset" in out
     before, after = map(float, re.search(r"([\d.]+) dB before, ([\d.]+) dB after", out).groups())
     assert after < before
 
 
-def test_plan_with_your_twin(tmp_path):
-    out = run("plan_with_your_twin", tmp_path)
+def test_plan_with_your_twin(run):
+    out = run("plan_with_your_twin")
     shares = {found[1:]: int(found[0]) for found in (
         (share, name, where) for name, share, where in re.findall(r"(\w+) flights collect (\d+)% .* the (\w+)", out))}
     assert shares["greedy", "truth"] > shares["random", "truth"]

@@ -55,7 +55,7 @@ function drawAxes(context, stage) {
   for (let x = Math.ceil(x0 / step) * step; x <= x1; x += step) write(x.toFixed(0), x, y0 - off);
   for (let y = Math.ceil(y0 / step) * step; y <= y1; y += step) write(y.toFixed(0), x1 + 1.3 * off, y);
   write("x, east [m]", (x0 + x1) / 2, y0 - 2.6 * off);
-  write("y, north [m]", x1 + 4 * off, (y0 + y1) / 2);
+  write("y, north [m]", x1 + 6 * off, (y0 + y1) / 2);
 }
 
 function drawDevices(context, stage) {

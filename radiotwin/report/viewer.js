@@ -181,6 +181,7 @@ function start() {
   fill(control("flight"), data.flights.map(({name}) => name));
   document.getElementById("flight-controls").hidden = data.flights.length === 0;
   document.getElementById("scale").hidden = views.length === 0;
+  control("buildings").parentElement.hidden = !data.city;
   control("view").onchange = chooseView;
   control("device").onchange = control("altitude").onchange = drawView;
   control("flight").onchange = chooseFlight;

@@ -42,7 +42,8 @@ def test_each_device_and_altitude_shows_its_own_map(opened, run, path, pixels, t
         expected_db = truth.gain_db[truth.devices.index(device), z].ravel()
         assert 0 < np.isnan(expected_db).sum() < len(expected_db)
         np.testing.assert_allclose(shown_db(page), expected_db, atol=0.006)
-        opacity = np.array(page.evaluate("[...stage.slice.material.uniforms.cells.value.image.data]")).reshape(-1, 4)[:, 3]
+        cells = page.evaluate("[...stage.slice.material.uniforms.cells.value.image.data]")
+        opacity = np.array(cells).reshape(-1, 4)[:, 3]
         np.testing.assert_array_equal(opacity > 0, np.isfinite(expected_db))
         pictures.append(pixels(page))
     for one, other in zip(pictures, pictures[1:]):
