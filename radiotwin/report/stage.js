@@ -142,9 +142,9 @@ class Stage {
       this.far = Math.max(2.1 * deep, 2.3 * wide / aspect);
     } else {
       [this.turn, this.lift] = [-Math.PI / 2 + 0.45, 0.72];
-      this.far = most * Math.max(1.75, 2.8 / aspect);
-      this.middle.x += 0.08 * most * Math.cos(this.turn);  // what is near looks larger
-      this.middle.y += 0.08 * most * Math.sin(this.turn);
+      this.far = most * Math.max(1.8, 2.85 / aspect);
+      this.middle.x += 0.14 * most * Math.cos(this.turn);  // what is near looks larger
+      this.middle.y += 0.14 * most * Math.sin(this.turn);
     }
     this.redraw();
   }

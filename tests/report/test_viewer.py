@@ -113,11 +113,18 @@ def test_the_city_turns_and_zooms(opened, path, pixels):
     assert (np.abs(pixels(page) - turned).max(axis=-1) > 20).mean() > 0.1
     for button in BUTTONS:
         page.click(f"#control-{button}")
+        pixels(page)  # once it is drawn
+        corners = page.evaluate("(([x0, x1, y0, y1]) => [[x0, y0], [x1, y0], [x1, y1], [x0, y1]]"
+                                ".map(([x, y]) => stage.pixel(x, y, 0)))(data.bounds)")
+        assert ((np.array(corners) > 0) & (corners < np.array([box["width"], box["height"]]))).all(), "all is in view"
+        assert np.ptp(corners, axis=0).max() > 0.5 * box["height"], "and fills it"
     page.mouse.move(*middle)
     text = page.inner_text("#control-hover")
     assert "m: " in text and ("dB" in text or "not detected" in text)
     page.uncheck("#control-buildings")
     assert page.evaluate("stage.city.visible") is False
+    assert page.evaluate("stage.renderer.context.getContextAttributes().antialias") is False
+    assert page.evaluate("stage.renderer.getPixelRatio()") == 1, "no more than needed without a graphics card"
 
 
 def test_names_from_a_file_are_never_run(opened, tmp_path):
