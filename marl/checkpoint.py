@@ -10,25 +10,31 @@ import torch
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, atomic_path
 
+FORMAT = 2  # 1 had the optimiser's state as torch.optim writes it
+
 
 def save_checkpoint(state: dict, path: Path) -> None:
     """Write nested dicts and lists of numbers, texts, arrays, tensors and tables."""
     with atomic_path(path) as temporary:
-        torch.save(_packed(state), temporary)
+        torch.save({"format": FORMAT, "state": _packed(state)}, temporary)
 
 
 def load_checkpoint(path: Path) -> dict:
     """Read what `save_checkpoint` wrote.
 
     Raises:
-        BadInput: it is damaged.
+        BadInput: it is damaged, or of another version.
     """
     try:
-        return _unpacked(torch.load(path, map_location="cpu", weights_only=True))
+        content = torch.load(path, map_location="cpu", weights_only=True)
     except (OSError, MemoryError):
         raise
     except Exception as error:  # zipfile, pickle and torch each have their own
         raise BadInput(f"{path} is damaged ({type(error).__name__}); remove the run's folder and start again") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise BadInput(f"{path} was written by another version of radiotwin, in a form that this one does not read; "
+                       "finish the run with that version, or remove its folder and start again")
+    return _unpacked(content["state"])
 
 
 def folder_content(folder: Path) -> dict[str, np.ndarray]:

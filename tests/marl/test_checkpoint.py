@@ -54,3 +54,9 @@ def test_a_folder_comes_back(tmp_path):
     restore_folder(content, tmp_path / "other")
     assert (tmp_path / "other" / "b.bin").read_bytes() == bytes(range(256))
     assert (tmp_path / "other" / "a.json").read_text() == "{}"
+
+
+def test_what_another_version_wrote_is_refused(tmp_path):
+    torch.save({"rows": []}, tmp_path / "state.pt")
+    with pytest.raises(BadInput, match="another version.*start again"):
+        load_checkpoint(tmp_path / "state.pt")
