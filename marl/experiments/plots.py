@@ -103,6 +103,7 @@ def pays_figure(records: list[dict]) -> Figure:
 
 
 def _figure(panels: int, columns: int, height_in: float) -> tuple[Figure, list]:
+    columns = min(columns, panels)
     rows = -(-panels // columns)
     figure = Figure(figsize=(10.0, height_in * rows + 0.9), layout="constrained")
     FigureCanvasAgg(figure)
