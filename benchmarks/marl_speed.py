@@ -27,6 +27,7 @@ from marl.replicas import Replicas
 from marl.settings import PRESETS
 from marl.threads import keep_memory, limit_threads
 from marl.trainer import Trainer
+from radiotwin.channel.adam import Adam
 from radiotwin.scene import Scene
 from radiotwin.survey import segmented_truth
 
@@ -91,7 +92,7 @@ def updates(mission) -> tuple[float, float, float]:
     reference = Learner(PRESETS["paper"], mission, 0)
     size, uavs, hidden = observe(mission, Environment(mission, 1, rng).reset())[0].shape[-1], mission.uavs, 64
     reference.agent, reference.target_agent = SlotBySlot(size, uavs, hidden), SlotBySlot(size, uavs, hidden)
-    reference.optimiser = torch.optim.Adam(reference.parameters(), foreach=True)
+    reference.optimiser = Adam(reference.parameters())
     taken = [cpu_seconds(lambda: learner.update(flights, mission, 5e-4), 15) for learner in (ours, reference)]
     return *taken, float(flights.length.mean())
 

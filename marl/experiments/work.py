@@ -110,9 +110,10 @@ def _claimed(run: Run, out: Path) -> Iterator[bool]:
         yield False
         return
     folder = run.unfinished(out)
+    lock = folder.parent / f"{folder.name}.lock"  # names have points in them, so not `with_suffix`
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = open(folder.with_suffix(".lock"), "w")
+        handle = lock.open("w")
     except OSError as error:
         raise BadInput(f"cannot write {folder}: {error.strerror}; choose another --out") from None
     with handle:
@@ -124,7 +125,7 @@ def _claimed(run: Run, out: Path) -> Iterator[bool]:
         yield True
         if finished(run, out):
             shutil.rmtree(folder, ignore_errors=True)
-            folder.with_suffix(".lock").unlink(missing_ok=True)
+            lock.unlink(missing_ok=True)
             with suppress(OSError):  # not empty: others are at work
                 folder.parent.rmdir()
 

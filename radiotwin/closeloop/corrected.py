@@ -134,7 +134,7 @@ def _mean_db(base: FittedBase, records: Records, coefficients: np.ndarray,
             continue
         term = effect.term(records, part["setting"], base.shifted_db)
         if effect.stage == "paths":
-            level_db, _ = effect.bend(level_db, records, part["setting"], term.extra)
+            level_db, _ = effect.bend(level_db, part["setting"], term.extra)
         gain_db += term.offset_db + term.columns @ np.array(part["coefficients"])
     return level_db + gain_db
 

@@ -81,14 +81,14 @@ class Side:
         """The regression on links of a mask or index."""
         records, parts = self.records, self.parts
         terms = [part.term for part in parts]
-        mine = records.select(rows) if any(part.effect.stage != "gain" for part in parts) else None
+        mine = records.select(rows) if any(part.effect.stage == "detection" for part in parts) else None
         return Problem(
             records.level_db[rows], self.limit_db[rows],
-            self.base_db[rows], self.base_columns[rows], _bend(parts, "paths", mine, rows),
+            self.base_db[rows], self.base_columns[rows], _bend(parts, "paths", rows),
             sum((term.offset_db[rows] for term in terms), np.zeros(len(self.base_db[rows]))),
             regression.design([term.columns[rows] for term in terms], len(self.base_db[rows])),
             np.concatenate([self.base_spread, *(term.spread_db for term in terms)]), self.group[rows],
-            _bend(parts, "receiver", mine, rows), self.dof, _lost(parts, mine), _unsure_db(parts, rows))
+            _bend(parts, "receiver", rows), self.dof, _lost(parts, mine), _unsure_db(parts, rows))
 
     @cached_property
     def training(self) -> Problem:
@@ -156,18 +156,17 @@ class Side:
         return sides
 
 
-def _bend(parts: list[Part], stage: str, records: Records | None, rows: np.ndarray | slice) -> Callable | None:
+def _bend(parts: list[Part], stage: str, rows: np.ndarray | slice) -> Callable | None:
     """What all parts of a stage do to the level, one after the other; None where there is none."""
     parts = [part for part in parts if part.effect.stage == stage]
     if not parts:
         return None
-    assert records is not None
     extras = [None if part.term.extra is None else part.term.extra[rows] for part in parts]
 
     def bend(level_db: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         slope = np.ones_like(level_db)
         for part, extra in zip(parts, extras):
-            level_db, own = part.effect.bend(level_db, records, part.setting, extra)
+            level_db, own = part.effect.bend(level_db, part.setting, extra)
             slope = slope * own
         return level_db, slope
     return bend
@@ -285,7 +284,7 @@ def _refine_members(side: Side, fitted: Solution, part: Part, variation: Variati
         there = changed(records, numbers)
         if not at_receiver:
             return there.term.offset_db
-        return sum((part.effect.bend(np.full(len(records), level_db), records, there.setting, there.term.extra)[0]
+        return sum((part.effect.bend(np.full(len(records), level_db), there.setting, there.term.extra)[0]
                     for level_db in EXTREMES_DB), start=np.zeros(len(records)))
 
     every = np.flatnonzero(side.train)
@@ -306,7 +305,7 @@ def _refine_members(side: Side, fitted: Solution, part: Part, variation: Variati
             tried, inside = numbers.copy(), np.clip(values, variation.low[member], variation.high[member])
             tried[member] = inside
             there = changed(mine, tried)
-            receiver = _bend([*others, there], "receiver", mine, slice(None))
+            receiver = _bend([*others, there], "receiver", slice(None))
             outside = np.abs((values - inside) / variation.steps[member]).sum()
             latest = solve(replace(alone, law_db=arriving_db[rows] + there.term.offset_db, receiver=receiver), latest)
             return latest.objective + 10.0 * outside

@@ -189,8 +189,7 @@ class Effect(ABC):
         """What it adds to the mean level of links; `at` asks the base for the mean level of other records, such as with
         devices elsewhere: `at(records)` quickly, `at(records, True)` exactly."""
 
-    def bend(self, level_db: np.ndarray, records: Records, setting: Setting,
-             extra: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def bend(self, level_db: np.ndarray, setting: Setting, extra: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
         """What it makes of the mean level of links (n,), and the slope of that; for the stages `paths` and
         `receiver`."""
         raise NotImplementedError

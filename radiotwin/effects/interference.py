@@ -64,7 +64,7 @@ class Interference(Effect):
         power_db = interference_db(records.receiver_m, setting["place_m"], setting["level_db"])
         return replace(nothing, extra=np.exp(power_db * NEPERS))
 
-    def bend(self, level_db, records, setting, extra):
+    def bend(self, level_db, setting, extra):
         return with_power(level_db, extra)
 
     def vary(self, setting) -> Variation:

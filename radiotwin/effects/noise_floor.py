@@ -49,7 +49,7 @@ class NoiseFloor(Effect):
             floor[int(receiver)] = floor_db
         return replace(Term.of_offset(np.zeros(len(records))), extra=np.exp(floor * NEPERS)[records.receiver])
 
-    def bend(self, level_db, records, setting, extra):
+    def bend(self, level_db, setting, extra):
         return with_power(level_db, extra)
 
     def vary(self, setting) -> Variation:

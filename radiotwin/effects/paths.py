@@ -9,7 +9,8 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from radiotwin.closeloop.paths import paths_of
-from radiotwin.effects.base import LEAST_POWER, NEPERS, Effect, Parameter, Term, Variation, View
+from radiotwin.effects.base import NEPERS, Effect, Parameter, Term, Variation, View
+from radiotwin.effects.noise_floor import with_power
 
 STRENGTHS_DB = (0.0, -4.0, -8.0)
 MOST_LINKS = 60_000
@@ -41,10 +42,8 @@ class _Paths(Effect):
         term = Term.of_offset(np.zeros(len(records)))
         return Term(term.offset_db, term.columns, term.spread_db, [], paths_of(records, self.kinds))
 
-    def bend(self, level_db, records, setting, extra):
-        power = np.maximum(np.exp(level_db * NEPERS), LEAST_POWER)
-        total = power + extra * np.exp(setting["strength_db"] * NEPERS)
-        return np.log(total) / NEPERS, power / total
+    def bend(self, level_db, setting, extra):
+        return with_power(level_db, extra * np.exp(setting["strength_db"] * NEPERS))
 
     def vary(self, setting) -> Variation:
         level_db = setting["level_db"]

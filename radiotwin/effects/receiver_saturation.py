@@ -53,7 +53,7 @@ class ReceiverSaturation(Effect):
             by_receiver[int(receiver)] = numbers
         return replace(Term.of_offset(np.zeros(len(records))), extra=by_receiver[records.receiver])
 
-    def bend(self, level_db, records, setting, extra):
+    def bend(self, level_db, setting, extra):
         bent, slope = level_db.copy(), np.ones_like(level_db)
         mine = np.isfinite(extra[:, 0])
         bent[mine], slope[mine] = _compress(level_db[mine], *extra[mine].T)

@@ -21,10 +21,10 @@ def test_powers_add_and_the_slope_is_known(links):
     setting = {"place_m": [120.0, 80.0], "level_db": -90.0, "within_m": [0, 0, 300, 300]}
     level_db = rng.uniform(-120, -60, len(records))
     extra = Interference().term(records, setting, None).extra
-    read_db, slope = Interference().bend(level_db, records, setting, extra)
+    read_db, slope = Interference().bend(level_db, setting, extra)
     power = heard(records.receiver_m, np.array([120.0, 80.0, 1.5]), -90.0)
     np.testing.assert_allclose(watts(read_db), watts(level_db) + power, rtol=1e-9)
-    more_db, less_db = (Interference().bend(level_db + step, records, setting, extra)[0] for step in (1e-4, -1e-4))
+    more_db, less_db = (Interference().bend(level_db + step, setting, extra)[0] for step in (1e-4, -1e-4))
     np.testing.assert_allclose(slope, (more_db - less_db) / 2e-4, atol=1e-6)
 
 

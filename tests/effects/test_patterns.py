@@ -98,6 +98,6 @@ def test_the_floor_adds_as_power_and_knows_its_slope():
 def test_a_receivers_fault_is_in_its_own_readings(links, effect, setting, expected_db):
     """At the floor the reading is twice the power, at the level of saturation with smoothness 1 half of it."""
     records = links([[0.0, 0, 1.5]], np.ones((4, 3)), receiver=np.array([0, 1, 0, 1]))
-    read_db, slope = effect.bend(np.full(4, -80.0), records, setting, effect.term(records, setting, None).extra)
+    read_db, slope = effect.bend(np.full(4, -80.0), setting, effect.term(records, setting, None).extra)
     np.testing.assert_allclose(read_db, [-80, expected_db, -80, expected_db])
     np.testing.assert_allclose(slope, [1, 0.5, 1, 0.5])

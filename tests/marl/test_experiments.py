@@ -12,6 +12,8 @@ import pytest
 
 from marl.checkpoint import load_checkpoint
 from marl.experiments.__main__ import main
+from marl.experiments.records import Run
+from marl.experiments.work import _claimed
 
 TINY = ["--set", "episodes=40", "--set", "real_episodes=2", "--set", "batch=8", "--set", "replay=40", "--set",
         "flights=4", "--set", "selection_flights=4", "--set", "planner_iterations=200", "--set", "federate_every=20"]
@@ -150,3 +152,10 @@ def test_records_of_other_settings_and_damaged_ones_are_refused(curve, tmp_path,
     path.write_text("{")
     assert main([*words, "--resume"]) == 2
     assert f"{path} is not the record of a run" in capsys.readouterr().err
+
+
+def test_runs_whose_names_differ_behind_a_point_do_not_share_a_lock(tmp_path):
+    """The second of them would be left out by whoever meets it while the first is under way."""
+    first, second = (Run("tuning", f"lambda-0.{digit}", "learning", {}, 0) for digit in (6, 9))
+    with _claimed(first, tmp_path) as mine, _claimed(second, tmp_path) as others, _claimed(first, tmp_path) as again:
+        assert mine and others and not again
