@@ -8,6 +8,7 @@ import pandas as pd
 import torch
 
 from marl.environment import Environment, Frame, empty_frame
+from marl.exploration import Exploration
 from marl.features import observe
 from marl.heuristics import greedy_actions, random_actions
 from marl.mission import Mission
@@ -76,25 +77,26 @@ class HeuristicPolicy:
 
 
 class AgentPolicy:
-    """The best action by the agents' values, and with the chance `epsilon` any feasible one.
+    """The best action by the agents' values.
 
     Args:
         agent: its weights are read at every slot.
-        epsilon: chance of a random action, for every UAV and slot.
-        rng: of exploration.
         device: the torch device that the agent is on.
+        exploration: changes some actions; None: none.
         guide: actions (T, U) of a plan, and (E,) slots that each flight follows it before the agents take over.
     """
 
-    def __init__(self, agent: Agent, epsilon: float, rng: np.random.Generator, device: str = "cpu",
+    def __init__(self, agent: Agent, device: str = "cpu", exploration: Exploration | None = None,
                  guide: tuple[np.ndarray, np.ndarray] | None = None):
-        self._agent, self._epsilon, self._rng, self._device, self._guide = agent, epsilon, rng, device, guide
+        self._agent, self._device, self._exploration, self._guide = agent, device, exploration, guide
 
     def start(self, mission: Mission, flights: int) -> None:
         self._mission = mission
         self._memory = None
         self._last = np.full((flights, mission.uavs), -1, dtype=np.int64)
         self._slot = 0
+        if self._exploration is not None:
+            self._exploration.start(flights, mission.uavs)
 
     @torch.inference_mode()
     def act(self, frame: Frame) -> np.ndarray:
@@ -102,10 +104,8 @@ class AgentPolicy:
         values, self._memory = self._agent(torch.from_numpy(observation).to(self._device)[None],
                                            torch.from_numpy(self._last).to(self._device)[None], self._memory)
         action = np.where(mask, values[0].cpu().numpy(), -np.inf).argmax(axis=-1)
-        if self._epsilon > 0:
-            explores = self._rng.random(action.shape) < self._epsilon
-            lots = np.where(mask, self._rng.random(mask.shape), -1.0).argmax(axis=-1)
-            action = np.where(explores, lots, action)
+        if self._exploration is not None:
+            action = self._exploration.change(action, mask)
         if self._guide is not None:
             plan, slots = self._guide
             following = slots > self._slot

@@ -24,8 +24,9 @@ class LearnerSettings(BaseModel):
     target_every: int = Field(50, ge=1, description="updates between copies to the target network")
     episodes_per_update: int = Field(4, ge=1, le=10_000, description="flights between updates")
     parallel: int = Field(20, ge=1, le=10_000, description="flights flown side by side")
-    first_epsilon: float = Field(1.0, ge=0, le=1, description="chance of a random action at the start")
-    last_epsilon: float = Field(0.05, ge=0, le=1, description="chance of a random action at the end")
+    first_epsilon: float = Field(1.0, ge=0, le=1, description="share of the slots that a UAV explores, at the start")
+    last_epsilon: float = Field(0.05, ge=0, le=1, description="the same at the end")
+    excursion_slots: float = Field(4.0, ge=1, le=1000, description="mean slots that exploration keeps a random action")
     epsilon_slots: int = Field(175_000, ge=0, description="slots over which it falls linearly")
     federate_every: int = Field(100, ge=1, description="episodes of a replica between averages (fedqmix), and between "
                                 "looks at the policy")
@@ -39,8 +40,8 @@ PRESETS = {
     "fast": LearnerSettings(),
     # Chen et al. 2023 and the code published with it; ten flights side by side are ours, and so is the reward's scale.
     "paper": LearnerSettings(learning_rate=5e-4, last_learning_rate=5e-4, td_lambda=0.0, double_q=False, replay=5000,
-                             target_every=200, episodes_per_update=1, parallel=10, epsilon_slots=50_000,
-                             federate_every=50, selection_flights=0, federate_all=False),
+                             target_every=200, episodes_per_update=1, parallel=10, excursion_slots=1.0,
+                             epsilon_slots=50_000, federate_every=50, selection_flights=0, federate_all=False),
 }
 EPISODES = {"fast": (10, 800), "paper": (30, 1000)}
 """Rounds, and episodes of each replica in each of them."""

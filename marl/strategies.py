@@ -167,7 +167,7 @@ class Learned:
         if not flights:
             return np.nan
         self.selection_flights += flights
-        policy = AgentPolicy(agent, 0.0, stream(seed, "decisions"), self._device)
+        policy = AgentPolicy(agent, self._device)
         return float(evaluate(mission, policy, flights, stream(seed, "choice")).ratio(mission).mean())
 
     def _better_plan(self, mission: Mission) -> np.ndarray:
@@ -181,7 +181,7 @@ class Learned:
         return new if after > before + CLEARLY else self._actions
 
     def policy(self, rng: np.random.Generator) -> Policy:
-        return AgentPolicy(self._best, 0.0, rng, self._device)
+        return AgentPolicy(self._best, self._device)
 
     def state(self, last: bool) -> dict:
         # The replicas' memories are most of a checkpoint.

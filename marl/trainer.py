@@ -3,6 +3,7 @@
 import numpy as np
 
 from marl.environment import Environment
+from marl.exploration import Exploration
 from marl.flights import AgentPolicy, Flights, fly
 from marl.learner import Learner
 from marl.mission import Mission
@@ -82,7 +83,8 @@ class Trainer:
 
     def _fly(self, count: int) -> Flights:
         guide = None if self._plan is None else (self._plan, self._follow(count))
-        policy = AgentPolicy(self.learner.agent, self.epsilon, self._rng, self.learner.device, guide)
+        exploration = Exploration(self.epsilon, self.settings.excursion_slots, self._rng)
+        policy = AgentPolicy(self.learner.agent, self.learner.device, exploration, guide)
         return fly(self._environment(count), policy)
 
     def _environment(self, count: int) -> Environment:

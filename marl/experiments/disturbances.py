@@ -20,7 +20,7 @@ from marl.mission import Known, Mission, make_mission
 from marl.planner import PlanPolicy, plan
 from marl.randomness import stream
 from marl.replanning import ReplanPolicy
-from marl.settings import PRESETS
+from marl.settings import LearnerSettings
 from marl.trainer import Trainer
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
@@ -60,8 +60,8 @@ def fly_disturbed(settings: dict, seed: int, folder: Path, keep: Callable[[], No
 
     Args:
         settings: `scene`, `scenario`, `method`, `flights`, `truths` (places of the devices that are drawn, where they
-            are not what is thought), and of a policy `episodes`, `epsilon_slots`, of a plan `planner_iterations`, of
-            re-planning `replan_every`, `replan_iterations`.
+            are not what is thought), and of a policy `episodes`, `learner` (fields of `LearnerSettings`), of a plan
+            `planner_iterations`, of re-planning `replan_every`, `replan_iterations`.
         seed: of everything random.
         folder, keep: not used; a run takes minutes.
 
@@ -77,7 +77,8 @@ def fly_disturbed(settings: dict, seed: int, folder: Path, keep: Callable[[], No
     policy: Policy
     if method == "policy":
         learned = make_world(scene, settings["scenario"], linked, settings["truths"], stream(seed, "learning", 1))
-        policy, curve = train(learned, settings["episodes"], settings["epsilon_slots"], settings["flights"], seed)
+        policy, curve = train(learned, settings["episodes"], LearnerSettings.model_validate(settings["learner"]),
+                              settings["flights"], seed)
     elif method == "plan":
         policy = PlanPolicy(plan(judged.believed, settings["planner_iterations"], seed).actions)
     elif method == "replan":
@@ -136,13 +137,13 @@ class DisturbedTrainer(Trainer):
         return DisturbedEnvironment(self.mission, count, self._rng, self.disturbance)
 
 
-def train(world: World, episodes: int, epsilon_slots: int, flights: int, seed: int) -> tuple[AgentPolicy, list[dict]]:
+def train(world: World, episodes: int, settings: LearnerSettings, flights: int,
+          seed: int) -> tuple[AgentPolicy, list[dict]]:
     """QMIX over the missions of a world, one after the other, a block each.
 
     Returns:
         the policy that collected most at the looks after the blocks, and these
     """
-    settings = PRESETS["fast"].model_copy(update={"epsilon_slots": epsilon_slots})
     trainer = DisturbedTrainer(settings, world.believed, episodes, seed)
     trainer.disturbance = world.disturbance
     best = Learner(settings, world.believed, seed).agent
@@ -153,7 +154,7 @@ def train(world: World, episodes: int, epsilon_slots: int, flights: int, seed: i
             trainer.enter(world.real[len(curve) % len(world.real)])
             block = min(BLOCK, episodes - trainer.episodes)
             record = trainer.train(block)
-            present = AgentPolicy(trainer.learner.agent, 0.0, stream(seed, "decisions", 1))
+            present = AgentPolicy(trainer.learner.agent)
             ratio = float(world.fly(present, flights, stream(seed, "choice")).mean())
             if ratio > highest:
                 highest = ratio
@@ -161,4 +162,4 @@ def train(world: World, episodes: int, epsilon_slots: int, flights: int, seed: i
                     best.load_state_dict(trainer.learner.agent.state_dict())
             curve.append({"episodes": trainer.episodes, "ratio": ratio, "train_ratio": record["train_ratio"]})
             advance(block)
-    return AgentPolicy(best, 0.0, stream(seed, "decisions", 2)), curve
+    return AgentPolicy(best), curve

@@ -13,11 +13,13 @@ import numpy as np
 
 import marl
 import radiotwin
-from marl.settings import LearnerSettings, RunSettings
+from marl.settings import LEARNERS, LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 
 SCHEMA = "radiotwin.experiment/1"
+EARLIER = {"excursion_slots": 1.0}
+"""What learners did before there was a setting for it, where that is not its default."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ def finished(run: Run, out: Path) -> bool:
         return False
     record = read_record(path)
     if not same(run, record["kind"], record["settings"]):
-        differ = _difference(filled(record["kind"], record["settings"]), run.settings)
+        differ = _difference(filled(record["settings"]), filled(run.settings))
         raise BadInput(f"{path} holds a run with other settings ({differ}); give another --out, or remove the file")
     return True
 
@@ -80,15 +82,16 @@ def write_record(run: Run, out: Path, result: dict, cpu_s: float, wall_s: float,
 
 def same(run: Run, kind: str, settings: dict) -> bool:
     """Whether these are the settings of a run."""
-    return kind == run.kind and filled(kind, settings) == filled(run.kind, run.settings)
+    return kind == run.kind and filled(settings) == filled(run.settings)
 
 
-def filled(kind: str, settings: dict) -> dict:
-    """Settings with the defaults of those that did not exist when they were written."""
-    if kind != "learning":
-        return settings
-    defaults = RunSettings().model_dump(mode="json", exclude={"seed", "compare"})
-    return {"run": defaults | settings["run"], "learner": LearnerSettings().model_dump() | settings["learner"]}
+def filled(settings: dict) -> dict:
+    """Settings with what those were that did not exist when they were written."""
+    groups = {"run": RunSettings().model_dump(mode="json", exclude={"seed", "compare"}),
+              "learner": LearnerSettings().model_dump() | EARLIER}
+    if settings.get("run", {}).get("algorithm", LEARNERS[0]) not in LEARNERS:  # how it would learn does not matter
+        settings = settings | {"learner": {}}
+    return settings | {name: group | settings[name] for name, group in groups.items() if name in settings}
 
 
 def read_record(path: Path) -> dict:

@@ -68,8 +68,8 @@ def twin(scenes: list[str], seeds: int) -> list[Run]:
     """Which twin to train in: the same five real flights, five twins, one learner, flown in the ray-traced truth."""
     return [Run("twin", f"{label(scene)}-{name}", "trained in",
                 {"scene": scene, "truth": "traced", "twin": name, "survey_flights": 5, "noise_db": 1.0,
-                 "episodes": 4000, "epsilon_slots": 87_500, "planner_iterations": 60_000, "flights": 64,
-                 "replayed_flights": 20}, seed)
+                 "episodes": 4000, "learner": learner(epsilon_slots=87_500), "planner_iterations": 60_000,
+                 "flights": 64, "replayed_flights": 20}, seed)
             for seed in range(seeds) for scene in scenes
             for name in ("nn", "segmented", "log-distance", "truth", "corrected")]
 
@@ -90,10 +90,10 @@ def pays(scenes: list[str], seeds: int) -> list[Run]:
         for scene in scenes:
             for scenario in SCENARIOS:
                 shared = {"scene": scene, "scenario": scenario, "flights": 64, "truths": 8}
-                learner = {"episodes": 4000, "epsilon_slots": 87_500}
+                trained = {"episodes": 4000, "learner": learner(epsilon_slots=87_500)}
                 planner = {"planner_iterations": 60_000}
                 again = planner | {"replan_every": 10, "replan_iterations": 1500}
-                for method, more in (("policy", learner), ("policy-no-link", learner), ("plan", planner),
+                for method, more in (("policy", trained), ("policy-no-link", trained), ("plan", planner),
                                      ("replan", again), ("replan-no-link", again), ("greedy", {})):
                     runs.append(Run("pays", f"{label(scene)}-{scenario}-{method}", "disturbed",
                                     shared | {"method": method} | more, seed))
@@ -103,13 +103,14 @@ def pays(scenes: list[str], seeds: int) -> list[Run]:
 def tuning(scenes: list[str], seeds: int) -> list[Run]:
     """What might bring model-aided learning nearer to the planner, one change at a time."""
     changes: dict[str, dict[str, Any]] = {
-               "as-it-is": {}, "lambda-0.6": {"td_lambda": 0.6}, "lambda-0.95": {"td_lambda": 0.95},
+               "as-it-is": {}, "excursions-1": {"excursion_slots": 1.0}, "excursions-8": {"excursion_slots": 8.0},
+               "lambda-0.6": {"td_lambda": 0.6}, "lambda-0.95": {"td_lambda": 0.95},
                "target-100": {"target_every": 100}, "epsilon-60k": {"epsilon_slots": 60_000},
                "replay-800": {"replay": 800}, "guide": {}, "measure": {}, "measure-guide": {}, "episodes-1600": {}}
     run_changes: dict[str, dict[str, Any]] = {"guide": {"guide": "planner"}, "measure": {"measure": "planner"},
                    "measure-guide": {"measure": "planner", "guide": "planner"}, "episodes-1600": {"episodes": 1600}}
-    return [learning("tuning", scene, "traced", seed, "qmix", changes=learner, name=name, **run_changes.get(name, {}))
-            for seed in range(seeds) for scene in scenes for name, learner in changes.items()]
+    return [learning("tuning", scene, "traced", seed, "qmix", changes=changed, name=name, **run_changes.get(name, {}))
+            for seed in range(seeds) for scene in scenes for name, changed in changes.items()]
 
 
 STUDIES = {
@@ -127,11 +128,15 @@ def learning(study: str, scene: str, truth: str, seed: int, algorithm: str, twin
              changes: dict[str, Any] | None = None, name: str | None = None, **run: Any) -> Run:
     """A run of Algorithm 1 with the preset `fast`, and what is changed in it."""
     settings = RunSettings(truth=truth, twin=twin, algorithm=algorithm, **run)
-    learner = PRESETS["fast"].model_copy(update={"mix": algorithm != "iql"} | (changes or {}))
     name = name or (f"{algorithm}-{twin}" if algorithm not in ("greedy", "random") else algorithm)
     return Run(study, f"{label(scene)}-{truth}-{name}", "learning",
                {"run": settings.model_dump(mode="json", exclude={"seed", "compare"}) | {"scene": scene},
-                "learner": learner.model_dump(mode="json")}, seed)
+                "learner": learner(**{"mix": algorithm != "iql"} | (changes or {}))}, seed)
+
+
+def learner(**changes: Any) -> dict[str, Any]:
+    """The preset `fast`, and what is changed in it, as a record has it."""
+    return PRESETS["fast"].model_copy(update=changes).model_dump(mode="json")
 
 
 def label(scene: str) -> str:
@@ -153,7 +158,7 @@ def with_settings(runs: list[Run], given: list[str]) -> list[Run]:
         name, equals, value = text.partition("=")
         changed = [_changed(run, name, value) if equals else None for run in runs]
         if all(run is None for run in changed):
-            names = sorted({each for run in runs for group in _groups(run) for each in group})
+            names = sorted({each for run in runs for group in _groups(run).values() for each in group})
             raise BadInput(f"--set {text}: give NAME=VALUE with one of {', '.join(names)}")
         runs = [new or old for new, old in zip(changed, runs)]
     for run in runs:
@@ -161,20 +166,18 @@ def with_settings(runs: list[Run], given: list[str]) -> list[Run]:
     return runs
 
 
-def _groups(run: Run) -> list[dict]:
-    return [run.settings["run"], run.settings["learner"]] if run.kind == "learning" else [run.settings]
+def _groups(run: Run) -> dict[str, dict[str, Any]]:
+    """The settings by group; those that are in none have the name ""."""
+    groups = {name: value for name, value in run.settings.items() if isinstance(value, dict)}
+    return groups | {"": {name: value for name, value in run.settings.items() if name not in groups}}
 
 
 def _changed(run: Run, name: str, text: str) -> Run | None:
-    if run.kind == "learning":
-        for group in ("run", "learner"):
-            if name in run.settings[group]:
-                value = _converted(name, text, run.settings[group][name])
-                return replace(run, settings=run.settings | {group: run.settings[group] | {name: value}})
-        return None
-    if name not in run.settings:
-        return None
-    return replace(run, settings=run.settings | {name: _converted(name, text, run.settings[name])})
+    for group, values in _groups(run).items():
+        if name in values:
+            changed = {name: _converted(name, text, values[name])}
+            return replace(run, settings=run.settings | ({group: values | changed} if group else changed))
+    return None
 
 
 def _converted(name: str, text: str, before: Any) -> Any:
@@ -191,16 +194,14 @@ def _converted(name: str, text: str, before: Any) -> Any:
 
 def _check(run: Run) -> None:
     """Complain about impossible values before anything is run."""
-    if run.kind == "learning":
-        try:
-            RunSettings.model_validate(run.settings["run"])
-            LearnerSettings.model_validate(run.settings["learner"])
-        except ValidationError as error:
-            first = error.errors()[0]
-            raise BadInput(f"--set {first['loc'][0]}={first['input']}: {first['msg']}") from None
-        return
-    for name, value in run.settings.items():
+    try:
+        for group, model in (("run", RunSettings), ("learner", LearnerSettings)):
+            model.model_validate(run.settings.get(group, {}))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise BadInput(f"--set {first['loc'][0]}={first['input']}: {first['msg']}") from None
+    for name, value in _groups(run)[""].items():
         for each in value if isinstance(value, list) else [value]:
-            least = 0 if name in ("noise_db", "epsilon_slots") else 1
+            least = 0 if name == "noise_db" else 1
             if isinstance(each, int | float) and each < least:
                 raise BadInput(f"--set {name}={each}: allowed is {least} or more")

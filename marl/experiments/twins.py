@@ -12,7 +12,7 @@ from marl.mission import Known, Mission
 from marl.planner import PlanPolicy, plan
 from marl.randomness import stream
 from marl.reality import Reality, known_by, location_errors_m
-from marl.settings import PRESETS, RunSettings
+from marl.settings import LearnerSettings, RunSettings
 from marl.strategies import evaluate, make_strategy
 from radiotwin.cli.world import read_truth
 from radiotwin.closeloop.corrected import corrected_twin
@@ -60,7 +60,8 @@ def train_in(settings: dict, seed: int, folder: Path, keep: Callable[[], None]) 
 
     Args:
         settings: `scene`, `truth`, `twin` (of `MODELS`, or `corrected`, `truth`), `survey_flights`, `noise_db`,
-            `episodes`, `epsilon_slots`, `planner_iterations`, `flights` of an evaluation, `replayed_flights`.
+            `episodes`, `learner` (fields of `LearnerSettings`), `planner_iterations`, `flights` of an evaluation,
+            `replayed_flights`.
         seed: of everything random.
         folder: the twin is kept in it; closing the loop takes minutes.
         keep: called when it is there.
@@ -79,8 +80,7 @@ def train_in(settings: dict, seed: int, folder: Path, keep: Callable[[], None]) 
     real = reality.mission(known)
     inside = real if twin is None else reality.twin_mission(twin, known)
     run = RunSettings(algorithm="qmix", episodes=settings["episodes"], real_episodes=1, seed=seed)
-    learner = PRESETS["fast"].model_copy(update={"epsilon_slots": settings["epsilon_slots"]})
-    strategy = make_strategy(run, learner, inside, 1, "cpu")
+    strategy = make_strategy(run, LearnerSettings.model_validate(settings["learner"]), inside, 1, "cpu")
     try:
         with progress(f"training, {name}", total=run.episodes) as advance:
             looks = strategy.prepare(inside, advance)

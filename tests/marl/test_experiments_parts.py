@@ -92,21 +92,33 @@ def test_every_run_of_every_study_has_its_own_file():
 
 
 def test_runs_of_the_benchmark_are_taken_where_they_flew_over_the_same_map(tmp_path):
-    run = learning("curve", "rbm", "traced", 1, "qmix")
+    def qmix(scene, truth, seed, **run):
+        return learning("curve", scene, truth, seed, "qmix", changes={"excursion_slots": 1.0}, **run)
+
+    run = qmix("rbm", "traced", 1)
     result, cpu_s, _, source = earlier.earlier_result(run, tmp_path)
     kept = json.loads((RESULTS / source).read_text())["runs"][1]
     assert result["curve"] == kept["rows"] and cpu_s == kept["cpu_s"]
-    assert earlier.earlier_result(learning("curve", "rbm", "segmented", 1, "qmix"), tmp_path) is None
-    of_the_paper = earlier.earlier_result(learning("curve", "runs/paper_rbm", "segmented", 1, "qmix"), tmp_path)
+    assert earlier.earlier_result(qmix("rbm", "segmented", 1), tmp_path) is None
+    of_the_paper = earlier.earlier_result(qmix("runs/paper_rbm", "segmented", 1), tmp_path)
     assert of_the_paper[3] == "marl_rbm_segmented_qmix.json"
-    assert earlier.earlier_result(learning("curve", "rbm", "traced", 9, "qmix"), tmp_path) is None
-    assert earlier.earlier_result(learning("curve", "rbm", "traced", 1, "qmix", episodes=801), tmp_path) is None
+    assert earlier.earlier_result(qmix("rbm", "traced", 9), tmp_path) is None
+    assert earlier.earlier_result(qmix("rbm", "traced", 1, episodes=801), tmp_path) is None
+    assert earlier.earlier_result(learning("curve", "rbm", "traced", 1, "qmix"), tmp_path) is None
+    assert earlier.earlier_result(learning("curve", "rbm", "traced", 1, "planner"), tmp_path) is not None
 
 
 def test_settings_from_before_a_setting_existed_have_its_default():
     settings = learning("curve", "rbm", "traced", 0, "qmix").settings
     old = settings | {"run": {name: value for name, value in settings["run"].items() if name != "measure"}}
-    assert filled("learning", old) == settings
+    assert filled(old) == settings
+
+
+def test_learners_from_before_excursions_made_none():
+    settings = learning("curve", "rbm", "traced", 0, "qmix", changes={"excursion_slots": 1.0}).settings
+    old = settings | {"learner": {name: value for name, value in settings["learner"].items()
+                                  if name != "excursion_slots"}}
+    assert filled(old) == settings != filled(learning("curve", "rbm", "traced", 0, "qmix").settings)
 
 
 def test_a_record_has_only_what_json_has(tmp_path):

@@ -90,5 +90,5 @@ def test_a_small_mission_is_learnt_to_95_percent_of_its_optimum(tiny):
     trainer = Trainer(settings, mission, 3000, 0)
     trainer.train(3000)
     rng = np.random.default_rng(0)
-    ratio = fly(Environment(mission, 1, rng), AgentPolicy(trainer.learner.agent, 0.0, rng)).ratio(mission)[0]
+    ratio = fly(Environment(mission, 1, rng), AgentPolicy(trainer.learner.agent)).ratio(mission)[0]
     assert 0.95 * optimum <= ratio <= optimum * (1 + 1e-6)
