@@ -70,8 +70,7 @@ def _trajectories(records: list[dict], figures: Path) -> list[Path]:
     written = []
     for record in records:
         run = record["settings"]["run"]
-        if (run["algorithm"], run["twin"], run["truth"], record["seed"]) == ("fedqmix", "nn", "traced", 0) and \
-                "flight" in record:
+        if record["name"].endswith("-traced-fedqmix-nn") and record["seed"] == 0 and "flight" in record:
             scene = Scene.load(scene_folder(run["scene"]))
             known = Known({name: tuple(place_m) for name, place_m in record["known_m"].items()})
             mission = make_mission(scene, segmented_truth(scene), known)
