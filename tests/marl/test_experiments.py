@@ -51,7 +51,7 @@ def test_a_study_writes_a_record_for_each_run_and_its_table_and_figure(curve, tm
     status, out, err = run([*words, "--jobs", "2", "--out", "results"], tmp_path)
     assert status == 0, err
     folder = tmp_path / "results"
-    names = {"fedqmix-nn", "iql-truth", "greedy"}
+    names = {"fedqmix-nn", "fedqmix-nn-measured", "iql-truth", "greedy"}
     assert {path.name for path in (folder / "curve").iterdir()} == {f"small-segmented-{name}-s0.json" for name in names}
     assert out.count("CPU s") == len(names)
     record = json.loads((folder / "curve" / "small-segmented-fedqmix-nn-s0.json").read_text())
@@ -62,10 +62,11 @@ def test_a_study_writes_a_record_for_each_run_and_its_table_and_figure(curve, tm
     assert 0 < record["curve"][-1]["truth_ratio"] <= 1
     table = (folder / "curve.md").read_text()
     assert f"| model-aided FedQMIX | 2 | {record['curve'][-1]['truth_ratio']:.3f} |" in table
+    assert "| model-aided FedQMIX, plans measure | 2 |" in table
     assert (folder / "figures" / "curve.png").stat().st_size > 10_000
     assert main([*words, "--out", str(folder)]) == 2
     err = capsys.readouterr().err
-    assert "3 finished runs" in err and "--resume" in err
+    assert f"{len(names)} finished runs" in err and "--resume" in err
 
 
 def test_a_killed_study_goes_on_and_repeats_nothing(curve, tmp_path, capsys):
