@@ -63,7 +63,7 @@ def curve_table(records: list[dict]) -> str:
 
 def slot_by_slot(records: list[dict]) -> bool:
     """Whether no learner of these runs made excursions."""
-    return all(filled(record["settings"])["learner"].get("excursion_slots", 1.0) == 1.0 for record in records)
+    return all(filled(record["settings"])["learner"]["excursion_slots"] == 1.0 for record in records)
 
 
 def factors(curves: dict, target: float) -> str:
