@@ -19,8 +19,8 @@ from radiotwin.scene.preview import height_grid
 DPI = 130
 IDLE_COLOUR = "#555555"
 COLOURS = ["#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9",  # Okabe and Ito
-           "#6a3d9a"]
-MARKERS = "os^DvPX"
+           "#6a3d9a", "#f0e442"]
+MARKERS = "os^DvPX*"
 LEVEL_STYLES = ("--", ":", "-.")
 
 

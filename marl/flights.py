@@ -108,10 +108,30 @@ class AgentPolicy:
             action = self._exploration.change(action, mask)
         if self._guide is not None:
             plan, slots = self._guide
-            following = slots > self._slot
-            action[following] = plan[self._slot]
+            wanted = plan[self._slot]
+            # A UAV that was lost cannot follow.
+            following = (slots > self._slot)[:, None] & mask[:, np.arange(len(wanted)), wanted]
+            action = np.where(following, wanted, action)
         self._last, self._slot = action, self._slot + 1
         return action
+
+
+class Replayed:
+    """The actions of earlier flights, flight by flight; only for as many, and where they are feasible.
+
+    Args:
+        action: (E, T, U).
+    """
+
+    def __init__(self, action: np.ndarray):
+        self._action = action
+
+    def start(self, mission: Mission, flights: int) -> None:
+        self._slot = 0
+
+    def act(self, frame: Frame) -> np.ndarray:
+        self._slot += 1
+        return self._action[:, self._slot - 1]
 
 
 def fly(environment: Environment, policy: Policy) -> Flights:

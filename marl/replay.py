@@ -2,9 +2,11 @@
 
 import numpy as np
 
-from marl.environment import Frame, empty_frame
-from marl.flights import Flights
+from marl.environment import Environment, Frame, empty_frame
+from marl.flights import Flights, Replayed, fly
 from marl.mission import Mission
+
+SIDE_BY_SIDE = 200  # flights that are flown again at once; bounds the memory
 
 
 class Replay:
@@ -30,6 +32,19 @@ class Replay:
             kept[rows] = new
         self._next = int((self._next + len(rows)) % self.capacity)
         self.size = min(self.size + len(rows), self.capacity)
+
+    def fly_again(self, mission: Mission, rng: np.random.Generator) -> None:
+        """Fly all that is remembered again in another map: the same actions, but what is received and collected there.
+
+        Args:
+            mission: differs in the map and the known positions only, so that the actions stay feasible.
+            rng: draws the shadowing.
+        """
+        for start in range(0, self.size, SIDE_BY_SIDE):
+            rows = slice(start, min(start + SIDE_BY_SIDE, self.size))
+            flights = fly(Environment(mission, rows.stop - start, rng), Replayed(self._flights.action[rows]))
+            for kept, new in zip(_arrays(self._flights), _arrays(flights)):
+                kept[rows] = new
 
     def sample(self, count: int, rng: np.random.Generator) -> Flights:
         """Draw different flights, all with the same chance; cut to the longest of them."""

@@ -21,6 +21,7 @@ class LearnerSettings(BaseModel):
     double_q: bool = Field(True, description="choose the target's action with the present network")
     batch: int = Field(32, ge=1, le=10_000, description="flights in an update")
     replay: int = Field(2000, ge=1, le=1_000_000, description="flights that are remembered")
+    fly_again: bool = Field(False, description="in a new map, fly what is remembered again, action by action")
     target_every: int = Field(50, ge=1, description="updates between copies to the target network")
     episodes_per_update: int = Field(4, ge=1, le=10_000, description="flights between updates")
     parallel: int = Field(20, ge=1, le=10_000, description="flights flown side by side")
@@ -28,6 +29,8 @@ class LearnerSettings(BaseModel):
     last_epsilon: float = Field(0.05, ge=0, le=1, description="the same at the end")
     excursion_slots: float = Field(4.0, ge=1, le=1000, description="mean slots that exploration keeps a random action")
     epsilon_slots: int = Field(175_000, ge=0, description="slots over which it falls linearly")
+    restart_epsilon: float = Field(0.0, ge=0, le=1, description="share that a new map starts with, at least")
+    restart_slots: int = Field(25_000, ge=1, description="slots over which it falls to 0 linearly")
     federate_every: int = Field(100, ge=1, description="episodes of a replica between averages (fedqmix), and between "
                                 "looks at the policy")
     selection_flights: int = Field(64, ge=0, le=100_000, description="flights of a look at the policy, in the map that "

@@ -31,7 +31,7 @@ class Trainer:
         self.settings, self.horizon = settings, horizon
         self.learner = Learner(settings, mission, seed, device)
         self.replay = Replay(settings.replay, mission)
-        self.episodes, self.slots = 0, 0
+        self.episodes, self.slots, self._entered = 0, 0, 0
         self.mission = mission
         self._plan: np.ndarray | None = None
         self._rng = stream(seed, "learning", number)
@@ -43,14 +43,18 @@ class Trainer:
             mission: its map.
             plan: (T, U) actions of a good flight in it, to learn from; None: no help.
         """
-        self.mission, self._plan = mission, plan
+        self.mission, self._plan, self._entered = mission, plan, self.slots
+        if self.settings.fly_again:
+            self.replay.fly_again(mission, self._rng)
 
     @property
     def epsilon(self) -> float:
-        """Present chance of a random action."""
+        """Present share of explored slots."""
         settings = self.settings
         done = min(self.slots / settings.epsilon_slots, 1.0) if settings.epsilon_slots else 1.0
-        return settings.first_epsilon + done * (settings.last_epsilon - settings.first_epsilon)
+        here = min((self.slots - self._entered) / settings.restart_slots, 1.0)
+        return max(settings.first_epsilon + done * (settings.last_epsilon - settings.first_epsilon),
+                   settings.restart_epsilon * (1 - here))
 
     @property
     def learning_rate(self) -> float:
@@ -109,11 +113,11 @@ class Trainer:
 
     def state(self) -> dict:
         """Everything that training goes on from, for a checkpoint."""
-        return {"episodes": self.episodes, "slots": self.slots, "rng": self._rng.bit_generator.state,
-                "learner": self.learner.state(), "replay": self.replay.state()}
+        return {"episodes": self.episodes, "slots": self.slots, "entered": self._entered,
+                "rng": self._rng.bit_generator.state, "learner": self.learner.state(), "replay": self.replay.state()}
 
     def load_state(self, state: dict) -> None:
-        self.episodes, self.slots = state["episodes"], state["slots"]
+        self.episodes, self.slots, self._entered = state["episodes"], state["slots"], state["entered"]
         self._rng.bit_generator.state = state["rng"]
         self.learner.load_state(state["learner"])
         self.replay.load_state(state["replay"])

@@ -60,8 +60,8 @@ def fly_disturbed(settings: dict, seed: int, folder: Path, keep: Callable[[], No
 
     Args:
         settings: `scene`, `scenario`, `method`, `flights`, `truths` (places of the devices that are drawn, where they
-            are not what is thought), and of a policy `episodes`, `learner` (fields of `LearnerSettings`), of a plan
-            `planner_iterations`, of re-planning `replan_every`, `replan_iterations`.
+            are not what is thought), and of a policy `episodes`, `learner` (fields of `LearnerSettings`), of a plan and
+            of a policy that one teaches `planner_iterations`, of re-planning `replan_every`, `replan_iterations`.
         seed: of everything random.
         folder, keep: not used; a run takes minutes.
 
@@ -75,10 +75,11 @@ def fly_disturbed(settings: dict, seed: int, folder: Path, keep: Callable[[], No
     curve: list[dict] = []
     rng = stream(seed, "decisions")
     policy: Policy
-    if method == "policy":
+    if method in ("policy", "taught"):
+        teacher = None if method == "policy" else plan(judged.believed, settings["planner_iterations"], seed).actions
         learned = make_world(scene, settings["scenario"], linked, settings["truths"], stream(seed, "learning", 1))
         policy, curve = train(learned, settings["episodes"], LearnerSettings.model_validate(settings["learner"]),
-                              settings["flights"], seed)
+                              settings["flights"], seed, teacher)
     elif method == "plan":
         policy = PlanPolicy(plan(judged.believed, settings["planner_iterations"], seed).actions)
     elif method == "replan":
@@ -137,9 +138,17 @@ class DisturbedTrainer(Trainer):
         return DisturbedEnvironment(self.mission, count, self._rng, self.disturbance)
 
 
-def train(world: World, episodes: int, settings: LearnerSettings, flights: int,
-          seed: int) -> tuple[AgentPolicy, list[dict]]:
+def train(world: World, episodes: int, settings: LearnerSettings, flights: int, seed: int,
+          teacher: np.ndarray | None = None) -> tuple[AgentPolicy, list[dict]]:
     """QMIX over the missions of a world, one after the other, a block each.
+
+    Args:
+        world: what is trained in, and looked at.
+        episodes: of training.
+        settings: of the learner.
+        flights: of a look.
+        seed: of everything random.
+        teacher: (T, U) actions of a plan that some flights follow (`Trainer.enter`).
 
     Returns:
         the policy that collected most at the looks after the blocks, and these
@@ -151,7 +160,7 @@ def train(world: World, episodes: int, settings: LearnerSettings, flights: int,
     curve: list[dict] = []
     with progress("training", total=episodes) as advance:
         while trainer.episodes < episodes:
-            trainer.enter(world.real[len(curve) % len(world.real)])
+            trainer.enter(world.real[len(curve) % len(world.real)], teacher)
             block = min(BLOCK, episodes - trainer.episodes)
             record = trainer.train(block)
             present = AgentPolicy(trainer.learner.agent)

@@ -27,7 +27,8 @@ TWINS = {"nn": "segmented network (NN)", "segmented": "segmented log-distance", 
          "corrected": "corrected (after `close-loop`)", "truth": "the truth"}
 MODELS = {"segmented_nn": "NN", "log_distance": "log-distance", "regression_kriging": "kriging"}
 METHODS = {"plan": "open-loop plan", "replan": "re-planning, link", "replan-no-link": "re-planning, no link",
-           "policy": "policy, link", "policy-no-link": "policy, no link", "greedy": "greedy"}
+           "policy": "policy, link", "policy-no-link": "policy, no link", "taught": "policy taught by the plan, link",
+           "taught-no-link": "the same, no link", "greedy": "greedy"}
 SCENARIOS = {"nominal": "as thought", "volumes": "data 0–2 × nominal", "positions": "devices 20–40 m off",
              "loss": "a UAV is lost", "everything": "all three"}
 ENOUGH = 0.95  # of what both learners reach at least

@@ -7,7 +7,7 @@ import numpy as np
 
 from marl.environment import Environment
 from marl.experiments.learning import scene_folder
-from marl.flights import Flights, HeuristicPolicy, fly
+from marl.flights import Flights, HeuristicPolicy, Replayed, fly
 from marl.mission import Known, Mission
 from marl.planner import PlanPolicy, plan
 from marl.randomness import stream
@@ -116,20 +116,6 @@ class Mixed:
         return np.where(explores, self._random.act(frame), self._greedy.act(frame))
 
 
-class Replayed:
-    """The actions of recorded flights, flight by flight."""
-
-    def __init__(self, flights: Flights):
-        self._action = flights.action.astype(np.int64)
-
-    def start(self, mission: Mission, flights: int) -> None:
-        self._slot = 0
-
-    def act(self, frame):
-        self._slot += 1
-        return self._action[:, self._slot - 1]
-
-
 def fidelity(real: Mission, twin: Mission, flights: int, seed: int) -> dict[str, float]:
     """What the same actions collect in a twin and in the truth.
 
@@ -143,7 +129,7 @@ def fidelity(real: Mission, twin: Mission, flights: int, seed: int) -> dict[str,
         share collected from each device, with `device_`
     """
     flown = fly(Environment(real, flights, stream(seed, "real flight")), Mixed(stream(seed, "decisions", 1)))
-    replays = [fly(Environment(twin, flights, stream(seed, "twin evaluation", number)), Replayed(flown))
+    replays = [fly(Environment(twin, flights, stream(seed, "twin evaluation", number)), Replayed(flown.action))
                for number in range(SAMPLES)]
     there, here = _by_device(flown), np.mean([_by_device(each) for each in replays], axis=0)
     found = {}

@@ -1,10 +1,14 @@
 """Flights that do not go as was thought."""
 
 import numpy as np
+import torch
 
 from marl.disturbances import Disturbance, DisturbedEnvironment
 from marl.environment import Environment
-from marl.flights import HeuristicPolicy, fly
+from marl.features import observation_size
+from marl.flights import AgentPolicy, HeuristicPolicy, fly
+from marl.mission import HOVER, NO_OP
+from marl.networks import Agent
 
 
 def flown(mission, disturbance, flights=200):
@@ -41,3 +45,15 @@ def test_one_uav_is_lost_stands_still_and_collects_no_more(tiny):
         assert (flights.collected[flight, slot:, uav] == 0).all()
         assert (flights.frames.cell[flight, slot:, uav] == flights.frames.cell[flight, slot, uav]).all()
         assert flights.collected[flight, slot:, 1 - uav].shape[0] > 0
+
+
+def test_a_lost_uav_does_not_follow_the_plan_that_teaches(tiny):
+    mission = tiny(0, uavs=2, battery=(40, 40))
+    agent = Agent(observation_size(mission), mission.uavs, 8, torch.Generator().manual_seed(0))
+    plan = np.full((mission.longest, 2), HOVER)
+    policy = AgentPolicy(agent, guide=(plan, np.full(50, mission.longest)))
+    flights = fly(DisturbedEnvironment(mission, 50, np.random.default_rng(0), Disturbance(loss=1.0)), policy)
+    down = flights.frames.battery == 0
+    flown = np.arange(mission.longest)[None, :] < flights.length[:, None]
+    assert down[flown].any() and (flights.action[flown][down[flown]] == NO_OP).all()
+    assert (flights.action[flown][~down[flown]] == HOVER).all()

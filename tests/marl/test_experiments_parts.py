@@ -64,7 +64,7 @@ def test_every_method_flies_where_things_are_not_as_thought(small_scene, tmp_pat
                  "everything", "--set", "episodes=100", "--set", "flights=6", "--set", "truths=2", "--set",
                  "planner_iterations=500", "--set", "replan_iterations=50"]) == 0
     found = records(tmp_path / "pays")
-    assert len(found) == 6 and all(len(record["ratios"]) == 6 for record in found.values())
+    assert len(found) == 8 and all(len(record["ratios"]) == 6 for record in found.values())
     assert all(0 <= ratio <= 1 for record in found.values() for ratio in record["ratios"])
     assert [row["episodes"] for row in found["small-everything-policy-s0"]["curve"]] == [100]
     table = (tmp_path / "pays.md").read_text()

@@ -80,3 +80,27 @@ def test_three_replicas_of_five_thousand_flights_of_the_papers_missions_take_at_
         np.zeros(uavs), np.ones(devices), np.zeros((devices, 2)), 20.0, 100.0, 10.0, -np.inf, np.zeros(2), False)
     # Zeros are not yet taken from the system, so this needs no memory.
     assert 3 * Replay(5000, mission).bytes < 0.7 * GIB
+
+
+def test_flown_again_in_another_map_the_actions_stay_and_what_they_meet_is_new(tiny, monkeypatch):
+    monkeypatch.setattr("marl.replay.SIDE_BY_SIDE", 4)  # ten flights are three parts
+    here, there = tiny(2), tiny(2)._replace(snr_db=tiny(3).snr_db, known_m=tiny(3).known_m)
+    replay = Replay(20, here)
+    flights = fly(Environment(here, 10, np.random.default_rng(0)), HeuristicPolicy("random", np.random.default_rng(1)))
+    replay.add(flights)
+    replay.fly_again(there, np.random.default_rng(2))
+    environment = Environment(there, 10, np.random.default_rng(3))
+    frame, collected = environment.reset(), []
+    for slot in range(flights.action.shape[1]):
+        state = replay.state()
+        np.testing.assert_array_equal(state["snr_db"][:, slot], frame.snr_db)
+        np.testing.assert_array_equal(state["data_units"][:, slot], frame.data_units)
+        np.testing.assert_array_equal(state["cell"][:, slot], flights.frames.cell[:, slot])
+        np.testing.assert_array_equal(state["battery"][:, slot], flights.frames.battery[:, slot])
+        collected.append(environment.step(flights.action[:, slot]))
+    state = replay.state()
+    assert replay.size == 10
+    np.testing.assert_array_equal(state["collected"], np.stack(collected, axis=1))
+    np.testing.assert_array_equal(state["action"], flights.action)
+    np.testing.assert_array_equal(state["length"], flights.length)
+    assert (state["collected"] != flights.collected).any()

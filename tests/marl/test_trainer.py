@@ -92,3 +92,31 @@ def test_a_small_mission_is_learnt_to_95_percent_of_its_optimum(tiny):
     rng = np.random.default_rng(0)
     ratio = fly(Environment(mission, 1, rng), AgentPolicy(trainer.learner.agent)).ratio(mission)[0]
     assert 0.95 * optimum <= ratio <= optimum * (1 + 1e-6)
+
+
+def test_exploration_begins_anew_in_a_new_map_and_fades_to_what_it_would_be(tiny):
+    mission = tiny(0)
+    settings = SETTINGS.model_copy(update={"epsilon_slots": 40, "restart_epsilon": 0.5, "restart_slots": 200})
+    trainer = Trainer(settings, mission, 400, 0)
+    trainer.enter(mission)
+    assert trainer.epsilon == 1.0
+    trainer.train(40)
+    assert trainer.epsilon == pytest.approx(0.05)
+    trainer.enter(mission)
+    assert trainer.epsilon == 0.5
+    before = trainer.slots
+    trainer.train(4)
+    assert trainer.epsilon == pytest.approx(0.5 * (1 - (trainer.slots - before) / 200))
+    trainer.train(40)
+    assert trainer.epsilon == pytest.approx(0.05)
+
+
+def test_what_is_remembered_is_flown_again_in_a_new_map_only_where_that_is_asked_for(tiny):
+    here = tiny(2)
+    there = here._replace(snr_db=tiny(3).snr_db)
+    for asked in (False, True):
+        trainer = Trainer(SETTINGS.model_copy(update={"fly_again": asked}), here, 40, 0)
+        trainer.train(12)
+        before = trainer.replay.state()["collected"].copy()
+        trainer.enter(there)
+        assert (trainer.replay.state()["collected"] != before).any() == asked
