@@ -15,6 +15,7 @@ from marl.randomness import stream
 from marl.reality import Reality, known_by, learn_twin, location_errors_m
 from marl.settings import LearnerSettings, RunSettings
 from marl.strategies import Strategy, evaluate, make_strategy
+from marl.waypoints import waypoint_actions
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin
@@ -89,7 +90,8 @@ def run_algorithm(run: RunSettings, learner: LearnerSettings, scene: Scene, trut
                 reality.fly(_measuring(run, reality, twin, known, strategy, rng), known)
                 twin = learn_twin(reality, run.twin, run.seed, twin)
                 known = known if run.privileged else known_by(twin)
-                mission = reality.twin_mission(twin, known)
+                lasting = reality.measurements() if run.twin_shadowing == "fitted" else None
+                mission = reality.twin_mission(twin, known, lasting)
             learned_s = time.perf_counter() - started
             blocks += [{"round": number + 1} | block for block in strategy.prepare(mission, advance)]
             in_twin = np.full(1, np.nan)
@@ -123,9 +125,12 @@ def run_algorithm(run: RunSettings, learner: LearnerSettings, scene: Scene, trut
 def _measuring(run: RunSettings, reality: Reality, twin: Twin | None, known: Known, strategy: Strategy,
                rng: np.random.Generator) -> Policy:
     """What flies the next real episode."""
-    if twin is None:  # nothing is known yet
+    how = run.measure if twin is not None else run.first_flight
+    if how == "waypoints":
+        return PlanPolicy(waypoint_actions(reality.scene, reality.mission(known), rng))
+    if twin is None:
         return HeuristicPolicy("random", rng)
-    if run.measure == "planner":
+    if how == "planner":
         return PlanPolicy(plan(reality.twin_mission(twin, known), run.planner_iterations, run.seed).actions)
     return strategy.policy(rng)
 

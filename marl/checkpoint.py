@@ -10,7 +10,7 @@ import torch
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, atomic_path
 
-FORMAT = 2  # 1 had the optimiser's state as torch.optim writes it
+FORMAT = 3  # 1 had the optimiser's state as torch.optim writes it, 2 not when a trainer entered its map
 
 
 def save_checkpoint(state: dict, path: Path) -> None:

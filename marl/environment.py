@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from marl.mission import COSTS, MOVES, NO_OP, Mission
+from marl.shadowing import CorrelatedField
 
 ACTION_COUNT = len(COSTS)
 
@@ -55,6 +56,12 @@ class Environment:
         self.mission = mission
         self.frame = empty_frame((flights,), mission)
         self._rng = rng
+        shape = mission.snr_db.shape[1:]
+        self._field = None
+        if mission.shadowing_share > 0:
+            self._field = CorrelatedField(shape[1:], mission.step_m, mission.shadowing_m)
+        # (E, K, ny, nx) what stays of each flight's shadowing, in sigmas
+        self._lasting = np.zeros((flights if self._field else 0, *shape), dtype=np.float32)
 
     def reset(self, which: np.ndarray | None = None) -> Frame:
         """All UAVs at their starts with full batteries, all data at their devices.
@@ -67,7 +74,10 @@ class Environment:
         frame.cell[which] = mission.start
         frame.battery[which] = mission.battery
         frame.data_units[which] = mission.data_units
-        _sense(mission, frame, which, self._rng)
+        if self._field is not None:
+            new = self._field.draw(int(which.sum()) * mission.devices, self._rng) * mission.shadowing_share**0.5
+            self._lasting[which] = new.reshape(-1, *self._lasting.shape[1:])
+        _sense(mission, frame, which, self._lasting, self._rng)
         return frame
 
     def step(self, action: np.ndarray) -> np.ndarray:
@@ -79,7 +89,7 @@ class Environment:
         Returns:
             (E, U) float32 data units that each UAV collected
         """
-        return _step(self.mission, self.frame, np.asarray(action, dtype=np.int64), self._rng)
+        return _step(self.mission, self.frame, np.asarray(action, dtype=np.int64), self._lasting, self._rng)
 
     @property
     def done(self) -> np.ndarray:
@@ -143,9 +153,10 @@ def assign(strength: np.ndarray, max_rate: bool, out: np.ndarray) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _sense(mission, frame, flying, rng):
+def _sense(mission, frame, flying, lasting, rng):
     """Draw this slot's SNRs and assign devices, in the flights that are still flying."""
     uavs, devices = mission.snr_db.shape[:2]
+    of_slot = np.sqrt(1.0 - mission.shadowing_share)
     strength = np.empty((uavs, devices))
     for e in range(len(flying)):
         if not flying[e]:
@@ -156,7 +167,10 @@ def _sense(mission, frame, flying, rng):
                 snr_db = mission.snr_db[u, k, row, column]
                 sigma_db = mission.sigma_db[u, k, row, column]
                 if sigma_db > 0:
-                    snr_db += np.float32(sigma_db * rng.standard_normal())
+                    shadowing = of_slot * rng.standard_normal()
+                    if mission.shadowing_share > 0:
+                        shadowing += lasting[e, k, row, column]
+                    snr_db += np.float32(sigma_db * shadowing)
                 if snr_db < mission.detection_db:
                     snr_db = np.float32(-np.inf)
                 frame.snr_db[e, u, k] = snr_db
@@ -167,7 +181,7 @@ def _sense(mission, frame, flying, rng):
 
 
 @njit(cache=True, nogil=True)
-def _step(mission, frame, action, rng):
+def _step(mission, frame, action, lasting, rng):
     flights, uavs = action.shape
     collected = np.zeros((flights, uavs), dtype=np.float32)
     flying = np.zeros(flights, dtype=np.bool_)
@@ -186,5 +200,5 @@ def _step(mission, frame, action, rng):
             frame.cell[e, u, 0] += MOVES[action[e, u], 0]
             frame.cell[e, u, 1] += MOVES[action[e, u], 1]
             frame.battery[e, u] -= COSTS[action[e, u]]
-    _sense(mission, frame, flying, rng)
+    _sense(mission, frame, flying, lasting, rng)
     return collected

@@ -26,7 +26,7 @@ class Mission(NamedTuple):
 
     Attributes:
         snr_db: (U, K, ny, nx) float32 mean SNR [dB]; -inf where nothing is ever received.
-        sigma_db: (U, K, ny, nx) float32 standard deviation of the shadowing, drawn anew in every slot [dB].
+        sigma_db: (U, K, ny, nx) float32 standard deviation of the shadowing [dB].
         steps_home: (U, ny, nx) int64 moves to the UAV's terminal.
         start: (U, 2) int64 cell (row, column) where each UAV starts.
         battery: (U,) int64 at take-off, in hovers (half battery units).
@@ -41,6 +41,7 @@ class Mission(NamedTuple):
         uav_link_db: (2,) SNR between two UAVs at 1 m [dB], and its slope per decade of distance (the LoS law).
         max_rate: whether a UAV that loses its best device to another one idles (the paper's Eq. 8); otherwise the
             strongest remaining pair is matched until none is left.
+        shadowing_share, shadowing_m: see `Shadowing`; with 0 all of it is drawn anew in every slot.
     """
 
     snr_db: np.ndarray
@@ -57,6 +58,8 @@ class Mission(NamedTuple):
     detection_db: float
     uav_link_db: np.ndarray
     max_rate: bool
+    shadowing_share: float = 0.0
+    shadowing_m: float = 50.0
 
     @property
     def uavs(self) -> int:

@@ -9,6 +9,7 @@ from marl.environment import Environment
 from marl.flights import Flights, Policy, fly
 from marl.mission import Known, Mission, make_mission
 from marl.randomness import stream
+from marl.shadowing import twin_shadowing
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.radiomap import RadioMap
@@ -43,9 +44,15 @@ class Reality:
         """The mission in the truth, for UAVs that know these positions."""
         return make_mission(self.scene, self.truth, known, self.assignment)
 
-    def twin_mission(self, twin: Twin, known: Known) -> Mission:
-        """The mission in the twin."""
-        return make_mission(self.scene, twin.radio_map(self.scene), known, self.assignment)
+    def twin_mission(self, twin: Twin, known: Known, measurements: Measurements | None = None) -> Mission:
+        """The mission in the twin; what its map is wrong about lasts as long as `measurements` say, where they are
+        given, otherwise for a slot."""
+        radio_map = twin.radio_map(self.scene)
+        mission = make_mission(self.scene, radio_map, known, self.assignment)
+        if measurements is None:
+            return mission
+        share, length_m = twin_shadowing(twin, radio_map, measurements, self.scene.config.gain_limit_db, self.seed)
+        return mission._replace(shadowing_share=share, shadowing_m=length_m)
 
     def fly(self, policy: Policy, known: Known) -> Flights:
         """Fly one real episode with all UAVs, measure every device in every slot, and keep the measurements."""

@@ -61,6 +61,9 @@ class RunSettings(BaseModel):
         "traced", description="what real flights meet: SCENE/truth.nc, or the statistical truth of the paper")
     twin: Literal["nn", "log-distance", "kriging", "truth"] = Field(
         "nn", description="channel model of the twin that is trained in; truth: a perfect twin, no flight is needed")
+    twin_shadowing: Literal["fitted", "slot"] = Field(
+        "fitted", description="how long a simulated flight is off the twin's map by the same: as its errors say, or "
+        "(the paper's) for a slot")
     algorithm: Literal["fedqmix", "qmix", "iql", "greedy", "planner", "random"] = Field(
         "fedqmix", description="what decides where the UAVs fly")
     preset: Literal["fast", "paper"] = Field("fast", description="settings of learning")
@@ -70,9 +73,12 @@ class RunSettings(BaseModel):
                           description="episodes of training of each replica in a round; preset paper: 1000")
     guide: Literal["none", "planner"] = Field(
         "none", description="planner: some of the flights that a learner learns from follow a plan")
-    measure: Literal["policy", "planner"] = Field(
-        "policy", description="what flies the real episodes that a twin is learnt from: the present policy, or a plan "
-        "made in the twin; the first one is random")
+    first_flight: Literal["waypoints", "random"] = Field(
+        "waypoints", description="what flies the first real episode, when nothing is known: from one random cell to "
+        "the next, or (the paper's) any feasible action in every slot")
+    measure: Literal["policy", "planner", "waypoints"] = Field(
+        "policy", description="what flies the other real episodes that a twin is learnt from: the present policy, a "
+        "plan made in the twin, or from one random cell to the next")
     assignment: Literal["matching", "max-rate"] = Field(
         "matching", description="matching: strongest remaining pair first; max-rate: strictly each UAV's best device")
     privileged: bool = Field(False, description="agents see the true positions of the unknown devices")

@@ -18,8 +18,10 @@ from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 
 SCHEMA = "radiotwin.experiment/1"
-EARLIER = {"excursion_slots": 1.0}
-"""What learners did before there was a setting for it, where that is not its default."""
+EARLIER: dict[str, dict[str, Any]] = {"run": {"first_flight": "random", "twin_shadowing": "slot"},
+                                     "learner": {"excursion_slots": 1.0}}
+"""What was done before there was a setting for it, where that is not its default."""
+MEASURING = ("first_flight", "measure", "twin_shadowing")
 
 
 @dataclass(frozen=True)
@@ -86,11 +88,14 @@ def same(run: Run, kind: str, settings: dict) -> bool:
 
 
 def filled(settings: dict) -> dict:
-    """Settings with what those were that did not exist when they were written."""
-    groups = {"run": RunSettings().model_dump(mode="json", exclude={"seed", "compare"}),
-              "learner": LearnerSettings().model_dump() | EARLIER}
-    if settings.get("run", {}).get("algorithm", LEARNERS[0]) not in LEARNERS:  # how it would learn does not matter
+    """Settings with what those were that did not exist when they were written, and without what does not matter."""
+    groups = {"run": RunSettings().model_dump(mode="json", exclude={"seed", "compare"}) | EARLIER["run"],
+              "learner": LearnerSettings().model_dump() | EARLIER["learner"]}
+    run = settings.get("run", {})
+    if run.get("algorithm", LEARNERS[0]) not in LEARNERS:
         settings = settings | {"learner": {}}
+    if run.get("twin") == "truth":  # nothing is measured
+        settings = settings | {"run": {name: value for name, value in run.items() if name not in MEASURING}}
     return settings | {name: group | settings[name] for name, group in groups.items() if name in settings}
 
 

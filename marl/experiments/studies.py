@@ -37,8 +37,6 @@ def curve(scenes: list[str], seeds: int) -> list[Run]:
             for scene in scenes:
                 here: dict[str, Any] = {"study": "curve", "scene": scene, "truth": truth, "seed": seed}
                 runs += [learning(algorithm="fedqmix", **here), learning(algorithm="qmix", **here),
-                         *(learning(algorithm=name, measure="planner", name=f"{name}-nn-measured", **here)
-                           for name in ("fedqmix", "qmix")),
                          learning(algorithm="qmix", twin="truth", **here),
                          learning(algorithm="iql", twin="truth", **here), learning(algorithm="planner", **here)]
                 runs += [learning(algorithm=name, twin="truth", real_episodes=1, flights=64, **here)
@@ -106,18 +104,26 @@ def pays(scenes: list[str], seeds: int) -> list[Run]:
 
 
 def tuning(scenes: list[str], seeds: int) -> list[Run]:
-    """What might bring model-aided learning nearer to the planner, one change at a time."""
-    changes: dict[str, dict[str, Any]] = {
-               "as-it-is": {}, "excursions-1": {"excursion_slots": 1.0}, "excursions-8": {"excursion_slots": 8.0},
-               "lambda-0.6": {"td_lambda": 0.6}, "lambda-0.95": {"td_lambda": 0.95},
-               "target-100": {"target_every": 100}, "epsilon-60k": {"epsilon_slots": 60_000},
-               "fly-again": {"fly_again": True}, "restart-0.3": {"restart_epsilon": 0.3},
-               "fly-again-restart-0.3": {"fly_again": True, "restart_epsilon": 0.3},
-               "replay-800": {"replay": 800}, "guide": {}, "measure": {}, "measure-guide": {}, "episodes-1600": {}}
-    run_changes: dict[str, dict[str, Any]] = {"guide": {"guide": "planner"}, "measure": {"measure": "planner"},
-                   "measure-guide": {"measure": "planner", "guide": "planner"}, "episodes-1600": {"episodes": 1600}}
-    return [learning("tuning", scene, "traced", seed, "qmix", changes=changed, name=name, **run_changes.get(name, {}))
-            for seed in range(seeds) for scene in scenes for name, changed in changes.items()]
+    """What might bring model-aided learning nearer to the planner, one change at a time; `earlier` ones are changes of
+    what the preset was before."""
+    again, earlier = {"fly_again": True}, {"first_flight": "random", "twin_shadowing": "slot"}
+    changes: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # of the learner, and of the run
+        "as-it-is": ({}, {}), "shadowing-slot": ({}, {"twin_shadowing": "slot"}),
+        "first-random": ({}, {"first_flight": "random"}), "excursions-1": ({"excursion_slots": 1.0}, {}),
+        "excursions-8": ({"excursion_slots": 8.0}, {}), "fly-again": (again, {}),
+        "shadowing-slot-fly-again": (again, {"twin_shadowing": "slot"}),
+        "shadowing-slot-fly-again-waypoints": (again, {"twin_shadowing": "slot", "measure": "waypoints"}),
+        "restart-0.3": ({"restart_epsilon": 0.3}, {}), "lambda-0.6": ({"td_lambda": 0.6}, {}),
+        "lambda-0.95": ({"td_lambda": 0.95}, {}), "target-100": ({"target_every": 100}, {}),
+        "epsilon-60k": ({"epsilon_slots": 60_000}, {}), "replay-800": ({"replay": 800}, {}),
+        "waypoints": ({}, {"measure": "waypoints"}), "measure": ({}, {"measure": "planner"}),
+        "guide": ({}, {"guide": "planner"}), "measure-guide": ({}, {"measure": "planner", "guide": "planner"}),
+        "episodes-1600": ({}, {"episodes": 1600}), "earlier": ({}, earlier),
+        "earlier-excursions-1": ({"excursion_slots": 1.0}, earlier), "earlier-fly-again": (again, earlier),
+        "earlier-restart-0.3": ({"restart_epsilon": 0.3}, earlier),
+        "earlier-measure": ({}, earlier | {"measure": "planner"})}
+    return [learning("tuning", scene, "traced", seed, "qmix", changes=of_learner, name=name, **of_run)
+            for seed in range(seeds) for scene in scenes for name, (of_learner, of_run) in changes.items()]
 
 
 STUDIES = {

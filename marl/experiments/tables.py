@@ -16,8 +16,7 @@ from marl.experiments.summaries import (
 )
 
 LABELS = {"fedqmix-nn": "model-aided FedQMIX", "qmix-nn": "model-aided QMIX",
-          "fedqmix-nn-measured": "model-aided FedQMIX, plans measure",
-          "qmix-nn-measured": "model-aided QMIX, plans measure", "qmix-truth": "QMIX on real episodes",
+          "qmix-truth": "QMIX on real episodes",
           "iql-truth": "IQL on real episodes", "planner-nn": "planner in the NN twin",
           "greedy": "greedy, distinct targets, true positions", "random": "random"}
 LEVELS = ("greedy", "random")
@@ -71,7 +70,7 @@ def factors(curves: dict, target: float) -> str:
     """How many times as many real episodes QMIX needs without a twin."""
     real = curves["qmix-truth"].needed(target) if "qmix-truth" in curves else np.nan
     told = []
-    for name in ("fedqmix-nn", "qmix-nn", "fedqmix-nn-measured", "qmix-nn-measured", "planner-nn"):
+    for name in ("fedqmix-nn", "qmix-nn", "planner-nn"):
         if name in curves and real == real:
             aided = curves[name].needed(target)
             told.append(f"{LABELS[name]} {aided:.0f} (a factor of {real / aided:,.0f})" if aided == aided else

@@ -73,12 +73,13 @@ def train_in(settings: dict, seed: int, folder: Path, keep: Callable[[], None]) 
     scene = Scene.load(scene_folder(settings["scene"]))
     truth = read_truth(scene, settings["truth"])
     name, flights = settings["twin"], settings["flights"]
-    twin = None if name == "truth" else _learnt(settings, seed, scene, truth, folder)
+    measured = _survey(scene, truth, settings["survey_flights"], settings["noise_db"], seed)
+    twin = None if name == "truth" else _learnt(name, seed, scene, measured, folder)
     keep()
     reality = Reality(scene, truth, "matching", settings["noise_db"], seed)
     known = Known.truth(scene) if twin is None else known_by(twin)
     real = reality.mission(known)
-    inside = real if twin is None else reality.twin_mission(twin, known)
+    inside = real if twin is None else reality.twin_mission(twin, known, measured)
     run = RunSettings(algorithm="qmix", episodes=settings["episodes"], real_episodes=1, seed=seed)
     strategy = make_strategy(run, LearnerSettings.model_validate(settings["learner"]), inside, 1, "cpu")
     try:
@@ -153,16 +154,15 @@ def _survey(scene: Scene, truth: RadioMap, flights: int, noise_db: float, seed: 
                       noise_db=0.0 if "sigma_db" in truth.dataset else noise_db)
 
 
-def _learnt(settings: dict, seed: int, scene: Scene, truth: RadioMap, folder: Path) -> Twin:
+def _learnt(name: str, seed: int, scene: Scene, measured: Measurements, folder: Path) -> Twin:
     if (folder / "twin" / "twin.json").is_file():
         return Twin.load(folder / "twin")
-    measured = _survey(scene, truth, settings["survey_flights"], settings["noise_db"], seed)
-    if settings["twin"] == "corrected":
+    if name == "corrected":
         with progress("closing the loop", total=None) as advance:
             loop = close_loop(measured, scene, "auto", seed, lambda text: advance(1, text))
         twin = corrected_twin(loop, scene)
     else:
-        twin = fit_twin(measured, scene, model=MODELS[settings["twin"]], seed=seed)
+        twin = fit_twin(measured, scene, model=MODELS[name], seed=seed)
     twin.save(folder / "twin")
     return twin
 

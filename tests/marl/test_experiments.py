@@ -51,7 +51,7 @@ def test_a_study_writes_a_record_for_each_run_and_its_table_and_figure(curve, tm
     status, out, err = run([*words, "--jobs", "2", "--out", "results"], tmp_path)
     assert status == 0, err
     folder = tmp_path / "results"
-    names = {"fedqmix-nn", "fedqmix-nn-measured", "iql-truth", "greedy"}
+    names = {"fedqmix-nn", "iql-truth", "greedy"}
     assert {path.name for path in (folder / "curve").iterdir()} == {f"small-segmented-{name}-s0.json" for name in names}
     assert out.count("CPU s") == len(names)
     record = json.loads((folder / "curve" / "small-segmented-fedqmix-nn-s0.json").read_text())

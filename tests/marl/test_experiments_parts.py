@@ -91,9 +91,13 @@ def test_every_run_of_every_study_has_its_own_file():
             assert {run.seed for run in runs} == {0, 1, 2}
 
 
+BEFORE = {"first_flight": "random", "twin_shadowing": "slot"}  # what was done before these were settings
+
+
 def test_runs_of_the_benchmark_are_taken_where_they_flew_over_the_same_map(tmp_path):
     def qmix(scene, truth, seed, **run):
-        return learning("curve", scene, truth, seed, "qmix", changes={"excursion_slots": 1.0}, **run)
+        return learning("curve", scene, truth, seed, "qmix", changes={"excursion_slots": 1.0},
+                        **BEFORE, **run)
 
     run = qmix("rbm", "traced", 1)
     result, cpu_s, _, source = earlier.earlier_result(run, tmp_path)
@@ -105,13 +109,23 @@ def test_runs_of_the_benchmark_are_taken_where_they_flew_over_the_same_map(tmp_p
     assert earlier.earlier_result(qmix("rbm", "traced", 9), tmp_path) is None
     assert earlier.earlier_result(qmix("rbm", "traced", 1, episodes=801), tmp_path) is None
     assert earlier.earlier_result(learning("curve", "rbm", "traced", 1, "qmix"), tmp_path) is None
-    assert earlier.earlier_result(learning("curve", "rbm", "traced", 1, "planner"), tmp_path) is not None
+    planned = learning("curve", "rbm", "traced", 1, "planner", **BEFORE)
+    assert earlier.earlier_result(planned, tmp_path) is not None
 
 
 def test_settings_from_before_a_setting_existed_have_its_default():
     settings = learning("curve", "rbm", "traced", 0, "qmix").settings
     old = settings | {"run": {name: value for name, value in settings["run"].items() if name != "measure"}}
     assert filled(old) == settings
+
+
+def test_runs_from_before_a_setting_existed_did_what_was_done_then_which_matters_where_something_is_measured():
+    for twin, alike in (("nn", False), ("truth", True)):
+        settings = learning("curve", "rbm", "traced", 0, "qmix", twin=twin).settings
+        old = settings | {"run": {name: value for name, value in settings["run"].items() if name not in BEFORE}}
+        assert filled(old) == filled(learning("curve", "rbm", "traced", 0, "qmix", twin=twin,
+                                              **BEFORE).settings)
+        assert (filled(old) == filled(settings)) == alike
 
 
 def test_learners_from_before_excursions_made_none():
