@@ -6,7 +6,7 @@ from pathlib import Path
 
 from marl.command import exit_status
 from marl.options import add_options, checked
-from marl.settings import EPISODES, LEARNERS, PRESETS, LearnerSettings, RunSettings
+from marl.settings import LEARNERS, PRESETS, RUNS, LearnerSettings, RunSettings
 from radiotwin.cli.console import say
 from radiotwin.cli.output import output
 from radiotwin.errors import BadInput
@@ -36,8 +36,7 @@ def settings_of(given: argparse.Namespace) -> tuple[RunSettings, LearnerSettings
         BadInput: an impossible value.
     """
     preset = checked(given, RunSettings()).preset
-    real_episodes, episodes = EPISODES[preset]
-    run = checked(given, RunSettings(real_episodes=real_episodes, episodes=episodes))
+    run = checked(given, RunSettings(**RUNS[preset]))
     learner = checked(given, PRESETS[preset].model_copy(update={"mix": run.algorithm != "iql"}))
     if learner.batch > learner.replay or learner.parallel > learner.replay:
         raise BadInput(f"--replay {learner.replay}: it must hold a batch ({learner.batch} flights) and what is flown "

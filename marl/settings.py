@@ -1,7 +1,7 @@
 """Settings of a run and of learning, with a line of help each, checked when they are given."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -46,8 +46,11 @@ PRESETS = {
                              target_every=200, episodes_per_update=1, parallel=10, excursion_slots=1.0,
                              epsilon_slots=50_000, federate_every=50, selection_flights=0, federate_all=False),
 }
-EPISODES = {"fast": (10, 800), "paper": (30, 1000)}
-"""Rounds, and episodes of each replica in each of them."""
+RUNS: dict[str, dict[str, Any]] = {
+    "fast": {},
+    "paper": {"real_episodes": 30, "episodes": 1000, "first_flight": "random", "twin_shadowing": "slot"},
+}
+"""What the presets change in a run."""
 LEARNERS = ("fedqmix", "qmix", "iql")
 
 
@@ -63,19 +66,19 @@ class RunSettings(BaseModel):
         "nn", description="channel model of the twin that is trained in; truth: a perfect twin, no flight is needed")
     twin_shadowing: Literal["fitted", "slot"] = Field(
         "fitted", description="how long a simulated flight is off the twin's map by the same: as its errors say, or "
-        "(the paper's) for a slot")
+        "for a slot; preset paper: slot")
     algorithm: Literal["fedqmix", "qmix", "iql", "greedy", "planner", "random"] = Field(
         "fedqmix", description="what decides where the UAVs fly")
     preset: Literal["fast", "paper"] = Field("fast", description="settings of learning")
-    real_episodes: int = Field(EPISODES["fast"][0], ge=1, le=10_000,
+    real_episodes: int = Field(10, ge=1, le=10_000,
                                description="rounds, of one real flight each to learn the twin from; preset paper: 30")
-    episodes: int = Field(EPISODES["fast"][1], ge=1, le=10_000_000,
+    episodes: int = Field(800, ge=1, le=10_000_000,
                           description="episodes of training of each replica in a round; preset paper: 1000")
     guide: Literal["none", "planner"] = Field(
         "none", description="planner: some of the flights that a learner learns from follow a plan")
     first_flight: Literal["waypoints", "random"] = Field(
         "waypoints", description="what flies the first real episode, when nothing is known: from one random cell to "
-        "the next, or (the paper's) any feasible action in every slot")
+        "the next, or any feasible action in every slot; preset paper: random")
     measure: Literal["policy", "planner", "waypoints"] = Field(
         "policy", description="what flies the other real episodes that a twin is learnt from: the present policy, a "
         "plan made in the twin, or from one random cell to the next")

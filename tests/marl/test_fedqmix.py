@@ -1,5 +1,6 @@
 """`python -m marl.fedqmix`, as a user runs it."""
 
+import argparse
 import csv
 import json
 import os
@@ -12,6 +13,7 @@ import time
 import pytest
 
 from marl.checkpoint import load_checkpoint
+from marl.fedqmix import settings_of
 
 SMALL = ("--truth segmented --real-episodes 2 --episodes 40 --batch 8 --replay 40 --flights 8 "
          "--planner-iterations 300 ")
@@ -111,3 +113,13 @@ def test_bad_input_is_one_message_and_leaves_nothing(words, parts, small_scene, 
     assert status == 2 and "Traceback" not in err and not out
     assert all(part in err for part in parts), err
     assert not list(tmp_path.iterdir())
+
+
+def test_the_preset_paper_begins_and_doubts_as_the_paper_does_unless_told_otherwise():
+    run, learner = settings_of(argparse.Namespace(preset="paper"))
+    assert (run.real_episodes, run.episodes, run.first_flight, run.twin_shadowing) == (30, 1000, "random", "slot")
+    assert learner.excursion_slots == 1 and learner.td_lambda == 0
+    run, _ = settings_of(argparse.Namespace(preset="paper", first_flight="waypoints"))
+    assert (run.first_flight, run.twin_shadowing) == ("waypoints", "slot")
+    run, _ = settings_of(argparse.Namespace())
+    assert (run.real_episodes, run.first_flight, run.twin_shadowing) == (10, "waypoints", "fitted")
