@@ -37,6 +37,7 @@ def curve(scenes: list[str], seeds: int) -> list[Run]:
             for scene in scenes:
                 here: dict[str, Any] = {"study": "curve", "scene": scene, "truth": truth, "seed": seed}
                 runs += [learning(algorithm="fedqmix", **here), learning(algorithm="qmix", **here),
+                         learning(algorithm="qmix", twin="log-distance", **here),
                          learning(algorithm="qmix", twin="truth", **here),
                          learning(algorithm="iql", twin="truth", **here), learning(algorithm="planner", **here)]
                 runs += [learning(algorithm=name, twin="truth", real_episodes=1, flights=64, **here)

@@ -16,7 +16,7 @@ from marl.experiments.summaries import (
 )
 
 LABELS = {"fedqmix-nn": "model-aided FedQMIX", "qmix-nn": "model-aided QMIX",
-          "qmix-truth": "QMIX on real episodes",
+          "qmix-log-distance": "model-aided QMIX, log-distance twin", "qmix-truth": "QMIX on real episodes",
           "iql-truth": "IQL on real episodes", "planner-nn": "planner in the NN twin",
           "greedy": "greedy, distinct targets, true positions", "random": "random"}
 LEVELS = ("greedy", "random")
@@ -70,7 +70,7 @@ def factors(curves: dict, target: float) -> str:
     """How many times as many real episodes QMIX needs without a twin."""
     real = curves["qmix-truth"].needed(target) if "qmix-truth" in curves else np.nan
     told = []
-    for name in ("fedqmix-nn", "qmix-nn", "planner-nn"):
+    for name in ("fedqmix-nn", "qmix-nn", "qmix-log-distance", "planner-nn"):
         if name in curves and real == real:
             aided = curves[name].needed(target)
             told.append(f"{LABELS[name]} {aided:.0f} (a factor of {real / aided:,.0f})" if aided == aided else
