@@ -178,10 +178,11 @@ def tuning_table(records: list[dict]) -> str:
     parts = []
     for (truth, scene), runs in worlds(records).items():
         rows = [[name, with_spread([record["curve"][-1]["truth_ratio"] for record in seeds]),
+                 with_spread([record["curve"][-1]["twin_ratio"] for record in seeds]),
                  number(np.mean([record["curve"][-1]["location_error_worst_m"] for record in seeds]), 0),
                  str(len(seeds))] for name, seeds in runs.items()]
-        parts.append(f"**{shown(scene, truth)}, model-aided QMIX**\n\n"
-                     + markdown(["change", "collected", "worst position error at the end [m]", "seeds"], rows))
+        heads = ["change", "collected", "in the twin", "worst position error at the end [m]", "seeds"]
+        parts.append(f"**{shown(scene, truth)}, model-aided QMIX**\n\n{markdown(heads, rows)}")
     return "\n\n".join(parts)
 
 
