@@ -9,9 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.fft import fft2, next_fast_len
-from scipy.special import log_ndtr
 
-from radiotwin.channel.likelihood import HALF_LOG_2PI
+from radiotwin.channel.likelihood import standardised
 from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.channel.residual_field import ResidualField
 from radiotwin.measurements import Measurements
@@ -73,10 +72,7 @@ def fit_shadowing(radio_map: RadioMap, measurements: Measurements, limit_db: flo
     names = measurements.devices["device"].to_numpy()[measurements.device_index[some]]
     at = np.array([radio_map.devices.index(name) for name in names]), *(axis[some] for axis in cell)
     mean_db, sigma_db = radio_map.gain_db[at].astype(float), radio_map.dataset["sigma_db"].values[at].astype(float)
-    residual = (measurements.level_db[some] - mean_db) / sigma_db
-    missing = np.isnan(residual)
-    below = (limit_db - mean_db[missing]) / sigma_db[missing]
-    residual[missing] = -np.exp(-0.5 * below**2 - HALF_LOG_2PI - log_ndtr(below))
+    residual = standardised(measurements.level_db[some], mean_db, sigma_db, limit_db)
     field = ResidualField().fit(measurements.device_index[some], measurements.receiver_m[some], residual, seed)
     return Shadowing(field.share, field.length_m)
 

@@ -40,6 +40,17 @@ def mean_if_detected(mean_db: np.ndarray, sigma_db: np.ndarray, limit_db: float)
     return mean_db + sigma_db * np.exp(-0.5 * below**2 - HALF_LOG_2PI - log_ndtr(-below))
 
 
+def standardised(level_db: np.ndarray, mean_db: np.ndarray, sigma_db: np.ndarray, limit_db: float | None) -> np.ndarray:
+    """(level - mean) / sigma of each link (n,); of one that was not detected (NaN) the mean below the limit,
+    -phi(a) / Phi(a), a = (limit - mean) / sigma, as in `mean_if_detected`. limit_db: None where all were detected."""
+    residual = (level_db - mean_db) / sigma_db
+    missing = np.isnan(residual)
+    if missing.any():
+        below = (limit_db - mean_db[missing]) / sigma_db[missing]
+        residual[missing] = -np.exp(-0.5 * below**2 - HALF_LOG_2PI - log_ndtr(below))
+    return residual
+
+
 def gaussian_nll_torch(
     level: torch.Tensor, mean: torch.Tensor, log_sigma: torch.Tensor, censored: torch.Tensor
 ) -> torch.Tensor:

@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any, Self
 
 import numpy as np
-from scipy.special import log_ndtr
 
 from radiotwin.channel.base import ChannelModel, drop_uninformative
-from radiotwin.channel.likelihood import HALF_LOG_2PI
+from radiotwin.channel.likelihood import standardised
 from radiotwin.channel.links import Links
 from radiotwin.channel.residual_field import ResidualField
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
@@ -39,11 +38,7 @@ class RegressionKriging(ChannelModel):
         links, level_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)
         mean_db, sigma_db = self.law.predict(links)
-        residual = (level_db - mean_db) / sigma_db
-        missing = np.isnan(residual)
-        if missing.any():
-            below = (limit_db - mean_db[missing]) / sigma_db[missing]
-            residual[missing] = -np.exp(-0.5 * below**2 - HALF_LOG_2PI - log_ndtr(below))
+        residual = standardised(level_db, mean_db, sigma_db, limit_db)
         self.field.fit(links.device, links.receiver_m, residual, seed)
         return self
 

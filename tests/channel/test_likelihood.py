@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.stats import norm, truncnorm
 
-from radiotwin.channel.likelihood import gaussian_nll, gaussian_nll_torch, mean_if_detected
+from radiotwin.channel.likelihood import gaussian_nll, gaussian_nll_torch, mean_if_detected, standardised
 
 
 def test_equals_density_of_the_seen_and_probability_of_the_rest():
@@ -42,6 +42,13 @@ def test_stays_finite_far_above_the_limit(mean_db):
 def test_mean_of_the_detected_is_the_truncated_normals(mean_db):
     expected = truncnorm.mean((-120.0 - mean_db) / 6.0, np.inf, loc=mean_db, scale=6.0)
     assert mean_if_detected(np.array([mean_db]), 6.0, -120.0)[0] == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("mean_db", [-90.0, -118.0, -120.0, -135.0])
+def test_a_link_that_was_not_detected_stands_for_the_mean_of_those_below_the_limit(mean_db):
+    found = standardised(np.array([np.nan, -100.0]), np.full(2, mean_db), np.full(2, 6.0), -120.0)
+    assert found[0] == pytest.approx(truncnorm.mean(-np.inf, (-120.0 - mean_db) / 6.0), abs=1e-6)
+    assert found[1] == pytest.approx((-100.0 - mean_db) / 6.0)
 
 
 def test_mean_of_the_detected_never_falls_below_the_limit():
