@@ -62,7 +62,6 @@ def test_a_study_writes_a_record_for_each_run_and_its_table_and_figure(curve, tm
     assert 0 < record["curve"][-1]["truth_ratio"] <= 1
     table = (folder / "curve.md").read_text()
     assert f"| model-aided FedQMIX | 2 | {record['curve'][-1]['truth_ratio']:.3f} |" in table
-    assert "| model-aided FedQMIX, plans measure | 2 |" in table
     assert (folder / "figures" / "curve.png").stat().st_size > 10_000
     assert main([*words, "--out", str(folder)]) == 2
     err = capsys.readouterr().err
