@@ -18,7 +18,7 @@ from radiotwin.radiomap import RadioMap
 from radiotwin.twin import Twin
 
 MOST_LINKS = 300  # of a device, to learn from
-LEAST = 0.05
+LEAST = 0.05  # share that is worth drawing
 FAR = 3.0  # correlation lengths until fields of opposite sides of the map are taken to know nothing of each other
 
 

@@ -91,9 +91,7 @@ def pays(scenes: list[str], seeds: int) -> list[Run]:
         for scene in scenes:
             for scenario in SCENARIOS:
                 shared = {"scene": scene, "scenario": scenario, "flights": 64, "truths": 8}
-                # Maps alternate there, and none is nearer to the truth than those before.
-                trained = {"episodes": 4000, "learner": learner(epsilon_slots=87_500, fly_again=False,
-                                                                restart_epsilon=0.0)}
+                trained = {"episodes": 4000, "learner": learner(epsilon_slots=87_500)}
                 planner = {"planner_iterations": 60_000}
                 again = planner | {"replan_every": 10, "replan_iterations": 1500}
                 for method, more in (("policy", trained), ("policy-no-link", trained), ("plan", planner),

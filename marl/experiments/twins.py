@@ -14,6 +14,7 @@ from marl.randomness import stream
 from marl.reality import Reality, known_by, location_errors_m
 from marl.settings import LearnerSettings, RunSettings
 from marl.strategies import evaluate, make_strategy
+from marl.waypoints import PATTERN
 from radiotwin.cli.world import read_truth
 from radiotwin.closeloop.corrected import corrected_twin
 from radiotwin.closeloop.run import close_loop
@@ -27,7 +28,6 @@ from radiotwin.twin import Twin, fit_twin
 
 MODELS = {"nn": "segmented_nn", "segmented": "segmented_log_distance", "log-distance": "log_distance"}
 """Name of a twin in the study -> channel model; `corrected` and `truth` besides."""
-PATTERN = "random-waypoint"
 SAMPLES = 10  # times that a sequence of actions is flown in a twin, whose shadowing differs from time to time
 
 
