@@ -48,7 +48,7 @@ def main() -> None:
     settings = {"run": run.model_dump(mode="json", exclude={"seed", "compare"}) | {"scene": run.scene.name},
                 "learner": learner.model_dump(mode="json")}
     record = json.loads(arguments.out.read_text()) if arguments.out.exists() else {"settings": settings, "runs": []}
-    if filled("learning", record["settings"]) != settings:
+    if filled(record["settings"]) != filled(settings):
         raise SystemExit(f"{arguments.out} holds other settings; give another --out")
     for seed in range(len(record["runs"]), arguments.seeds):
         started, cpu_before = time.perf_counter(), cpu_s()

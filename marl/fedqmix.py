@@ -6,10 +6,9 @@ from pathlib import Path
 
 from marl.command import exit_status
 from marl.options import add_options, checked
-from marl.settings import LEARNERS, PRESETS, RUNS, LearnerSettings, RunSettings
+from marl.settings import PRESETS, RUNS, LearnerSettings, RunSettings, check_together
 from radiotwin.cli.console import say
 from radiotwin.cli.output import output
-from radiotwin.errors import BadInput
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -38,12 +37,7 @@ def settings_of(given: argparse.Namespace) -> tuple[RunSettings, LearnerSettings
     preset = checked(given, RunSettings()).preset
     run = checked(given, RunSettings(**RUNS[preset]))
     learner = checked(given, PRESETS[preset].model_copy(update={"mix": run.algorithm != "iql"}))
-    if learner.batch > learner.replay or learner.parallel > learner.replay:
-        raise BadInput(f"--replay {learner.replay}: it must hold a batch ({learner.batch} flights) and what is flown "
-                       f"side by side ({learner.parallel}); raise it, or lower --batch or --parallel")
-    if run.guide != "none" and run.algorithm not in LEARNERS:
-        raise BadInput(f"--guide {run.guide}: {run.algorithm} does not learn, so nothing can be guided; give it with "
-                       f"--algorithm {', '.join(LEARNERS)} only")
+    check_together(run, learner)
     return run, learner
 
 

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-import torch
 
 from marl.algorithm import Outcome, run_algorithm
 from marl.figures import choose_flight, draw_curve, draw_trajectories
@@ -18,7 +17,7 @@ from marl.mission import Known, Mission, make_mission
 from marl.randomness import stream
 from marl.settings import LEARNERS, LearnerSettings, RunSettings
 from marl.strategies import evaluate, make_strategy
-from marl.threads import keep_memory, limit_threads
+from marl.threads import keep_memory, limit_threads, torch_device
 from radiotwin.cli.console import print_rows
 from radiotwin.cli.world import read_truth
 from radiotwin.errors import BadInput
@@ -58,7 +57,7 @@ class Session:
         truth = read_truth(scene, self.run.truth)
         scene.check_map(truth)
         make_mission(scene, truth, Known.truth(scene), self.run.assignment)  # complains before anything is written
-        _torch_device(self.run.device)
+        torch_device(self.run.device)
         self._claim_folder(_world(scene, truth))
         runs: dict[str, RunSettings] = {self.run.twin: self.run}
         if self.run.compare and self.run.algorithm in LEARNERS:
@@ -72,7 +71,7 @@ class Session:
                     advance(count, text and f"{TRAINED_IN[twin]}: {text}")
                 folder = self.out if run is self.run else self.out / "compare" / twin
                 outcomes[twin] = run_algorithm(run, self.learner, scene, truth, folder, self.resume,
-                                               _Log(folder), named, _torch_device(self.run.device))
+                                               _Log(folder), named, torch_device(self.run.device))
         self._write(scene, truth, outcomes)
 
     def _claim_folder(self, world: dict[str, str]) -> None:
@@ -148,13 +147,6 @@ def _entry(method: str, twin: str, row: dict) -> dict:
     learned = method in (*LEARNERS, "planner")
     return {"method": method, "trained_in": TRAINED_IN[twin] if learned else "",
             **{name: row[name] for name in ("real_episodes", "truth_ratio", "truth_ratio_std")}}
-
-
-def _torch_device(wanted: str) -> str:
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise BadInput("--device cuda: torch finds no usable GPU here; leave the option out, or install a CUDA "
-                       "build of torch")
-    return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted
 
 
 def _world(scene: Scene, truth: RadioMap) -> dict[str, str]:

@@ -5,6 +5,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from radiotwin.errors import BadInput
+
 
 class LearnerSettings(BaseModel):
     """How a policy is learned. The defaults are the preset `fast`."""
@@ -48,7 +50,8 @@ PRESETS = {
 }
 RUNS: dict[str, dict[str, Any]] = {
     "fast": {},
-    "paper": {"real_episodes": 30, "episodes": 1000, "first_flight": "random", "twin_shadowing": "slot"},
+    "paper": {"real_episodes": 30, "episodes": 1000, "first_flight": "random", "measure": "policy",
+              "twin_shadowing": "slot"},
 }
 """What the presets change in a run."""
 LEARNERS = ("fedqmix", "qmix", "iql")
@@ -80,8 +83,8 @@ class RunSettings(BaseModel):
         "waypoints", description="what flies the first real episode, when nothing is known: from one random cell to "
         "the next, or any feasible action in every slot; preset paper: random")
     measure: Literal["policy", "planner", "waypoints"] = Field(
-        "policy", description="what flies the other real episodes that a twin is learnt from: the present policy, a "
-        "plan made in the twin, or from one random cell to the next")
+        "waypoints", description="what flies the other real episodes that a twin is learnt from: the present policy, "
+        "a plan made in the twin, or from one random cell to the next; preset paper: policy")
     assignment: Literal["matching", "max-rate"] = Field(
         "matching", description="matching: strongest remaining pair first; max-rate: strictly each UAV's best device")
     privileged: bool = Field(False, description="agents see the true positions of the unknown devices")
@@ -93,3 +96,17 @@ class RunSettings(BaseModel):
     device: Literal["auto", "cpu", "cuda"] = Field(
         "auto", description="where networks are trained; auto: on a GPU if there is one. Only cpu repeats to the bit")
     seed: int = Field(0, ge=0, le=2**31, description="of everything random")
+
+
+def check_together(run: RunSettings, learner: LearnerSettings) -> None:
+    """Refuse settings that are allowed each, and not together.
+
+    Raises:
+        BadInput: a memory that is too small, or a guide for what does not learn.
+    """
+    if learner.batch > learner.replay or learner.parallel > learner.replay:
+        raise BadInput(f"replay {learner.replay}: it must hold a batch ({learner.batch} flights) and what is flown "
+                       f"side by side ({learner.parallel}); raise it, or lower batch or parallel")
+    if run.guide != "none" and run.algorithm not in LEARNERS:
+        raise BadInput(f"guide {run.guide}: {run.algorithm} does not learn, so nothing can be guided; it is for "
+                       f"algorithm {', '.join(LEARNERS)} only")

@@ -176,6 +176,7 @@ class Learned:
         new = plan(mission, self._run.planner_iterations, self._run.seed).actions
         if self._actions is None:
             return new
+        self.selection_flights += 2 * self._run.flights
         before, after = (evaluate(mission, PlanPolicy(actions), self._run.flights, stream(self._run.seed, "choice"))
                          .ratio(mission).mean() for actions in (self._actions, new))
         return new if after > before + CLEARLY else self._actions

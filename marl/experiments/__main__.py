@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 from marl.command import exit_status
-from marl.experiments.records import Run, finished
+from marl.experiments.records import Run, begun, finished
 from marl.experiments.studies import STUDIES, with_settings
 from radiotwin.cli.console import say
 from radiotwin.errors import BadInput
@@ -52,18 +52,14 @@ def _run(given: argparse.Namespace) -> None:
             raise BadInput(f"--only {given.only}: no run of {name} has that in its name; they are "
                            f"{', '.join(sorted({run.name for run in make_runs(scenes, 1)}))}")
         plans[name] = with_settings(runs, given.settings)
-    if not given.report:
+    if not given.report:  # complain before hours of work, not after them
         _check_scenes(scenes)
+        for name, runs in plans.items():
+            _check_resumed(name, runs, given.out, given.resume)
     for name, runs in plans.items():
         if runs and not given.report:
             from marl.experiments.work import do_runs  # torch and all: not for --help
 
-            done = sum(finished(run, given.out) for run in runs)
-            started = any(run.unfinished(given.out).is_dir() for run in runs)
-            if (done or started) and not given.resume:
-                raise BadInput(f"{given.out / name} holds {done} finished runs of this study"
-                               f"{' and some that were stopped' if started else ''}; --resume keeps them and goes on, "
-                               "--out names another folder, --report only makes table and figures")
             do_runs(runs, given.out, jobs)
 
         from marl.experiments.report import write_report
@@ -79,8 +75,17 @@ def _count(option: str, text: str) -> int:
     return int(text)
 
 
+def _check_resumed(study: str, runs: list[Run], out: Path, resume: bool) -> None:
+    """Complain about records of other settings, and about any at all where they are not wanted."""
+    done, stopped = sum(finished(run, out) for run in runs), sum(begun(run, out) for run in runs)
+    if (done or stopped) and not resume:
+        raise BadInput(f"{out / study} holds {done} finished runs of this study"
+                       f"{' and some that were stopped' if stopped else ''}; --resume keeps them and goes on, --out "
+                       "names another folder, --report only makes table and figures")
+
+
 def _check_scenes(scenes: list[str]) -> None:
-    """Complain about a scene before hours of work, not after them."""
+    """Complain about a scene that is not there."""
     from marl.experiments.learning import scene_folder
     from radiotwin.scene import Scene
 

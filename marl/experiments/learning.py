@@ -10,6 +10,7 @@ from marl.figures import choose_flight
 from marl.flights import Flights
 from marl.mission import Mission, make_mission
 from marl.settings import LearnerSettings, RunSettings
+from marl.threads import torch_device
 from radiotwin.cli.world import read_truth
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
@@ -19,7 +20,7 @@ SCENES = Path("scenes")
 
 def scene_folder(name: str) -> Path:
     """A scene that ships has no path in a record, which is read on other machines; others have theirs."""
-    return Path(name) if len(Path(name).parts) > 1 else SCENES / name
+    return SCENES / name if name == Path(name).name else Path(name)
 
 
 def learn(settings: dict, seed: int, folder: Path, keep: Callable[[], None]) -> dict:
@@ -41,7 +42,8 @@ def learn(settings: dict, seed: int, folder: Path, keep: Callable[[], None]) -> 
     truth = read_truth(scene, run.truth)
     scene.check_map(truth)
     with progress(f"{run.algorithm}, seed {seed}", total=run.real_episodes * run.episodes) as advance:
-        outcome = run_algorithm(run, learner, scene, truth, folder, True, lambda rows, blocks: keep(), advance)
+        outcome = run_algorithm(run, learner, scene, truth, folder, True, lambda rows, blocks: keep(), advance,
+                                torch_device(run.device))
     real = make_mission(scene, truth, outcome.known, run.assignment)
     return {"curve": outcome.rows,
             "looks": [[block["round"], block["episodes"], block["twin_ratio"]] for block in outcome.blocks],

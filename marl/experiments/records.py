@@ -18,8 +18,9 @@ from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 
 SCHEMA = "radiotwin.experiment/1"
-EARLIER: dict[str, dict[str, Any]] = {"run": {"first_flight": "random", "twin_shadowing": "slot"},
-                                     "learner": {"excursion_slots": 1.0}}
+EARLIER: dict[str, dict[str, Any]] = {
+    "run": {"first_flight": "random", "measure": "policy", "twin_shadowing": "slot"},
+    "learner": {"excursion_slots": 1.0}}
 """What was done before there was a setting for it, where that is not its default."""
 MEASURING = ("first_flight", "measure", "twin_shadowing")
 
@@ -61,10 +62,38 @@ def finished(run: Run, out: Path) -> bool:
     if not path.is_file():
         return False
     record = read_record(path)
-    if not same(run, record["kind"], record["settings"]):
-        differ = _difference(filled(record["settings"]), filled(run.settings))
-        raise BadInput(f"{path} holds a run with other settings ({differ}); give another --out, or remove the file")
+    _refuse_others(run, record["kind"], record["settings"], path)
     return True
+
+
+def begun(run: Run, out: Path) -> bool:
+    """Whether something is left of it that was stopped.
+
+    Raises:
+        BadInput: that is damaged, or was done with other settings.
+    """
+    path = run.unfinished(out) / "run.json"
+    if not path.is_file():
+        return False
+    try:
+        left = json.loads(path.read_text(encoding="utf-8"))
+        kind, settings = left["kind"], left["settings"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise BadInput(f"{path} is damaged ({type(error).__name__}: {error}); remove the folder") from None
+    _refuse_others(run, kind, settings, path)
+    return True
+
+
+def begin(run: Run, out: Path) -> None:
+    """Write down what is begun, so that it goes on with the same settings only."""
+    with atomic_path(run.unfinished(out) / "run.json") as temporary:
+        temporary.write_text(json.dumps({"kind": run.kind, "settings": run.settings}), encoding="utf-8")
+
+
+def _refuse_others(run: Run, kind: str, settings: dict, path: Path) -> None:
+    if not same(run, kind, settings):
+        differ = _difference(filled(settings), filled(run.settings))
+        raise BadInput(f"{path} holds a run with other settings ({differ}); give another --out, or remove it")
 
 
 def write_record(run: Run, out: Path, result: dict, cpu_s: float, wall_s: float, **more) -> None:
@@ -73,11 +102,11 @@ def write_record(run: Run, out: Path, result: dict, cpu_s: float, wall_s: float,
     Args:
         result: what the kind returns; numbers are rounded, what is not finite becomes null.
         cpu_s, wall_s: processor and wall seconds, stops not counted.
-        more: further entries.
+        more: further entries, and others in place of this code's version and this machine.
     """
-    record = {"schema": SCHEMA, "study": run.study, "name": run.name, "kind": run.kind, "seed": run.seed,
-              "version": radiotwin.__version__, "code": code_version(), "machine": machine(),
-              "cpu_s": round(cpu_s, 1), "wall_s": round(wall_s, 1), **more, "settings": run.settings, **plain(result)}
+    by = {"version": radiotwin.__version__, "code": code_version(), "machine": machine()}
+    record = {"schema": SCHEMA, "study": run.study, "name": run.name, "kind": run.kind, "seed": run.seed, **by,
+              "cpu_s": round(cpu_s, 1), "wall_s": round(wall_s, 1)} | more | {"settings": run.settings} | plain(result)
     with atomic_path(run.path(out)) as temporary:
         temporary.write_text(_lines(record), encoding="utf-8")
 

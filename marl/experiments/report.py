@@ -6,7 +6,7 @@ import numpy as np
 
 from marl.environment import Frame
 from marl.experiments import plots, tables
-from marl.experiments.closeloop import RESULTS, closeloop_table
+from marl.experiments.closeloop import FILES, RESULTS, closeloop_table
 from marl.experiments.learning import scene_folder
 from marl.experiments.records import read_study
 from marl.figures import save, trajectories_figure
@@ -43,7 +43,7 @@ def write_report(study: str, question: str, out: Path, figures: Path) -> list[Pa
     path = out / f"{study}.md"
     head = f"# {question}\n\n`python -m marl.experiments {study}`. "
     if study == "closeloop":
-        missing = [name for name in ("closeloop_undeclared.json",) if not (RESULTS / name).is_file()]
+        missing = [name for name in FILES if not (RESULTS / name).is_file()]
         if missing:
             raise BadInput(f"{RESULTS / missing[0]} is not there; start this in the root of the repository")
         return [_write(path, head + "From the JSON files in `docs/results`.\n\n" + closeloop_table() + "\n")]

@@ -8,12 +8,13 @@ from typing import Any
 from pydantic import ValidationError
 
 from marl.experiments.records import Run
-from marl.settings import PRESETS, LearnerSettings, RunSettings
+from marl.settings import PRESETS, LearnerSettings, RunSettings, check_together
 from radiotwin.errors import BadInput
 
 TRUTHS = ("traced", "segmented")
 FLIGHTS = (1, 2, 3, 5, 10)  # real episodes that a twin is learnt from
 SCENARIOS = ("nominal", "volumes", "positions", "loss", "everything")
+NAMING = ("scene", "twin", "model", "scenario", "method", "algorithm")  # what the names of runs say
 
 
 @dataclass(frozen=True)
@@ -105,22 +106,23 @@ def pays(scenes: list[str], seeds: int) -> list[Run]:
 def tuning(scenes: list[str], seeds: int) -> list[Run]:
     """What might bring model-aided learning nearer to the planner, one change at a time; `earlier` ones are changes of
     what the preset was before."""
-    again, earlier = {"fly_again": True}, {"first_flight": "random", "twin_shadowing": "slot"}
+    again, policy = {"fly_again": True}, {"measure": "policy"}
+    earlier = policy | {"first_flight": "random", "twin_shadowing": "slot"}
     changes: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # of the learner, and of the run
         "as-it-is": ({}, {}), "shadowing-slot": ({}, {"twin_shadowing": "slot"}),
         "first-random": ({}, {"first_flight": "random"}), "excursions-1": ({"excursion_slots": 1.0}, {}),
         "excursions-8": ({"excursion_slots": 8.0}, {}), "fly-again": (again, {}),
-        "shadowing-slot-fly-again": (again, {"twin_shadowing": "slot"}),
-        "shadowing-slot-fly-again-waypoints": (again, {"twin_shadowing": "slot", "measure": "waypoints"}),
+        "shadowing-slot-fly-again": (again, {"twin_shadowing": "slot"}), "measure-policy": ({}, policy),
+        "measure-policy-fly-again": (again, policy),
+        "measure-policy-shadowing-slot-fly-again": (again, policy | {"twin_shadowing": "slot"}),
         "restart-0.3": ({"restart_epsilon": 0.3}, {}), "lambda-0.6": ({"td_lambda": 0.6}, {}),
         "lambda-0.95": ({"td_lambda": 0.95}, {}), "target-100": ({"target_every": 100}, {}),
         "epsilon-60k": ({"epsilon_slots": 60_000}, {}), "replay-800": ({"replay": 800}, {}),
-        "waypoints": ({}, {"measure": "waypoints"}), "measure": ({}, {"measure": "planner"}),
-        "guide": ({}, {"guide": "planner"}), "measure-guide": ({}, {"measure": "planner", "guide": "planner"}),
+        "measure-planner": ({}, {"measure": "planner"}), "guide": ({}, {"guide": "planner"}),
         "episodes-1600": ({}, {"episodes": 1600}), "earlier": ({}, earlier),
         "earlier-excursions-1": ({"excursion_slots": 1.0}, earlier), "earlier-fly-again": (again, earlier),
         "earlier-restart-0.3": ({"restart_epsilon": 0.3}, earlier),
-        "earlier-measure": ({}, earlier | {"measure": "planner"})}
+        "earlier-measure-planner": ({}, earlier | {"measure": "planner"})}
     return [learning("tuning", scene, "traced", seed, "qmix", changes=of_learner, name=name, **of_run)
             for seed in range(seeds) for scene in scenes for name, (of_learner, of_run) in changes.items()]
 
@@ -168,6 +170,9 @@ def with_settings(runs: list[Run], given: list[str]) -> list[Run]:
     """
     for text in given:
         name, equals, value = text.partition("=")
+        if name in NAMING:
+            raise BadInput(f"--set {text}: the names of the runs say that, so it cannot be changed in them; choose "
+                           "with --scenes, --only")
         changed = [_changed(run, name, value) if equals else None for run in runs]
         if all(run is None for run in changed):
             names = sorted({each for run in runs for group in _groups(run).values() for each in group})
@@ -207,12 +212,14 @@ def _converted(name: str, text: str, before: Any) -> Any:
 def _check(run: Run) -> None:
     """Complain about impossible values before anything is run."""
     try:
-        for group, model in (("run", RunSettings), ("learner", LearnerSettings)):
-            model.model_validate(run.settings.get(group, {}))
+        settings = RunSettings.model_validate(run.settings.get("run", {}))
+        check_together(settings, LearnerSettings.model_validate(run.settings.get("learner", {})))
     except ValidationError as error:
         first = error.errors()[0]
         raise BadInput(f"--set {first['loc'][0]}={first['input']}: {first['msg']}") from None
     for name, value in _groups(run)[""].items():
+        if name == "truth" and value not in TRUTHS:
+            raise BadInput(f"--set truth={value}: allowed is {' or '.join(TRUTHS)}")
         for each in value if isinstance(value, list) else [value]:
             least = 0 if name == "noise_db" else 1
             if isinstance(each, int | float) and each < least:

@@ -189,10 +189,11 @@ def tuning_table(records: list[dict]) -> str:
 def provenance(records: list[dict]) -> str:
     """Where the numbers come from."""
     taken = sorted({record["taken_from"] for record in records if "taken_from" in record})
-    versions = sorted({f"{record['version']} ({record['code']})" for record in records})
+    versions = sorted({record["version"] + (f" ({record['code']})" if record["code"] else "") for record in records})
+    machines = sorted({record["machine"] for record in records if record["machine"]})
     own = [record for record in records if "taken_from" not in record]
     hours = sum(record["cpu_s"] for record in own) / 3600
     text = (f"{len(records)} runs of {len(by_name(records))} kinds, {hours:.1f} CPU hours; version (hash of the "
-            f"sources): {', '.join(versions)}; {', '.join(sorted({record['machine'] for record in records}))}.")
+            f"sources): {', '.join(versions)}; {', '.join(machines)}.")
     return text + (f" Taken from runs with the same settings: {', '.join(f'`{name}`' for name in taken)}."
                    if taken else "")

@@ -11,9 +11,10 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import TextIO
 
 from marl.experiments.earlier import earlier_result
-from marl.experiments.records import Run, finished, write_record
+from marl.experiments.records import Run, begin, begun, finished, write_record
 from marl.threads import keep_memory, limit_threads
 from radiotwin.cli.console import complain, say, show_warnings_plainly
 from radiotwin.errors import BadInput, RunFailed
@@ -26,6 +27,9 @@ KINDS = {"learning": ("learning", "learn"), "twin quality": ("twins", "judge_twi
 
 class Clock:
     """Processor and wall seconds of a run, those before a stop included.
+
+    Of a run that was stopped, what its replicas' processes used before the stop is not in the processor seconds: a
+    process is counted when it ends.
 
     Args:
         folder: where `keep` writes them.
@@ -111,12 +115,7 @@ def _claimed(run: Run, out: Path) -> Iterator[bool]:
         return
     folder = run.unfinished(out)
     lock = folder.parent / f"{folder.name}.lock"  # names have points in them, so not `with_suffix`
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        handle = lock.open("w")
-    except OSError as error:
-        raise BadInput(f"cannot write {folder}: {error.strerror}; choose another --out") from None
-    with handle:
+    with _opened(lock, folder) as handle:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -130,14 +129,28 @@ def _claimed(run: Run, out: Path) -> Iterator[bool]:
                 folder.parent.rmdir()
 
 
+def _opened(lock: Path, folder: Path) -> TextIO:
+    """The lock's file and the folder, which another process may remove as it finishes the last run before this one."""
+    try:
+        for _ in range(100):
+            with suppress(FileNotFoundError):
+                folder.mkdir(parents=True, exist_ok=True)
+                return lock.open("w")
+        raise FileNotFoundError(2, "another process keeps removing it")
+    except OSError as error:
+        raise BadInput(f"cannot write {folder}: {error.strerror}; choose another --out") from None
+
+
 def _do(run: Run, out: Path, place: str) -> None:
     copied = earlier_result(run, out)
     if copied is not None:
-        result, cpu_s, wall_s, source = copied
-        write_record(run, out, result, cpu_s, wall_s, taken_from=source)
-        say(f"{place} {run.study} {run.name} seed {run.seed}: taken from {source}")
+        result, cpu_s, wall_s, by = copied
+        write_record(run, out, result, cpu_s, wall_s, **by)
+        say(f"{place} {run.study} {run.name} seed {run.seed}: taken from {by['taken_from']}")
         return
     folder = run.unfinished(out)
+    if not begun(run, out):
+        begin(run, out)
     clock = Clock(folder)
     result = _kind(run.kind)(run.settings, run.seed, folder, clock.keep)
     cpu_s, wall_s = clock.seconds()

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
@@ -112,6 +113,21 @@ def test_the_report_needs_the_records_only_and_the_seed_decides(curve, tmp_path,
         (tmp_path / "one" / "figures" / "curve.png").read_bytes()
 
 
+def test_the_lock_of_a_run_is_made_though_another_process_removes_its_folder(tmp_path, monkeypatch):
+    run, made = Run("tuning", "a", "learning", {}, 0), []
+    mkdir = Path.mkdir
+
+    def once_in_vain(path, *words, **more):
+        mkdir(path, *words, **more)
+        made.append(path)
+        if len(made) == 1:
+            shutil.rmtree(path.parent)
+
+    monkeypatch.setattr(Path, "mkdir", once_in_vain)
+    with _claimed(run, tmp_path) as mine:
+        assert mine and len(made) > 1
+
+
 def test_what_another_study_has_run_is_not_run_again(small_scene, tmp_path, capsys):
     words = ["--seeds", "1", "--scenes", str(small_scene.folder), "--out", str(tmp_path), *TINY]
     assert main(["curve", "--only", "segmented-qmix-nn", *words]) == 0
@@ -119,8 +135,8 @@ def test_what_another_study_has_run_is_not_run_again(small_scene, tmp_path, caps
     assert "qmix-800 seed 0: taken from curve/small-segmented-qmix-nn-s0.json" in capsys.readouterr().out
     one, other = (json.loads((tmp_path / name).read_text()) for name in
                   ("curve/small-segmented-qmix-nn-s0.json", "federation/small-segmented-qmix-800-s0.json"))
-    assert one["curve"] == other["curve"] and other["taken_from"] and "`weights`" in \
-        (tmp_path / "federation.md").read_text()
+    assert all(one[name] == other[name] for name in ("curve", "code", "machine")) and other["taken_from"]
+    assert "`weights`" in (tmp_path / "federation.md").read_text()
 
 
 @pytest.mark.parametrize("words, parts", [
@@ -133,7 +149,11 @@ def test_what_another_study_has_run_is_not_run_again(small_scene, tmp_path, caps
     (["curve", "--set", "magic=1"], ["--set magic=1", "td_lambda"]),
     (["curve", "--set", "episodes=some"], ["--set episodes=some", "whole number"]),
     (["curve", "--set", "episodes=0"], ["--set episodes=0", "greater than or equal to 1"]),
+    (["curve", "--set", "replay=8"], ["replay 8", "32 flights"]),
     (["pays", "--set", "flights=0"], ["--set flights=0", "1 or more"]),
+    (["pays", "--set", "method=magic"], ["--set method=magic", "--only"]),
+    (["twin", "--set", "truth=magic"], ["--set truth=magic", "traced or segmented"]),
+    (["curve", "--scenes", "./nowhere"], ["nowhere", "radiotwin build-scene"]),
     (["quality", "--report", "--out", "nothing"], ["nothing/quality", "no finished run"])])
 def test_bad_input_is_one_message_and_leaves_nothing(words, parts, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -152,6 +172,30 @@ def test_records_of_other_settings_and_damaged_ones_are_refused(curve, tmp_path,
     path.write_text("{")
     assert main([*words, "--resume"]) == 2
     assert f"{path} is not the record of a run" in capsys.readouterr().err
+
+
+def test_a_stopped_run_goes_on_with_its_own_settings_only(curve, tmp_path, capsys):
+    words = [*curve, "--only", "segmented-planner", "--resume", "--out", str(tmp_path)]
+    path = tmp_path / "curve" / "unfinished" / "small-segmented-planner-nn-s0" / "run.json"
+    process = start(words, tmp_path)
+    while process.poll() is None and not path.exists():
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.communicate(timeout=60)
+    assert path.is_file()
+    assert main([*words, "--set", "noise_db=3"]) == 2
+    assert f"{path} holds a run with other settings (noise_db = 1.0, not 3.0)" in capsys.readouterr().err
+    path.write_text("{")
+    assert main(words) == 2
+    assert f"{path} is damaged" in capsys.readouterr().err
+
+
+def test_a_study_whose_records_are_refused_holds_up_all_before_anything_is_run(small_scene, tmp_path, capsys):
+    words = ["--seeds", "1", "--scenes", str(small_scene.folder), "--resume", "--out", str(tmp_path)]
+    assert main(["federation", *words, *TINY, "--only", "qmix-800"]) == 0
+    assert main(["all", *words]) == 2
+    assert "small-segmented-qmix-800-s0.json holds a run with other settings" in capsys.readouterr().err
+    assert not (tmp_path / "curve").exists()
 
 
 def test_runs_whose_names_differ_behind_a_point_do_not_share_a_lock(tmp_path):

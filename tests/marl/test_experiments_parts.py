@@ -91,21 +91,21 @@ def test_every_run_of_every_study_has_its_own_file():
             assert {run.seed for run in runs} == {0, 1, 2}
 
 
-BEFORE = {"first_flight": "random", "twin_shadowing": "slot"}  # what was done before these were settings
+BEFORE = {"first_flight": "random", "measure": "policy", "twin_shadowing": "slot"}  # before these were settings
 
 
 def test_runs_of_the_benchmark_are_taken_where_they_flew_over_the_same_map(tmp_path):
     def qmix(scene, truth, seed, **run):
-        return learning("curve", scene, truth, seed, "qmix", changes={"excursion_slots": 1.0},
-                        **BEFORE, **run)
+        return learning("curve", scene, truth, seed, "qmix", changes={"excursion_slots": 1.0}, **BEFORE, **run)
 
     run = qmix("rbm", "traced", 1)
-    result, cpu_s, _, source = earlier.earlier_result(run, tmp_path)
-    kept = json.loads((RESULTS / source).read_text())["runs"][1]
+    result, cpu_s, _, by = earlier.earlier_result(run, tmp_path)
+    kept = json.loads((RESULTS / by["taken_from"]).read_text())["runs"][1]
     assert result["curve"] == kept["rows"] and cpu_s == kept["cpu_s"]
+    assert by["version"] == kept["version"] and by["code"] is None
     assert earlier.earlier_result(qmix("rbm", "segmented", 1), tmp_path) is None
     of_the_paper = earlier.earlier_result(qmix("runs/paper_rbm", "segmented", 1), tmp_path)
-    assert of_the_paper[3] == "marl_rbm_segmented_qmix.json"
+    assert of_the_paper[3]["taken_from"] == "marl_rbm_segmented_qmix.json"
     assert earlier.earlier_result(qmix("rbm", "traced", 9), tmp_path) is None
     assert earlier.earlier_result(qmix("rbm", "traced", 1, episodes=801), tmp_path) is None
     assert earlier.earlier_result(learning("curve", "rbm", "traced", 1, "qmix"), tmp_path) is None
@@ -115,7 +115,7 @@ def test_runs_of_the_benchmark_are_taken_where_they_flew_over_the_same_map(tmp_p
 
 def test_settings_from_before_a_setting_existed_have_its_default():
     settings = learning("curve", "rbm", "traced", 0, "qmix").settings
-    old = settings | {"run": {name: value for name, value in settings["run"].items() if name != "measure"}}
+    old = settings | {"run": {name: value for name, value in settings["run"].items() if name != "guide"}}
     assert filled(old) == settings
 
 
@@ -123,8 +123,7 @@ def test_runs_from_before_a_setting_existed_did_what_was_done_then_which_matters
     for twin, alike in (("nn", False), ("truth", True)):
         settings = learning("curve", "rbm", "traced", 0, "qmix", twin=twin).settings
         old = settings | {"run": {name: value for name, value in settings["run"].items() if name not in BEFORE}}
-        assert filled(old) == filled(learning("curve", "rbm", "traced", 0, "qmix", twin=twin,
-                                              **BEFORE).settings)
+        assert filled(old) == filled(learning("curve", "rbm", "traced", 0, "qmix", twin=twin, **BEFORE).settings)
         assert (filled(old) == filled(settings)) == alike
 
 

@@ -103,8 +103,8 @@ def flat(value):
     ("--episodes 0", ["--episodes 0", "≥ 1"]),
     ("--compare perhaps", ["--compare perhaps", "true|false"]),
     ("--twin magic", ["--twin magic", "nn|log-distance|kriging|truth"]),
-    ("--batch 64 --replay 32", ["--replay 32", "64"]),
-    ("--guide planner --algorithm greedy", ["--guide planner", "greedy does not learn"]),
+    ("--batch 64 --replay 32", ["replay 32", "64"]),
+    ("--guide planner --algorithm greedy", ["guide planner", "greedy does not learn"]),
     ("--device tpu", ["--device tpu", "auto|cpu|cuda"]),
     ("--out result --resume", ["nothing to resume"])])
 def test_bad_input_is_one_message_and_leaves_nothing(words, parts, small_scene, tmp_path):
@@ -117,9 +117,11 @@ def test_bad_input_is_one_message_and_leaves_nothing(words, parts, small_scene, 
 
 def test_the_preset_paper_begins_and_doubts_as_the_paper_does_unless_told_otherwise():
     run, learner = settings_of(argparse.Namespace(preset="paper"))
-    assert (run.real_episodes, run.episodes, run.first_flight, run.twin_shadowing) == (30, 1000, "random", "slot")
+    assert (run.real_episodes, run.episodes) == (30, 1000)
+    assert (run.first_flight, run.measure, run.twin_shadowing) == ("random", "policy", "slot")
     assert learner.excursion_slots == 1 and learner.td_lambda == 0
     run, _ = settings_of(argparse.Namespace(preset="paper", first_flight="waypoints"))
-    assert (run.first_flight, run.twin_shadowing) == ("waypoints", "slot")
+    assert (run.first_flight, run.measure, run.twin_shadowing) == ("waypoints", "policy", "slot")
     run, _ = settings_of(argparse.Namespace())
-    assert (run.real_episodes, run.first_flight, run.twin_shadowing) == (10, "waypoints", "fitted")
+    assert (run.real_episodes, run.first_flight, run.measure) == (10, "waypoints", "waypoints")
+    assert run.twin_shadowing == "fitted"
