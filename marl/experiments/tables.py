@@ -14,6 +14,7 @@ from marl.experiments.summaries import (
     with_spread,
     worlds,
 )
+from marl.settings import LearnerSettings, RunSettings
 
 LABELS = {"fedqmix-nn": "model-aided FedQMIX", "qmix-nn": "model-aided QMIX",
           "qmix-log-distance": "model-aided QMIX, log-distance twin", "qmix-truth": "QMIX on real episodes",
@@ -30,6 +31,7 @@ METHODS = {"plan": "open-loop plan", "replan": "re-planning, link", "replan-no-l
            "taught-no-link": "the same, no link", "greedy": "greedy"}
 SCENARIOS = {"nominal": "as thought", "volumes": "data 0–2 × nominal", "positions": "devices 20–40 m off",
              "loss": "a UAV is lost", "everything": "all three"}
+WORLD = ("scene", "truth", "algorithm")  # settings that heads and titles of tables say
 ENOUGH = 0.95  # of what both learners reach at least
 
 
@@ -177,13 +179,22 @@ def tuning_table(records: list[dict]) -> str:
     """One change at a time."""
     parts = []
     for (truth, scene), runs in worlds(records).items():
-        rows = [[name, with_spread([record["curve"][-1]["truth_ratio"] for record in seeds]),
+        rows = [[options(seeds[0]["settings"]), with_spread([record["curve"][-1]["truth_ratio"] for record in seeds]),
                  with_spread([record["curve"][-1]["twin_ratio"] for record in seeds]),
                  number(np.mean([record["curve"][-1]["location_error_worst_m"] for record in seeds]), 0),
-                 str(len(seeds))] for name, seeds in runs.items()]
-        heads = ["change", "collected", "in the twin", "worst position error at the end [m]", "seeds"]
+                 str(len(seeds))] for seeds in runs.values()]
+        heads = ["options", "collected", "in the twin", "worst position error at the end [m]", "seeds"]
         parts.append(f"**{shown(scene, truth)}, model-aided QMIX**\n\n{markdown(heads, rows)}")
     return "\n\n".join(parts)
+
+
+def options(settings: dict) -> str:
+    """What of a run of Algorithm 1 differs from today's defaults, as options of `marl.fedqmix`."""
+    defaults = {"run": RunSettings(), "learner": LearnerSettings()}
+    given = [f"--{name.replace('_', '-')} {str(value).lower()}" for group, before in defaults.items()
+             for name, value in filled(settings)[group].items()
+             if name not in WORLD and value != before.model_dump(mode="json")[name]]
+    return f"`{' '.join(given)}`" if given else "as it is"
 
 
 def provenance(records: list[dict]) -> str:

@@ -134,6 +134,13 @@ def test_learners_from_before_excursions_made_none():
     assert filled(old) == settings != filled(learning("curve", "rbm", "traced", 0, "qmix").settings)
 
 
+def test_the_tuning_table_says_what_differs_from_the_defaults_as_options():
+    run = learning("tuning", "rdm", "traced", 0, "qmix", measure="policy",
+                   changes={"td_lambda": 0.6, "fly_again": True})
+    assert tables.options(run.settings) == "`--measure policy --td-lambda 0.6 --fly-again true`"
+    assert tables.options(learning("tuning", "rdm", "traced", 0, "qmix").settings) == "as it is"
+
+
 def test_a_record_has_only_what_json_has(tmp_path):
     assert plain({1: (np.float32(0.123456), np.nan, np.int64(3), np.bool_(True)), "a": np.array([np.inf, 2])}) == \
         {"1": [0.1235, None, 3, True], "a": [None, 2]}
