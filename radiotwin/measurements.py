@@ -200,11 +200,13 @@ def _read_table(path: Path, required: list[str], optional: list[str], may_be_emp
 
 
 def _read_parquet(path: Path) -> pd.DataFrame:
+    """Its columns, in the order of its rows. What pandas wrote about an index is not looked at: a table that was
+    filtered or sorted before would keep its old labels, and here rows are counted."""
     _needs_pyarrow(path)
-    from pyarrow.parquet import read_schema
+    from pyarrow.parquet import read_schema, read_table
 
     _check_header(path, read_schema(path).names)
-    return pd.read_parquet(path)
+    return read_table(path).to_pandas(ignore_metadata=True)
 
 
 def _read_csv(path: Path) -> pd.DataFrame:

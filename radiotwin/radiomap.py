@@ -92,6 +92,13 @@ class RadioMap:
         with atomic_path(path) as temporary:
             _with_conventions(self.dataset).to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
 
+    def placed(self, origin: Origin | None) -> "RadioMap":
+        """The same map with another origin of its frame on the globe, or none."""
+        given = {} if origin is None else {f"origin_{name}": value for name, value in origin.model_dump().items()}
+        dataset = self.dataset.copy()
+        dataset.attrs = {name: value for name, value in dataset.attrs.items() if not name.startswith("origin_")} | given
+        return RadioMap(dataset)
+
     @property
     def devices(self) -> list[str]:
         return [str(name) for name in self.dataset["device"].values]

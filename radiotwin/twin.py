@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 import radiotwin
 from radiotwin.channel import MODELS, ChannelModel, Links, check_fit_data, load_channel, make_links, save_channel
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_folder
+from radiotwin.files import atomic_folder, require_writable
 from radiotwin.localize import LocalizeSettings, localize
 from radiotwin.measurements import Measurements
 from radiotwin.progress import progress
@@ -22,6 +22,7 @@ from radiotwin.scene.citymap import CityMap
 
 SCHEMA = "radiotwin.twin/1"
 CHANNEL_FILE = "channel.safetensors"
+TWIN_FILES = {"twin.json", CHANNEL_FILE, "report.html"}  # the last one is what `radiotwin report` makes of the others
 MAP_CHUNK = 200_000  # links predicted at once
 FEW_BLANK, LIMIT_GAP_DB = 0.02, 10.0  # from which on blanks and the limit of detection are said not to fit together
 
@@ -188,9 +189,13 @@ class Twin:
 
 
 def check_twin_target(folder: Path) -> None:
-    """Raise BadInput when the folder holds anything but a twin, so that nothing else is overwritten."""
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / "twin.json").is_file():
-        raise BadInput(f"{folder} is not empty and not a twin's folder; choose another output folder")
+    """Raise BadInput unless a twin can be written there without loss of anything but a twin and its page."""
+    require_writable(folder / "twin.json")
+    names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
+    foreign = sorted(name for name in names - TWIN_FILES if not name.startswith("."))
+    if foreign:
+        raise BadInput(f"{folder} holds {foreign[0]}, which is not a twin's and would be lost; choose another output "
+                       "folder, or move it away")
 
 
 def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmented_nn", seed: int,

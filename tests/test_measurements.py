@@ -45,6 +45,20 @@ def test_written_and_read_again_is_the_same(write, tmp_path, suffix):
     assert again.table.equals(measurements.table) and again.devices.equals(measurements.devices)
 
 
+def test_a_parquet_table_that_was_sorted_and_filtered_before_is_read_in_its_own_order(write, tmp_path):
+    pytest.importorskip("pyarrow")
+    plain = read_measurements(write(HEADER + ROWS))
+    plain.table.iloc[[2, 1]].to_parquet(tmp_path / "m.parquet")
+    plain.devices.iloc[::-1].to_parquet(tmp_path / "devices.parquet")
+    again = read_measurements(tmp_path / "m.parquet", tmp_path / "devices.parquet")
+    np.testing.assert_array_equal(again.level_db, [-90, np.nan])
+    assert [again.devices["device"][row] for row in again.device_index] == ["a", "b"]
+    np.testing.assert_array_equal(again.is_anchor, [False, True])
+    plain.devices.set_index("device").to_parquet(tmp_path / "named.parquet")  # the index is a column like any other
+    np.testing.assert_array_equal(read_measurements(tmp_path / "m.parquet", tmp_path / "named.parquet").is_anchor,
+                                  [True, False])
+
+
 def test_select_keeps_the_devices(write):
     part = read_measurements(write(HEADER + ROWS)).select([False, True, False])
     assert len(part.table) == 1 and len(part.devices) == 2

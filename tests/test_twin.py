@@ -9,7 +9,7 @@ from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 from radiotwin.survey import fly_survey, segmented_truth
-from radiotwin.twin import Twin, fit_twin
+from radiotwin.twin import Twin, check_twin_target, fit_twin
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +85,20 @@ def test_a_damaged_twin_is_bad_input(twin, tmp_path):
     path.write_text(json.dumps(json.loads(text) | {"schema": "radiotwin.twin/99"}))
     with pytest.raises(BadInput, match="schema is"):
         Twin.load(tmp_path / "twin")
+
+
+def test_a_twin_is_replaced_with_its_page_and_nothing_else_is_lost(twin, tmp_path):
+    twin.save(tmp_path / "twin")
+    (tmp_path / "twin" / "report.html").write_text("made of the twin before")
+    twin.save(tmp_path / "twin")
+    assert not (tmp_path / "twin" / "report.html").exists()
+    (tmp_path / "twin" / "notes.txt").write_text("mine")
+    with pytest.raises(BadInput, match="notes.txt"):
+        twin.save(tmp_path / "twin")
+    assert (tmp_path / "twin" / "notes.txt").read_text() == "mine"
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInput, match="file"):
+        check_twin_target(tmp_path / "file")
 
 
 def test_a_missing_height_is_bad_input(small_scene, flown):

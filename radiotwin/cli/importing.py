@@ -69,7 +69,7 @@ def import_(
     _print(report)
     say(f"wrote {out}: {report['written']} links, {report['not_detected']} not detected; {report['devices']} devices "
         f"({report['anchors']} anchors), {report['receivers']} receivers, {report['flights']} flights")
-    again = ["radiotwin", "import", file, "--columns", out / "import.toml", "-o", out]
+    again = ["radiotwin", "import", file, "--columns", out / "import.toml", "-o", out, *(["--gzip"] if gzip else [])]
     say(f"again: {shlex.join(map(str, again))}")
 
 

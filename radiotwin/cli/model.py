@@ -1,13 +1,18 @@
 """Commands that learn from measurements and judge what was learned: fit, map, compare."""
 
+import warnings
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from radiotwin.cli.console import print_rows, result, say, show_warnings_plainly
 from radiotwin.errors import BadInput
 
+if TYPE_CHECKING:
+    from radiotwin.scene import Scene
+
+SAME_PLACE = 1e-6  # degrees, or metres of altitude, of two origins
 MeasurementFile = Annotated[Path, typer.Argument(
     metavar="MEASUREMENTS", help="measurements.csv, .csv.gz or .parquet; devices.csv lies beside it.")]
 SceneOption = Annotated[Path, typer.Option(help="Scene folder: the 3D map and where UAVs may fly.")]
@@ -34,9 +39,10 @@ def fit(
     """Learn the channel from the anchors, then find the unknown devices: the twin."""
     from radiotwin.measurements import read_measurements
     from radiotwin.scene import Scene
-    from radiotwin.twin import Twin, fit_twin
+    from radiotwin.twin import Twin, check_twin_target, fit_twin
 
     show_warnings_plainly()
+    check_twin_target(out)
     data, world = read_measurements(measurements, devices), Scene.load(scene)
     earlier = Twin.load(start) if start else None
     twin = fit_twin(data, world, model=model, seed=seed, start=earlier, allow_indoor=allow_indoor)
@@ -77,13 +83,28 @@ def map_(
     is_map = twin.suffix == ".nc"
     if out is None and is_map:
         raise BadInput(f"{twin} is a radio map already; say with --out in which form it is to be written")
-    out = out or twin.resolve().with_suffix(".nc")
+    out = out or twin.resolve().with_name(f"{twin.resolve().name}.nc")
     world = Scene.load(scene)
     check_format(out, world)
     radio_map = RadioMap.read(twin) if is_map else Twin.load(twin).radio_map(world)
+    if is_map:
+        _check_place(twin, radio_map.dataset.attrs, world)
     radio_map = select(radio_map, devices.split(",") if devices else None, _altitudes(altitudes))
     EXPORTERS[out.suffix](radio_map, world, out)
     say(f"wrote {out}: {len(radio_map.devices)} devices on {radio_map.lattice.shape} positions (z, y, x)")
+
+
+def _check_place(path: Path, attributes: dict, scene: "Scene") -> None:
+    """A map of another city would be written with this one's outlines and place on the globe."""
+    origin = scene.config.origin
+    for name, value in ({} if origin is None else origin.model_dump()).items():
+        there = attributes.get(f"origin_{name}", value)
+        if abs(there - value) > SAME_PLACE:
+            raise BadInput(f"{path} is a map of another place: its origin's {name} is {there:g}, that of "
+                           f"{scene.folder} is {value:g}; give the scene that it was made for, or trace again")
+    if attributes.get("scene_hash", scene.content_hash()) != scene.content_hash():
+        warnings.warn(f"{path} was made for another scene than {scene.folder}, or that has changed since: outlines, "
+                      "devices and the place on the globe are those of the scene", stacklevel=2)
 
 
 def _altitudes(text: str | None) -> list[float] | None:
@@ -112,10 +133,12 @@ def compare(
     from radiotwin.cli.world import read_truth
     from radiotwin.compare import compare_models, split_flights
     from radiotwin.comparison_output import judge_also, write_comparison
+    from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
     from radiotwin.scene import Scene
 
     show_warnings_plainly()
+    require_writable(out / "compare.json")
     world = Scene.load(scene)
     train, test = split_flights(read_measurements(measurements, devices), held_out)
     truth_map = read_truth(world, truth) if truth else None

@@ -12,9 +12,7 @@ from radiotwin.scene import Scene
 
 def write_netcdf(radio_map: RadioMap, scene: Scene, path: Path) -> None:
     """The whole map after the CF conventions; `xarray.open_dataset` reads it, and so does `RadioMap.read`."""
-    origin = {} if scene.config.origin is None else {
-        f"origin_{name}": value for name, value in scene.config.origin.model_dump().items()}
-    RadioMap(radio_map.dataset.assign_attrs(origin)).write(path)
+    radio_map.placed(scene.config.origin).write(path)
 
 
 def write_csv(radio_map: RadioMap, scene: Scene, path: Path) -> None:

@@ -15,6 +15,7 @@ EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
 """Texts, in lower case, of cells without a value."""
 FORMATS = (".csv", ".parquet", ".geojson", ".json")
 ALWAYS = "always "
+EXACT = 2.0**53  # below it, every whole number is one in double precision
 WGS84 = ("CRS84", "4326")
 
 
@@ -74,7 +75,8 @@ class Source:
 def as_text(cells: pd.Series) -> pd.Series:
     """Stripped texts, `""` for every spelling of an empty cell; whole numbers without a point."""
     if cells.dtype.kind == "f":
-        if (cells.isna() | (np.isfinite(cells) & (cells == cells.round()))).all():  # an integer column with gaps
+        whole = (cells == cells.round()) & (cells.abs() < EXACT)
+        if (cells.isna() | whole).all():  # an integer column with gaps
             cells = cells.astype("Int64")
     text = cells.astype(str).str.strip()
     return text.mask(cells.isna() | text.str.lower().isin(EMPTY), "")

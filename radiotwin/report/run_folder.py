@@ -108,6 +108,9 @@ def _read_maps(run: Run, truth: str | None) -> None:
     """The truth, the twin's map, and those in the folder; only maps over the scene's lattice can be shown in it."""
     if truth is not None and truth != "segmented":
         run.maps[TRUTH] = RadioMap.read(truth)
+        if run.scene is not None and not run.scene.over_lattice(run.maps[TRUTH]):
+            raise BadInput(f"{truth} is not over the lattice of {run.scene.folder}, so it cannot be held against the "
+                           "run; give a map of that scene")
     elif truth == "segmented" and run.scene is not None:
         run.maps[TRUTH] = segmented_truth(run.scene)
     elif run.scene is not None and (run.scene.folder / "truth.nc").is_file():
@@ -119,9 +122,15 @@ def _read_maps(run: Run, truth: str | None) -> None:
             run.notes.append(f"{run.scene.folder / 'truth.nc'} is not shown: {error}.")
     if run.twin is not None and run.scene is not None:
         run.maps["twin, corrected" if run.twin.effects else "twin"] = run.twin.radio_map(run.scene)
+    looked_at = run.scene and (run.scene.folder / "truth.nc").resolve()
     for path in sorted(run.folder.glob("*.nc")):
-        if path.stem != TRUTH or TRUTH not in run.maps:
-            run.maps[path.stem] = RadioMap.read(path)
+        if path.stem in run.maps or path.resolve() == looked_at:
+            continue
+        found = RadioMap.read(path)
+        if run.scene is not None and not run.scene.over_lattice(found):
+            run.notes.append(f"{path} is not shown: it is not over the lattice of {run.scene.folder}.")
+        else:
+            run.maps[path.stem] = found
 
 
 def _tracks(run: Run, measurements: Path | None) -> pd.DataFrame | None:

@@ -113,12 +113,15 @@ class Scene:
         attributes = radio_map.dataset.attrs
         names = [device.device for device in self.config.devices]
         missing = [name for name in names if name not in radio_map.devices]
-        same_lattice = radio_map.gain_db.shape[1:] == self.lattice.shape and \
-            np.allclose(radio_map.lattice.positions_m, self.lattice.positions_m)
-        if missing or not same_lattice or attributes.get("scene_hash") != self.content_hash():
+        if missing or not self.over_lattice(radio_map) or attributes.get("scene_hash") != self.content_hash():
             what = f"it lacks device {missing[0]!r}" if missing else "geometry, radio, devices or lattice differ"
             raise BadInput(f"the radio map was not made for the scene as it is now in {self.folder} ({what}); run "
                            "`radiotwin trace` again")
+
+    def over_lattice(self, radio_map) -> bool:
+        """Whether a `RadioMap` is over this scene's lattice."""
+        return radio_map.gain_db.shape[1:] == self.lattice.shape and \
+            np.allclose(radio_map.lattice.positions_m, self.lattice.positions_m)
 
     def content_hash(self) -> str:
         """SHA-256 over what decides a gain map: geometry, materials, frequency, sensitivity, devices and antennas."""
@@ -130,8 +133,8 @@ class Scene:
         digest.update(f"{radio.frequency_hz!r},{radio.tx_power_dbm!r},{radio.sensitivity_dbm!r};".encode())
         for device in self.config.devices:
             digest.update(f"{device.device},{device.x_m!r},{device.y_m!r},{device.z_m!r};".encode())
-        for antenna in (*self.device_antennas, self.uav_antenna):
+        for number, antenna in enumerate((*self.device_antennas, self.uav_antenna)):
             if antenna is not None:
-                digest.update(f"{antenna.azimuth_deg!r},{antenna.tilt_deg!r};".encode())
+                digest.update(f"{number},{antenna.azimuth_deg!r},{antenna.tilt_deg!r};".encode())
                 digest.update(np.ascontiguousarray(antenna.pattern.gain_dbi).tobytes())
         return digest.hexdigest()

@@ -10,6 +10,7 @@ from radiotwin.antennas import Antenna
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path, require_writable
 from radiotwin.geodesy import to_local
+from radiotwin.measurements import read_cells
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
 from radiotwin.tables import Origin
@@ -113,12 +114,7 @@ def read_points(path: Path | str, origin: Origin | None = None) -> np.ndarray:
             there is no origin.
     """
     path = Path(path)
-    if not path.is_file():
-        raise BadInput(f"{path} does not exist")
-    try:
-        raw = pd.read_csv(path, dtype=str, keep_default_na=False, skipinitialspace=True)
-    except (ValueError, OSError, EOFError) as error:  # pandas' own are ValueErrors
-        raise BadInput(f"{path} cannot be read as CSV: {error}") from None
+    raw = read_cells(path)
     geographic = "x_m" not in raw and GEOGRAPHIC[0] in raw
     wanted = GEOGRAPHIC if geographic else COLUMNS
     missing = [name for name in wanted if name not in raw]
@@ -138,7 +134,7 @@ def read_points(path: Path | str, origin: Origin | None = None) -> np.ndarray:
 
 def _numbers(path: Path, raw: pd.DataFrame, name: str) -> np.ndarray:
     """(n,) finite numbers of a column; degrees within their range."""
-    values = pd.to_numeric(raw[name].str.strip(), errors="coerce").to_numpy(dtype=float)
+    values = pd.to_numeric(raw[name].astype(str).str.strip(), errors="coerce").to_numpy(dtype=float)
     most = MOST_DEG.get(name, np.inf)
     bad = ~np.isfinite(values) | (np.abs(values) > most)
     if bad.any():

@@ -47,7 +47,10 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
     store = BatchStore(scene.folder / "cache", key)
     finished = _finished(Path(out_path), store.hash, [scene.config.devices[i].device for i in index])
     if finished is not None:
-        return finished
+        placed = finished.placed(scene.config.origin)  # of no account for the gains
+        if placed.dataset.attrs != finished.dataset.attrs:
+            placed.write(out_path)
+        return placed
     raw_db = solve_lattice(scene, settings, store, index)
 
     los = np.stack([scene.city.line_of_sight(one_m[None], positions_m) for one_m in device_m])
@@ -68,9 +71,9 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
     radio_map = RadioMap.build(
         [scene.config.devices[i].device for i in index], scene.lattice, gain_db, los,
         attributes={"source": "raytrace", "frequency_hz": frequency_hz, "gain_limit_db": limit_db,
-                    **_origin(scene), "scene": scene.config.name, "scene_hash": key["scene"],
+                    "scene": scene.config.name, "scene_hash": key["scene"],
                     "trace_hash": store.hash, **settings.attributes(), **counts, **figures,
-                    **library_versions(), "radiotwin_version": version("radiotwin")})
+                    **library_versions(), "radiotwin_version": version("radiotwin")}).placed(scene.config.origin)
     radio_map.write(out_path)
     return radio_map
 
@@ -134,8 +137,3 @@ def _censor(raw_db: np.ndarray, inside: np.ndarray, limit_db: float) -> tuple[np
         "links_detected": int(np.isfinite(gain_db).sum()), "links_without_path": int(no_path.sum()),
         "links_below_sensitivity": int(below.sum()), "links_inside_building": int(within.sum()),
     }
-
-
-def _origin(scene: Scene) -> dict[str, float]:
-    origin = scene.config.origin
-    return {} if origin is None else {f"origin_{name}": value for name, value in origin.model_dump().items()}

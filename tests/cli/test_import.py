@@ -103,6 +103,7 @@ def test_options_alone_are_enough_and_gzip_is_read_by_all(run, tmp_path):
     (tmp_path / "data.csv").write_text(GOOD)
     done = run(WORDS + " --gzip --origin 48.1,11.5,100 --not-detected -99,empty", tmp_path)
     assert done.returncode == 0, done.stderr
+    assert done.stdout.rstrip().endswith("--gzip")  # of the line that repeats it
     measurements = read_measurements(tmp_path / "out" / "measurements.csv.gz")
     np.testing.assert_array_equal(measurements.level_db, [-80, np.nan])
     np.testing.assert_allclose(measurements.receiver_m[0, :2], 0, atol=1e-3)

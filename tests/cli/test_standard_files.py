@@ -39,6 +39,26 @@ def test_maps_out(run, folder, suffix):
     assert (folder / f"part.{suffix}").stat().st_size > 500
 
 
+def test_a_name_that_is_not_ascii(run, folder):
+    result = run("export-scene scene -o 'Stadt Köln.obj'", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    assert "mtllib Stadt Köln.mtl" in (folder / "Stadt Köln.obj").read_text("utf-8")
+
+
+def test_a_map_of_another_scene_is_warned_of_and_one_of_another_place_is_refused(run, folder):
+    radio_map = RadioMap.read(folder / "map.nc")
+    for hash_, latitude_deg, status, words in (
+            (Scene.load(folder / "scene").content_hash(), 47.5, 0, ""),
+            ("another", 47.5, 0, "was made for another scene than scene"),
+            ("another", 40.0, 2, "latitude_deg is 40, that of scene is 47.5")):
+        radio_map.dataset.attrs |= {"scene_hash": hash_, "origin_latitude_deg": latitude_deg}
+        radio_map.write(folder / "other.nc")
+        result = run("map other.nc --scene scene -o other.tif", cwd=folder)
+        assert result.returncode == status and words in " ".join(result.stderr.split()), result.stderr
+        assert bool(result.stderr.strip()) == bool(words) and (folder / "other.tif").exists() == (status == 0)
+        (folder / "other.tif").unlink(missing_ok=True)
+
+
 @pytest.mark.llvm
 def test_gains_at_points(run, folder):
     (folder / "points.csv").write_text("x_m,y_m,z_m\n80,60,30\n80,40,1.5\n80,60,-3\n80,60,200\n")
@@ -67,7 +87,7 @@ BAD = {
     "map scene/city.nc --scene scene -o a.tif": "does not exist",
     "map map.nc --scene scene -o none/../map.nc/a.tif": "cannot write",
     "gains scene --points none.csv": "none.csv does not exist",
-    "gains scene --points map.nc": "cannot be read as CSV|missing",
+    "gains scene --points map.nc": "map.nc: unknown format; allowed are .csv",
     "gains scene --points p.csv --sum loud": "combining = 'loud' is unknown",
     "gains scene --points p.csv --quality best": "quality 'best' is unknown",
     "gains scene --points p.csv --devices d9": "device 'd9' is not in",

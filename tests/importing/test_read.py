@@ -35,6 +35,14 @@ def test_all_formats_give_the_same(bring_in, local, tmp_path):
     assert list(plain.table["receiver_x_m"]) == [0, 3] and list(plain.table["rssi_dbm"]) == [-80, -90]
 
 
+def test_numbers_beyond_whole_ones_are_read_as_they_are(bring_in, local, tmp_path):
+    pytest.importorskip("pyarrow")
+    frame = pd.DataFrame({"device": [1e20, 7.0], "x": [0, 3], "y": [0.0, 4.0], "level": [-80, -90.0]}, index=[5, 3])
+    frame.to_parquet(tmp_path / "made.parquet")
+    made = bring_in((tmp_path / "made.parquet").read_bytes(), "data.parquet", columns=local, length_unit="m")
+    assert list(made.table["device"]) == ["1e+20", "7.0"] and list(made.table["receiver_x_m"]) == [0, 3]
+
+
 def test_points_of_geojson(bring_in, points):
     result = bring_in(json.dumps(points), "data.geojson", length_unit="m", columns={
         "latitude": "latitude", "longitude": "longitude", "altitude": "altitude", "device": "cell", "level": "rsrp"})

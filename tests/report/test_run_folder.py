@@ -7,6 +7,7 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
+from radiotwin.radiomap import RadioMap
 from radiotwin.report import read_run, write_report
 
 
@@ -33,6 +34,20 @@ def test_a_truth_of_another_scene_is_not_shown(run_folder, tmp_path):
     with pytest.warns(UserWarning, match="another scene"):
         run = read_run(folder)
     assert "truth" not in run.maps and "run `radiotwin trace`" in run.notes[0]
+
+
+def test_a_rejected_truth_is_not_shown_by_another_way_nor_maps_over_other_lattices(run_folder, tmp_path):
+    folder = shutil.copytree(run_folder / "scene", tmp_path / "scene")
+    path = folder / "scene.toml"
+    path.write_text(path.read_text().replace("tx_power_dbm = 0.0", "tx_power_dbm = 3.0"))
+    truth = RadioMap.read(folder / "truth.nc")
+    smaller = RadioMap(truth.dataset.isel(x=slice(1, None)))
+    smaller.write(folder / "part.nc")
+    run = read_run(folder)
+    assert not run.maps and [note.split(" is not shown")[0] for note in run.notes] == [
+        str(folder / "truth.nc"), str(folder / "part.nc")]
+    with pytest.raises(BadInput, match="part.nc is not over the lattice"):
+        read_run(folder, truth=str(folder / "part.nc"))
 
 
 def test_a_planning_run_shows_its_flights_and_its_table(run_folder, tmp_path):

@@ -28,8 +28,10 @@ def test_reads_the_columns_it_needs(tmp_path):
     ("x_m,y_m,z_m\n1,,3\n", "row 2, column y_m: '' is not a finite number"),
     ("x_m,y_m,z_m\nnan,2,3\n", "row 2, column x_m: 'nan' is not a finite number"),
     ("x_m,y_m,z_m\n", "has no rows"),
-    ("", "cannot be read as CSV"),
-    ("x_m,y_m,z_m\n1,2,3,4,5\n1,2\n\"", "cannot be read as CSV|not a finite number"),
+    ("", "is empty"),
+    ("x_m,y_m,z_m\n1,2,3\n10,20,1.5,7\n", "row 3 has 4 fields, the header has 3"),
+    ("x_m,y_m,z_m\n1,2,3,\n", "row 2 has 4 fields"),
+    ("x_m,y_m,z_m\n1,2,3,4,5\n1,2\n\"", "cannot be read as .csv|row 2 has 5 fields"),
 ])
 def test_bad_points_name_row_and_column(tmp_path, text, message):
     path = write(tmp_path / "points.csv", text)

@@ -9,6 +9,7 @@ from radiotwin.errors import BadInput, RunFailed
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.scene.config import write_config
+from radiotwin.tables import Origin
 from radiotwin.trace import SolverSettings, trace_map
 
 SETTINGS = SolverSettings(batch_receivers=100)
@@ -60,6 +61,21 @@ def test_rerun_solves_nothing_and_gives_the_same_file(own_scene, law, tmp_path):
     trace_map(Scene.load(own_scene.folder), SETTINGS, tmp_path / "second.nc")
     assert law.calls == solved
     assert (tmp_path / "first.nc").read_bytes() == (tmp_path / "second.nc").read_bytes()
+
+
+def test_a_place_on_the_globe_that_is_given_later_is_written_into_the_map(own_scene, law, tmp_path):
+    path = tmp_path / "truth.nc"
+    trace_map(own_scene, SETTINGS, path)
+    solved, plain = law.calls, RadioMap.read(path)
+    config = own_scene.config
+    for latitude_deg in (48.1, 48.2):
+        origin = Origin(latitude_deg=latitude_deg, longitude_deg=11.5)
+        write_config(config.model_copy(update={"origin": origin}), own_scene.folder / "scene.toml")
+        trace_map(Scene.load(own_scene.folder), SETTINGS, path)
+        assert RadioMap.read(path).dataset.attrs["origin_latitude_deg"] == latitude_deg
+    write_config(config, own_scene.folder / "scene.toml")
+    trace_map(Scene.load(own_scene.folder), SETTINGS, path)
+    assert law.calls == solved and RadioMap.read(path).dataset.identical(plain.dataset)
 
 
 def test_only_what_is_missing_or_damaged_is_solved_again(own_scene, law, tmp_path):
