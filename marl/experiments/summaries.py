@@ -13,7 +13,7 @@ class Curve(NamedTuple):
 
     Attributes:
         x: (n,) real episodes, or whatever it is over.
-        mean, spread: (n,) of the ratio; the spread is the standard deviation over the seeds, 0 with one.
+        mean, spread: (n,) of the ratio.
         seeds: how many.
     """
 
@@ -37,7 +37,12 @@ def over_seeds(records: list[dict], x: str = "real_episodes", y: str = "truth_ra
     """The curve of a run, as long as that of every seed."""
     rows = min(len(record["curve"]) for record in records)
     table = np.array([[(row[x], row[y]) for row in record["curve"][:rows]] for record in records], dtype=float)
-    return Curve(table[:, :, 0].mean(axis=0), table[:, :, 1].mean(axis=0), table[:, :, 1].std(axis=0), len(records))
+    return Curve(table[:, :, 0].mean(axis=0), table[:, :, 1].mean(axis=0), spread(table[:, :, 1]), len(records))
+
+
+def spread(values) -> np.ndarray:
+    """Standard deviation over the first axis, estimated from that few (n - 1); 0 of one value."""
+    return np.std(values, axis=0, ddof=1 if len(values) > 1 else 0)
 
 
 def worlds(records: list[dict]) -> dict[tuple[str, str], dict[str, list[dict]]]:
@@ -88,4 +93,4 @@ def with_spread(values: list[float], digits: int = 3) -> str:
     """Mean ± standard deviation, of one value the value."""
     if not values:
         return "–"
-    return f"{np.mean(values):.{digits}f}" + (f" ± {np.std(values):.{digits}f}" if len(values) > 1 else "")
+    return f"{np.mean(values):.{digits}f}" + (f" ± {spread(values):.{digits}f}" if len(values) > 1 else "")
