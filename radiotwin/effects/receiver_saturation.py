@@ -82,5 +82,6 @@ class ReceiverSaturation(Effect):
 
 def _compress(level_db: np.ndarray, saturation_db: float, smoothness: float) -> tuple[np.ndarray, np.ndarray]:
     """What is read, and the slope of it."""
-    over = np.clip((level_db - saturation_db) * smoothness * np.log(10) / 10, -60, 60)
-    return level_db - np.logaddexp(0, over) / smoothness * 10 / np.log(10), 1 / (1 + np.exp(over))
+    over = (level_db - saturation_db) * smoothness * np.log(10) / 10
+    # A slope of e^-60 is none, but can be divided by.
+    return level_db - np.logaddexp(0, over) / smoothness * 10 / np.log(10), 1 / (1 + np.exp(np.minimum(over, 60)))

@@ -101,3 +101,13 @@ def test_a_receivers_fault_is_in_its_own_readings(links, effect, setting, expect
     read_db, slope = effect.bend(np.full(4, -80.0), setting, effect.term(records, setting, None).extra)
     np.testing.assert_allclose(read_db, [-80, expected_db, -80, expected_db])
     np.testing.assert_allclose(slope, [1, 0.5, 1, 0.5])
+
+
+@pytest.mark.parametrize("smoothness", [1.0, 3.0, 8.0])
+def test_however_strong_a_signal_is_a_saturated_receiver_reads_its_level_of_saturation(smoothness):
+    level_db = np.array([-60.0, -20.0, 100.0])
+    read_db, slope = _compress(level_db, -80.0, smoothness)
+    np.testing.assert_allclose(read_db, -80.0, atol=0.05)
+    around_db = [_compress(level_db + step_db, -80.0, smoothness)[0] for step_db in (0.5, -0.5)]
+    np.testing.assert_allclose(slope, around_db[0] - around_db[1], atol=2e-3)
+    assert (slope > 0).all()  # residuals are divided by it
