@@ -53,6 +53,8 @@ class MissingObstacle(Effect):
     def propose(self, view: View) -> list[dict]:
         records = view.records
         rows = np.flatnonzero(records.los)
+        if not len(rows):
+            return []
         nats = lacks_nats(view.residual_db[rows], view.scale_db[rows], LOSSES_DB) / view.design_effect
         centres_m, total = back_project(records.device_m[records.device[rows]], records.receiver_m[rows], nats)
         boxes = [[*map(float, centre_m), 1.5 * CELL_M, 1.5 * CELL_M, HEIGHTS_M[height], 0.0]
