@@ -135,6 +135,8 @@ def link_grid(xy_m: np.ndarray, z_m: float, receiver_m: np.ndarray, los: np.ndar
 
 def predict_in_chunks(channel: Channel, links: Links) -> tuple[np.ndarray, np.ndarray]:
     """`channel.predict` with bounded memory; sigma at least MIN_SIGMA_DB, since the likelihood divides by it."""
+    if not len(links):
+        return np.zeros(0), np.zeros(0)
     parts = [
         channel.predict(links.select(slice(start, start + PREDICT_CHUNK)))
         for start in range(0, len(links), PREDICT_CHUNK)

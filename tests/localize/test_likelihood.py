@@ -60,3 +60,13 @@ def test_table_and_direct_agree_overhead_and_far(published_law):
     rows = np.array([0, 1])
     for a, b in zip(table.look_up(xy_m, rows, los, 0), direct.look_up(xy_m, rows, los, 0)):
         np.testing.assert_allclose(a, b, atol=0.02)
+
+
+def test_no_links_have_no_means(free_space, published_law):
+    """As of a device that nobody detected: receivers at very many heights, so that there is no table."""
+    rng = np.random.default_rng(3)
+    receiver_m = np.column_stack([rng.uniform(0, 400, (600, 2)), np.linspace(20, 120, 600)])
+    observations = merge_repeats(receiver_m, np.zeros(600, int), np.full(600, np.nan), np.array([0]), use_missed=True)
+    channel = DirectChannel(free_space, observations.receiver_m, 1.5, by_device=False)
+    likelihood = Likelihood(observations, channel, np.array([0]), 1.5, None, limit_db=-60.0)
+    assert len(likelihood.residuals(0, np.array([200.0, 200.0])).z) == 0
