@@ -160,7 +160,8 @@ def _fit_rest(records: Records, device_m: np.ndarray) -> tuple[float, float]:
     level_db = np.where(np.isnan(hidden.level_db), -np.inf if hidden.limit_db is None else hidden.limit_db,
                         hidden.level_db)
     blank, told = np.isnan(hidden.level_db), np.isfinite(level_db)
-    if told.sum() < LEAST_HIDDEN:
+    # Blanks alone say no more than that it is weak, and the least is.
+    if told.sum() < LEAST_HIDDEN or blank[told].all():
         return REST_LOW_DB, REST_EXPONENT
 
     def loss(numbers: np.ndarray) -> float:
