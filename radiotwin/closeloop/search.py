@@ -339,6 +339,8 @@ def _weigh(model: Model, extended: Model, judged: Judged, block: np.ndarray | No
     evidence (n,) it may hang on a few places."""
     gain = model.held_out_nll - extended.held_out_nll
     usable, los = np.isfinite(gain), model.whole.records.los
+    if not usable.any():
+        return replace(judged, reason="no held-out link can be judged with it")
     design_effect = model.whole.view(model.fits[0]).design_effect
 
     def by_fold(rows: np.ndarray) -> np.ndarray:

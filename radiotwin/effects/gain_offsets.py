@@ -37,6 +37,8 @@ class _GainOffset(Effect):
     def propose(self, view: View) -> list[dict]:
         index = self._index(view.records)
         members = measured(index, LEAST_LINKS)
+        if len(members) < 2:  # a fold may have fewer than all links
+            return []
         offsets_db = [np.average(view.residual_db[index == member], weights=view.weight[index == member])
                       for member in members]
         return [{"members": members, "spread_db": float(np.std(offsets_db))}]

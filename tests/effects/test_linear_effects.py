@@ -70,3 +70,9 @@ def test_the_body_shadows_one_side(records):
     found = BodyShadowing().parameters(records, setting, Found(coefficients, 0.01 * np.eye(2), np.zeros(0)))
     assert found["front_to_back_db[r1]"].value == pytest.approx(8)
     assert found["clearest_side_deg[r1]"].value == pytest.approx(60)
+
+
+def test_of_one_member_that_is_measured_enough_no_offset_is_proposed(records, view):
+    few = records.select((records.device == 0) | (np.arange(len(records)) < 30))
+    assert np.bincount(few.device).tolist() == [60, 10, 10]
+    assert DeviceGainOffset().propose(view(few, np.zeros(len(few)), 1.0)) == []
