@@ -29,6 +29,7 @@ TEMPERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08)
 MOST_TASKS = 100
 LEAST_DEVICES = 50  # fewer do not tell a share of nine in ten
 AROUND_M = 300.0  # beyond all ends that are known
+LINKS_AT_ONCE = 400_000  # of all cells together: bounds memory, 260 bytes each without a map
 
 
 @dataclass(frozen=True)
@@ -165,12 +166,21 @@ def device_spread_db(side: Side, fit: Solution) -> float:
 
 def _log_likelihood(model: Corrected, mine: Records, places_m: np.ndarray) -> np.ndarray:
     """(c,) of the links of one device, if it stood at places (c, 2)."""
+    cells = max(LINKS_AT_ONCE // len(mine), 1)
+    return np.concatenate([_log_likelihood_at(model, mine, places_m[first:first + cells])
+                           for first in range(0, len(places_m), cells)])
+
+
+def _log_likelihood_at(model: Corrected, mine: Records, places_m: np.ndarray) -> np.ndarray:
+    """The same, for all places at once."""
     links, cells, spread_db = len(mine), len(places_m), model.device_spread_db
     height_m = mine.device_m[mine.device[0], 2]
     rows = np.tile(np.arange(links), cells)
     every = replace(
         mine.select(rows), device=len(model.device_m) + np.repeat(np.arange(cells), links),
-        device_m=np.vstack([model.device_m, np.column_stack([places_m, np.full(cells, height_m)])]))
+        device_m=np.vstack([model.device_m, np.column_stack([places_m, np.full(cells, height_m)])]),
+        # Effects count devices as the model does; the file may have others.
+        device_names=[f"device {i}" for i in range(len(model.device_m) + cells)], anchors=frozenset())
     every.__dict__["first_s"] = model.first_s
     every.__dict__["time_in_flight_s"] = mine.time_in_flight_s[rows]
     everything, base = np.ones(len(every), dtype=bool), model.base

@@ -3,15 +3,22 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from radiotwin.channel.censored_line import LogDistanceLine
+from radiotwin.channel.log_distance import LogDistance
+from radiotwin.closeloop.bases import FittedChannel
 from radiotwin.closeloop.corrected import corrected_twin
 from radiotwin.closeloop.locate import Corrected, locate
+from radiotwin.closeloop.records import make_records
+from radiotwin.closeloop.regression import Solution
 from radiotwin.closeloop.run import close_loop
+from radiotwin.effects.gain_offsets import DeviceGainOffset
 from radiotwin.measurements import Measurements
 
 COMMAND = Path(sys.executable).with_name("radiotwin")
@@ -37,6 +44,47 @@ def few_links(records, rng, links):
     rows = [rng.choice(np.flatnonzero(records.device == device), links, replace=False)
             for device in range(len(records.device_names))]
     return records.select(np.concatenate(rows))
+
+
+class Counting(FittedChannel):
+    """The law of the open ground, which is asked for so many links at once."""
+
+    def __init__(self):
+        super().__init__(LogDistance(LogDistanceLine(-35.0, -2.6, 2.0)), np.zeros((3, 3)))
+        self.links = []
+
+    def mean_db(self, records):
+        self.links.append(len(records))
+        return super().mean_db(records)
+
+
+def alone(open_ground, seed):
+    """40 links of one device, in a file that lists no other; and where it is."""
+    world = open_ground.fly(seed)
+    records = make_records(open_ground.measured(world), None)
+    mine = records.select(np.flatnonzero(records.device == 4)[::18])
+    return replace(mine, device=np.zeros(40, int), device_m=world.device_m[4:], device_names=["d4"]), world.device_m[4]
+
+
+def test_effects_of_devices_that_the_file_does_not_list_do_not_matter(open_ground):
+    records, there_m = alone(open_ground, 14)
+    offsets = DeviceGainOffset(), {"members": [0, 1, 2], "spread_db": 0.5}
+    model = Corrected(Counting(), [offsets], Solution(np.array([0.0, 0, 9, -9, 9]), np.array([2.0]), np.nan), 5.0,
+                      np.zeros((3, 3)), 0.0, 0.0)
+    (place,) = locate(model, records, AREA_M)
+    assert np.hypot(place.x_m - there_m[0], place.y_m - there_m[1]) <= place.radius_m < 40
+
+
+def test_few_links_at_once_find_the_same_place(open_ground, monkeypatch):
+    records, places = alone(open_ground, 15)[0], []
+    for most in (10**9, 1000):
+        monkeypatch.setattr("radiotwin.closeloop.locate.LINKS_AT_ONCE", most, raising=False)
+        model = Corrected(Counting(), [], Solution(np.zeros(2), np.array([2.0]), np.nan), 5.0, np.zeros((3, 3)), 0.0,
+                          3.0)
+        places += list(locate(model, records, AREA_M))
+        assert max(model.base.links) <= most
+    assert (places[1].x_m, places[1].y_m) == pytest.approx((places[0].x_m, places[0].y_m))
+    assert places[1].radius_m == pytest.approx(places[0].radius_m)
 
 
 def test_what_is_known_of_receivers_brings_devices_nearer_and_the_radii_hold_nine_in_ten(open_ground):
