@@ -105,8 +105,8 @@ def locate(
     require_writable(out)
     unknown = int((data.devices["role"] == "unknown").sum())
     with progress("locating", total=unknown) as advance:
-        places, remarks = locate_file(data, known, corrected_model(known), Scene.load(scene) if scene else None,
-                                      lambda: advance(1))
+        world = Scene.load(scene) if scene else None
+        places, remarks = locate_file(data, known, corrected_model(known, world), world, lambda: advance(1))
     for remark in remarks:
         say(f"note: {remark}")
     with atomic_path(out) as temporary:

@@ -67,8 +67,9 @@ def corrected_map(twin: Twin, scene: Scene) -> RadioMap:
     """What a twin with effects predicts over a scene's lattice.
 
     Raises:
-        BadInput: effects that this version does not know.
+        BadInput: effects that this version does not know, or a twin that was made without a 3D map.
     """
+    _require_same_map(twin, scene)
     found = twin.effects
     base: FittedBase = FittedChannel(twin.channel, twin.device_m)
     if found["base"] == "raytrace":
@@ -103,11 +104,16 @@ def corrected_map(twin: Twin, scene: Scene) -> RadioMap:
     return RadioMap.build([twin.devices[i].device for i in known], scene.lattice, mean_db, los, sigma_db, attributes)
 
 
-def corrected_model(twin: Twin) -> Corrected:
+def corrected_model(twin: Twin, scene: Scene | None) -> Corrected:
     """What `locate` needs of a twin with effects.
 
+    Args:
+        twin: of `close-loop`.
+        scene: the 3D map that devices are to be located with.
+
     Raises:
-        BadInput: no effects, or some that this version does not know, or a base that follows paths.
+        BadInput: no effects, or some that this version does not know, or a base that follows paths, or a scene where
+            the twin was made without one, or the other way round.
     """
     found = twin.effects
     if not found or "temper" not in found:
@@ -116,6 +122,7 @@ def corrected_model(twin: Twin) -> Corrected:
     if found["base"] == "raytrace":
         raise BadInput("the twin's base is 'raytrace', and to follow paths from every place where a device may be "
                        "takes too long; close the loop with --base twin")
+    _require_same_map(twin, scene)
     parts = [(_effect(part["name"], part["variant"]), part) for part in found["parts"]]
     coefficients = np.concatenate([found["coefficients"], *(part["coefficients"] for _, part in parts)])
     solution = Solution(coefficients, np.array(found["scale_db"]), np.nan)
@@ -123,6 +130,19 @@ def corrected_model(twin: Twin) -> Corrected:
                      solution, found["dof"], np.nan_to_num(twin.device_m),
                      np.nan if found["first_s"] is None else found["first_s"], found["device_spread_db"],
                      found["temper"])
+
+
+def _require_same_map(twin: Twin, scene: Scene | None) -> None:
+    """A law that was fitted to each class of line of sight needs a map, and one that was not can do nothing with it."""
+    if twin.effects["base"] == "raytrace" or not twin.channel.uses_map:
+        return
+    with_map = len(twin.effects["coefficients"]) > 2  # a level and a slope for each class
+    if with_map and scene is None:
+        raise BadInput(f"the twin was made with a 3D map (scene {twin.provenance.get('scene', 'unknown')}), and none "
+                       "is given; give it with --scene")
+    if scene is not None and not with_map:
+        raise BadInput(f"the twin was made without a 3D map, and cannot use that of {scene.folder}: locate devices "
+                       "without --scene, or run close-loop with --scene first")
 
 
 def _mean_db(base: FittedBase, records: Records, coefficients: np.ndarray,
