@@ -116,6 +116,11 @@ class Records:
         return float(np.nanmin(self.time_s)) if np.isfinite(self.time_s).any() else np.nan
 
     @cached_property
+    def last_s(self) -> float:
+        """Time of the last measurement [s]; NaN without times"""
+        return float(np.nanmax(self.time_s)) if np.isfinite(self.time_s).any() else np.nan
+
+    @cached_property
     def los(self) -> np.ndarray:
         """(n,) bool; every link has line of sight where there is no map"""
         if self.city is None:
@@ -168,7 +173,7 @@ class Records:
         part = replace(self, **{name: value[rows] for name, value in values.items() if value is not None})
         for name in ("los", "time_in_flight_s"):  # costly, or not to be had from a part
             part.__dict__[name] = getattr(self, name)[rows]
-        part.__dict__["first_s"] = self.first_s
+        part.__dict__.update(first_s=self.first_s, last_s=self.last_s)
         return part
 
     def with_devices(self, device_m: np.ndarray) -> "Records":

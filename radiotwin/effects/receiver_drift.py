@@ -8,7 +8,7 @@ temperature follows first-order cooling); ageing as a slope in time; a step at a
 
 import numpy as np
 
-from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured
+from radiotwin.effects.base import Effect, Parameter, Setting, Term, Variation, View, measured
 
 LEAST_LINKS = 60
 LEAST_NATS = 5.0
@@ -55,7 +55,10 @@ class ReceiverDrift(Effect):
                 records.flight[rows], view.residual_db[rows], view.weight[rows])
             nats, form, number = max(each for each in candidates if each[1] == "step" or not self._steps_only)
             if nats > LEAST_NATS:
-                found.append((nats, {"receivers": {str(receiver): [form, float(number)]}}))
+                setting: Setting = {"receivers": {str(receiver): [form, float(number)]}}
+                if form == "ageing":  # is told from first to last, which other links are not to change
+                    setting["span_s"] = [records.first_s, records.last_s]
+                found.append((nats, setting))
         return [setting for _, setting in sorted(found, key=lambda each: -each[0])[:MOST_TRIED]]
 
     def term(self, records, setting, at) -> Term:
@@ -63,7 +66,7 @@ class ReceiverDrift(Effect):
         for receiver, (form, number) in setting["receivers"].items():
             mine = (records.receiver == int(receiver)) & np.isfinite(records.time_s)
             columns.append(np.where(mine, _shape(form, number, records.time_s - records.first_s, records.time_s,
-                                                 records.time_in_flight_s), 0.0))
+                                                 records.time_in_flight_s, setting.get("span_s")), 0.0))
             # An offset of its own, or the drift would have to stand for a constant error, too.
             columns.append(mine.astype(float))
             names += [form, f"offset[{records.receiver_names[int(receiver)]}]"]
@@ -78,7 +81,7 @@ class ReceiverDrift(Effect):
         def again(numbers: np.ndarray) -> dict:
             changed = {receiver: [setting["receivers"][receiver][0], float(np.exp(number))]
                        for receiver, number in zip(warming, numbers)}
-            return {"receivers": setting["receivers"] | changed}
+            return setting | {"receivers": setting["receivers"] | changed}
         return Variation(values, np.full(len(values), 0.3), np.full(len(values), 0.0), np.full(len(values), 9.0), again)
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
@@ -98,14 +101,14 @@ class ReceiverDrift(Effect):
 
 
 def _shape(form: str, number: float, since_first_s: np.ndarray, time_s: np.ndarray,
-           time_in_flight_s: np.ndarray) -> np.ndarray:
+           time_in_flight_s: np.ndarray, span_s: list[float] | None = None) -> np.ndarray:
     if form == "warm_up":
         return np.exp(-since_first_s / number)
     if form == "warm_up_each_flight":
         return np.exp(-time_in_flight_s / number)
     if form == "step":
         return (time_s >= number).astype(float)
-    low, high = np.nanmin(time_s), np.nanmax(time_s)
+    low, high = span_s or (np.nanmin(time_s), np.nanmax(time_s))  # twins of version 0.1 do not tell
     return (time_s - number) / max(high - low, 1.0)
 
 

@@ -1,5 +1,7 @@
 """The shapes of a receiver's drift in time, and which of them is proposed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -53,3 +55,15 @@ def test_the_form_that_is_there_is_proposed_for_the_receiver_that_has_it(flown, 
 
 def test_without_times_there_is_no_drift(links):
     assert "time_s" in ReceiverDrift().lacks(links([[0.0, 0, 1.5]], np.ones((80, 3))))
+
+
+def test_ageing_goes_on_as_it_was_learned_whatever_links_are_asked_for(flown, view):
+    records = flown()
+    records.level_db[:] = np.random.default_rng(0).normal(0, 0.5, len(records)) \
+        + np.where(records.receiver == 1, 6 * (records.time_s - 1500) / 998, 0.0)
+    (setting,) = ReceiverDrift().propose(view(records, np.zeros(len(records)), 1.0))
+    form, middle_s = setting["receivers"]["1"]
+    assert form == "ageing"
+    two = replace(records.select(np.flatnonzero(records.receiver == 1)[-2:]))  # 2 s apart, as if they were a file
+    column = ReceiverDrift().term(two, setting, None).columns[:, 0]
+    np.testing.assert_allclose(column, (two.time_s - middle_s) / 998, atol=1e-9)  # from 1000 to 1998 s
