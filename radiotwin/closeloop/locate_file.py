@@ -36,7 +36,7 @@ def locate_file(measurements: Measurements, twin: Twin, model: Corrected, scene:
                        "devices.csv")
     if unknown.level_column != twin.level:
         raise BadInput(f"the measurements have {unknown.level_column}, the twin is of {twin.level}; both need the same")
-    records = make_records(unknown, scene, unplaced=True)
+    records = make_records(unknown, scene, to_locate=True)
     names = twin.effects["receivers"]
     strangers = [name for name in records.receiver_names if name not in names]
     remarks = list(records.remarks)
@@ -46,7 +46,9 @@ def locate_file(measurements: Measurements, twin: Twin, model: Corrected, scene:
     every = [*names, *strangers]
     number = np.array([every.index(name) for name in records.receiver_names])
     records = replace(records, receiver=number[records.receiver], receiver_names=every,
-                      device_m=np.nan_to_num(records.device_m))
+                      device_m=np.nan_to_num(records.device_m),
+                      # A few links do not tell how weak a level can be detected.
+                      limit_db=records.limit_db if twin.limit_db is None else twin.limit_db)
     area_m = scene.config.extent.bounds if scene is not None else whole_area(model, records)
     found = list(locate(model, records, area_m, tell))
     table = pd.DataFrame({"device": [records.device_names[place.device] for place in found],

@@ -191,13 +191,14 @@ class Records:
         return other
 
 
-def make_records(measurements: Measurements, scene: Scene | None, unplaced: bool = False) -> Records:
+def make_records(measurements: Measurements, scene: Scene | None, to_locate: bool = False) -> Records:
     """Prepare measurements: what cannot be used is left out and told.
 
     Args:
         measurements: links.
         scene: the 3D map and the radio, if there is one.
-        unplaced: whether devices of unknown position are kept where there is no scene.
+        to_locate: whether devices are to be found, and nothing is learned: those of unknown position are kept where
+            there is no scene, and so are few links, and the silence of receivers and devices, which tells a place.
 
     Raises:
         BadInput: nothing that can be used is left, or positions or levels that cannot be what they are said to be.
@@ -231,9 +232,9 @@ def make_records(measurements: Measurements, scene: Scene | None, unplaced: bool
     flat = np.isnan(measurements.device_m[:, 2]).sum()
     if flat:
         remarks.append(f"{flat:,} device heights are empty and taken for {MISSING_HEIGHT_M} m")
-    placed = np.asarray(np.isfinite(device_m).all(axis=1) | (scene is not None) | unplaced)
+    placed = np.asarray(np.isfinite(device_m).all(axis=1) | (scene is not None) | to_locate)
     leave_out(~placed[device_index], "without a scene, devices of unknown position cannot be located")
-    for bad, why in useless_receivers(table, level_db, keep):
+    for bad, why in [] if to_locate else useless_receivers(table, level_db, keep):
         leave_out(bad, why)
     fill_db, share = fill_value(level_db[keep])
     if fill_db is not None:
@@ -241,10 +242,12 @@ def make_records(measurements: Measurements, scene: Scene | None, unplaced: bool
         level_db = np.where(at_fill, np.nan, level_db)
         remarks.append(f"{at_fill.sum():,} links read exactly {fill_db:g}, the lowest value, {share:.0%} of all: taken "
                        "for not detected")
-    leave_out(*unheard_devices(table, level_db, keep))
-    if keep.sum() < LEAST_ROWS or np.isfinite(level_db[keep]).sum() < LEAST_ROWS // 2:
+    if not to_locate:
+        leave_out(*unheard_devices(table, level_db, keep))
+    least = 1 if to_locate else LEAST_ROWS
+    if keep.sum() < least or np.isfinite(level_db[keep]).sum() < least // 2:
         raise BadInput(f"{int(keep.sum())} links can be used, {int(np.isfinite(level_db[keep]).sum())} of them "
-                       f"detected; at least {LEAST_ROWS} are needed, {LEAST_ROWS // 2} of them detected: "
+                       f"detected; at least {least} are needed, {least // 2} of them detected: "
                        + ("; ".join(remarks) or "measure more"))
     refuse_empty_levels(level_db[keep], measurements.level_column)
     table = table[keep]
