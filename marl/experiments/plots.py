@@ -52,7 +52,7 @@ def twin_figure(records: list[dict]) -> Figure:
         names = [name for name in TWINS if name in runs]
         for number, (key, label) in enumerate((("trained", "policy (QMIX)"), ("plan", "planner"))):
             values = [[record[f"{key}_truth_ratio"] for record in runs[name]] for name in names]
-            _bars(axes, number, 2, [np.mean(each) for each in values], [spread(each) for each in values], label)
+            _bars(axes, number, 2, [np.mean(each) for each in values], [float(spread(each)) for each in values], label)
         axes.set(xticks=range(len(names)), ylim=(0, 1.02), ylabel=RATIO, title=f"{scene}, ray-traced truth",
                  xlabel="twin that it was trained or planned in")
         axes.set_xticklabels([name.replace("-", "-\n") for name in names])

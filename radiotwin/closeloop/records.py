@@ -198,7 +198,7 @@ def make_records(measurements: Measurements, scene: Scene | None, to_locate: boo
         measurements: links.
         scene: the 3D map and the radio, if there is one.
         to_locate: whether devices are to be found, and nothing is learned: those of unknown position are kept where
-            there is no scene, and so are few links, and the silence of receivers and devices, which tells a place.
+            there is no scene, and so are few links, and receivers that heard nothing, which tells a place, too.
 
     Raises:
         BadInput: nothing that can be used is left, or positions or levels that cannot be what they are said to be.
@@ -242,8 +242,7 @@ def make_records(measurements: Measurements, scene: Scene | None, to_locate: boo
         level_db = np.where(at_fill, np.nan, level_db)
         remarks.append(f"{at_fill.sum():,} links read exactly {fill_db:g}, the lowest value, {share:.0%} of all: taken "
                        "for not detected")
-    if not to_locate:
-        leave_out(*unheard_devices(table, level_db, keep))
+    leave_out(*unheard_devices(table, level_db, keep))
     least = 1 if to_locate else LEAST_ROWS
     if keep.sum() < least or np.isfinite(level_db[keep]).sum() < least // 2:
         raise BadInput(f"{int(keep.sum())} links can be used, {int(np.isfinite(level_db[keep]).sum())} of them "
