@@ -86,7 +86,8 @@ def useless_receivers(table: pd.DataFrame, level_db: np.ndarray, keep: np.ndarra
     low, high = np.full(len(names), np.inf), np.full(len(names), -np.inf)
     np.minimum.at(low, end[seen], level_db[seen])
     np.maximum.at(high, end[seen], level_db[seen])
-    dead, stuck = (links > 0) & np.isinf(low), (links > FEW_ROWS) & (low == high)
+    heard = np.bincount(end[seen], minlength=len(names))  # one that heard once among many blanks is not stuck
+    dead, stuck = (links > 0) & np.isinf(low), (heard > FEW_ROWS) & (low == high)
     few = (links > 0) & (links < FEW_ROWS) & ~dead
     count = f"{links[few].max(initial=0)} {'only' if few.sum() < 2 else 'at most'}"
     return [(dead[end], f"receiver {_some(names[dead])} never detected anything"),

@@ -222,7 +222,8 @@ def make_records(measurements: Measurements, scene: Scene | None, to_locate: boo
               f"their receiver is more than {FAR_M / 1000:.0f} km from the others")
     leave_out(np.abs(receiver_m[:, :2] - device_m[device_index, :2]).max(axis=1) > FAR_M,
               f"their receiver is more than {FAR_M / 1000:.0f} km from the device; both need one frame, in metres")
-    leave_out(table.duplicated().to_numpy(), "they stand there twice")
+    if "time_s" in table:  # without a time, equal rows may be equal measurements
+        leave_out(table.duplicated().to_numpy() & table["time_s"].notna().to_numpy(), "they stand there twice")
     low_z = np.isnan(receiver_m[:, 2])
     if low_z.any() and scene is not None:
         leave_out(low_z, "their receiver's height is empty, and the 3D map needs it")

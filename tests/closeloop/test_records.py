@@ -30,6 +30,18 @@ def test_what_cannot_be_used_is_left_out_and_told(open_ground):
         assert part in told, part
 
 
+def test_a_receiver_that_heard_once_is_not_stuck_and_equal_rows_without_a_time_are_measurements(open_ground):
+    measurements = open_ground.measured(open_ground.fly(0, limit_db=-500.0))
+    table, n = measurements.table, len(measurements.table)
+    table.loc[:19, "receiver"] = "far"
+    table.loc[:18, "gain_db"] = np.nan
+    table.loc[30] = table.loc[31]
+    assert len(make_records(measurements, None)) == n - 1
+    table["time_s"] = np.nan
+    records = make_records(measurements, None)
+    assert len(records) == n and records.receiver_names == ["far", "r0", "r1"] and records.remarks == []
+
+
 def test_a_value_that_stands_for_not_detected_becomes_blank(open_ground):
     world = open_ground.fly(1)
     measurements = open_ground.measured(world)
