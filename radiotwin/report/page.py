@@ -11,6 +11,7 @@ from matplotlib import colormaps
 from radiotwin import __version__
 from radiotwin.closeloop.page import MORE_STYLE
 from radiotwin.closeloop.page import sections as closeloop_sections
+from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 from radiotwin.pages import STYLE, image, table
 from radiotwin.report.city import city_mesh
@@ -62,6 +63,9 @@ def write_report(run: Run, path: Path | str) -> None:
     Args:
         run: what there is to show.
         path: of the HTML file; whole or not at all.
+
+    Raises:
+        BadInput: a damaged `closeloop.json`, or a path that cannot be written.
     """
     title = run.scene.config.name if run.scene else run.folder.resolve().name
     parts = [f"<h1>{html.escape(title)}</h1>", comparison_lead(run.comparison) if run.comparison else ""]
@@ -75,7 +79,11 @@ def write_report(run: Run, path: Path | str) -> None:
             scripts += f"<script>{files(package).joinpath(name).read_text(encoding='utf-8')}</script>"
     parts += [f'<p class="notes">{html.escape(note)}</p>' for note in run.notes]
     if run.closeloop is not None and run.closeloop_folder is not None:
-        parts += closeloop_sections(run.closeloop, run.closeloop_folder)
+        try:
+            parts += closeloop_sections(run.closeloop, run.closeloop_folder)
+        except (KeyError, TypeError, ValueError) as error:
+            raise BadInput(f"{run.closeloop_folder}/closeloop.json is damaged ({type(error).__name__}: {error}); run "
+                           "`radiotwin close-loop` again") from None
     if run.comparison is not None and run.comparison_folder is not None:
         parts += comparison_sections(run.comparison, run.comparison_folder)
     parts += _planning(run) + _devices(run)

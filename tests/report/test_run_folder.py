@@ -76,6 +76,13 @@ def test_bad_folders_get_one_message(tmp_path, name, content, words):
         read_run(tmp_path)
 
 
+def test_a_close_loop_without_its_entries_is_bad_input(tmp_path):
+    (tmp_path / "closeloop.json").write_text('{"schema": "radiotwin.closeloop/1"}')
+    with pytest.raises(BadInput, match="closeloop.json is damaged"):
+        write_report(read_run(tmp_path), tmp_path / "page.html")
+    assert not (tmp_path / "page.html").exists()
+
+
 def test_no_folder_is_bad_input(tmp_path):
     with pytest.raises(BadInput, match="is not a folder"):
         read_run(tmp_path / "nowhere")
