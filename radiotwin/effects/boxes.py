@@ -9,7 +9,7 @@ CELL_M = 12.5
 HEIGHTS_M = (6.0, 9.0, 12.0, 16.0, 22.0, 30.0, 40.0, 52.0, 66.0, 85.0, 110.0)
 APART_M = 25.0
 MISSES, DOF = 0.4, 4.0
-CHUNK = 2000  # links a time: bounds memory
+CHUNK, MOST_POINTS = 2000, 4_000_000  # links, and points on them, a time: bounds memory
 
 
 class Box(NamedTuple):
@@ -128,8 +128,10 @@ def back_project(a_m: np.ndarray, b_m: np.ndarray, gain: np.ndarray, ground_m: f
     low = np.floor(np.minimum(a_m, b_m)[:, :2].min(axis=0) / CELL_M).astype(int)
     shape = np.ceil(np.maximum(a_m, b_m)[:, :2].max(axis=0) / CELL_M).astype(int) - low + 1
     total = np.zeros((len(HEIGHTS_M), shape[0] * shape[1]))
-    for first in range(0, len(a_m), CHUNK):
-        part = slice(first, first + CHUNK)
+    longest = np.linalg.norm((b_m - a_m)[:, :2], axis=1).max(initial=1.0)
+    step = max(min(CHUNK, int(MOST_POINTS * SAMPLES_M / longest)), 1)
+    for first in range(0, len(a_m), step):
+        part = slice(first, first + step)
         longest = np.linalg.norm((b_m - a_m)[part, :2], axis=1).max(initial=1.0)
         share = np.linspace(0, 1, max(int(longest / SAMPLES_M), 2))
         points = a_m[part, None] + share[:, None] * (b_m - a_m)[part, None]

@@ -1,8 +1,11 @@
 """Boxes in the way of links, against hand-made cases and points along each link."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
+from radiotwin.effects import boxes
 from radiotwin.effects.boxes import CELL_M, HEIGHTS_M, Box, back_project, cross, knife_edge_db, two_edges_db
 
 
@@ -66,6 +69,22 @@ def test_two_edges_lose_what_one_does_where_the_other_is_out_of_the_way_and_more
     assert np.all(np.diff(two_db) >= 0) and one_db[0] + 2 < two_db[-1] < 2 * one_db[0]
     turned_db = two_edges_db(np.array([7.5]), np.array([8.0]), 180.0, 20.0, 100.0, 0.125)
     assert turned_db[0] == pytest.approx(two_db[2])
+
+
+def test_long_links_are_projected_few_at_a_time_to_the_same_sums(monkeypatch):
+    rng = np.random.default_rng(1)
+    a_m = np.column_stack([rng.uniform(0, 200, (1000, 2)), np.full(1000, 1.5)])
+    turn = rng.uniform(0, 2 * np.pi, 1000)
+    b_m = a_m + np.column_stack([500 * np.cos(turn), 500 * np.sin(turn), np.full(1000, 60.0)])
+    gain, found = rng.normal(size=1000), []
+    for most in (boxes.MOST_POINTS, 5000):
+        monkeypatch.setattr(boxes, "MOST_POINTS", most)
+        tracemalloc.start()
+        total = back_project(a_m, b_m, gain)[1]
+        found.append((total, tracemalloc.get_traced_memory()[1]))
+        tracemalloc.stop()
+    np.testing.assert_allclose(found[1][0], found[0][0], atol=1e-9)
+    assert found[1][1] < 0.3 * found[0][1]
 
 
 def test_back_projection_finds_the_cell_and_how_high_it_must_be():
