@@ -119,7 +119,8 @@ class Twin:
 
         The mean is given below sensitivity, too; attribute `gain_limit_db` says where detection ends.
         """
-        if self.provenance.get("scene_hash", scene.content_hash()) != scene.content_hash():
+        scene_hash = scene.content_hash()
+        if self.provenance.get("scene_hash", scene_hash) != scene_hash:
             warnings.warn(f"the twin was learnt in another scene ({self.provenance.get('scene')}) than {scene.folder}, "
                           "or this one has changed since: geometry, radio or declared devices differ", stacklevel=2)
         if self.effects:
@@ -143,7 +144,7 @@ class Twin:
         if self.level == "rssi_dbm":
             mean_db -= scene.config.radio.tx_power_dbm
         attributes = {"source": f"twin:{self.channel.name}", "frequency_hz": scene.config.radio.frequency_hz,
-                      "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene.content_hash(),
+                      "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene_hash,
                       "radiotwin_version": radiotwin.__version__}
         names = [self.devices[i].device for i in known]
         return RadioMap.build(names, scene.lattice, mean_db, los, sigma_db, attributes)

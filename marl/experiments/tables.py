@@ -190,10 +190,10 @@ def tuning_table(records: list[dict]) -> str:
 
 def options(settings: dict) -> str:
     """What of a run of Algorithm 1 differs from today's defaults, as options of `marl.fedqmix`."""
-    defaults = {"run": RunSettings(), "learner": LearnerSettings()}
-    given = [f"--{name.replace('_', '-')} {str(value).lower()}" for group, before in defaults.items()
-             for name, value in filled(settings)[group].items()
-             if name not in WORLD and value != before.model_dump(mode="json")[name]]
+    defaults = RunSettings().model_dump(mode="json") | LearnerSettings().model_dump()
+    now = filled(settings)
+    given = [f"--{name.replace('_', '-')} {str(value).lower()}" for name, value in (now["run"] | now["learner"]).items()
+             if name not in WORLD and value != defaults[name]]
     return f"`{' '.join(given)}`" if given else "as it is"
 
 

@@ -102,7 +102,7 @@ def _check_place(path: Path, attributes: dict, scene: "Scene") -> None:
         if abs(there - value) > SAME_PLACE:
             raise BadInput(f"{path} is a map of another place: its origin's {name} is {there:g}, that of "
                            f"{scene.folder} is {value:g}; give the scene that it was made for, or trace again")
-    if attributes.get("scene_hash", scene.content_hash()) != scene.content_hash():
+    if attributes.get("scene_hash") not in (None, scene.content_hash()):
         warnings.warn(f"{path} was made for another scene than {scene.folder}, or that has changed since: outlines, "
                       "devices and the place on the globe are those of the scene", stacklevel=2)
 

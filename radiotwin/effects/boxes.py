@@ -128,12 +128,11 @@ def back_project(a_m: np.ndarray, b_m: np.ndarray, gain: np.ndarray, ground_m: f
     low = np.floor(np.minimum(a_m, b_m)[:, :2].min(axis=0) / CELL_M).astype(int)
     shape = np.ceil(np.maximum(a_m, b_m)[:, :2].max(axis=0) / CELL_M).astype(int) - low + 1
     total = np.zeros((len(HEIGHTS_M), shape[0] * shape[1]))
-    longest = np.linalg.norm((b_m - a_m)[:, :2], axis=1).max(initial=1.0)
-    step = max(min(CHUNK, int(MOST_POINTS * SAMPLES_M / longest)), 1)
+    length_m = np.linalg.norm((b_m - a_m)[:, :2], axis=1)
+    step = max(min(CHUNK, int(MOST_POINTS * SAMPLES_M / length_m.max(initial=1.0))), 1)
     for first in range(0, len(a_m), step):
         part = slice(first, first + step)
-        longest = np.linalg.norm((b_m - a_m)[part, :2], axis=1).max(initial=1.0)
-        share = np.linspace(0, 1, max(int(longest / SAMPLES_M), 2))
+        share = np.linspace(0, 1, max(int(length_m[part].max(initial=1.0) / SAMPLES_M), 2))
         points = a_m[part, None] + share[:, None] * (b_m - a_m)[part, None]
         cell = np.floor(points[..., :2] / CELL_M).astype(int) - low
         flat = cell[..., 0] * shape[1] + cell[..., 1]
