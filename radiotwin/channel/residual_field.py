@@ -10,9 +10,9 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-MAX_POINTS = 2500  # of a series
+MAX_POINTS, MIN_POINTS = 2500, 30  # of a series, where there are more
 MAX_PAIRS = 36e6  # of all series: their matrices take 8 bytes a pair
-MAX_POINTS_TO_FIT = 300
+MAX_POINTS_TO_FIT, MAX_SERIES_TO_FIT = 300, 400  # MAX_PAIRS again
 SAME_POINT_M = 0.1
 COARSER = 1.5  # times, from one width of cells to the next
 BATCH = 2000
@@ -41,8 +41,8 @@ class ResidualField:
     Correlation a * exp(-r / length), the exponential model of shadowing (Gudmundson 1991, Electronics Letters 27), b
     between measurements of one kind, such as those by one phone, wherever they are, and a nugget 1 - a - b for noise
     and what changes between neighbouring points. `share` a, `kind_share` b and `length_m` are common to all series and
-    have the highest marginal likelihood on at most MAX_POINTS_TO_FIT points of each. Where points are too many,
-    neighbours become their mean.
+    have the highest marginal likelihood on at most MAX_POINTS_TO_FIT points of each of at most MAX_SERIES_TO_FIT. Where
+    points are too many, neighbours become their mean.
     """
 
     def __init__(self) -> None:
@@ -63,13 +63,17 @@ class ResidualField:
         rng = np.random.default_rng(seed)
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
         numbers = np.unique(series)
-        most = int(min(MAX_POINTS, max(np.sqrt(MAX_PAIRS / max(len(numbers), 1)), MAX_POINTS_TO_FIT)))
+        most = int(np.clip(np.sqrt(MAX_PAIRS / max(len(numbers), 1)), MIN_POINTS, MAX_POINTS))
+        fitted = numbers
+        if len(numbers) > MAX_SERIES_TO_FIT:
+            fitted = np.sort(rng.choice(numbers, MAX_SERIES_TO_FIT, replace=False))
+        order = np.argsort(series, kind="stable")
         self.fields, some = {}, []
-        for number in numbers:
-            mask = series == number
+        for number, mask in zip(numbers, np.split(order, np.searchsorted(series[order], numbers[1:])), strict=True):
             points = position_m[mask], residual[mask], kind[mask]
             every = _merged(*points, SAME_POINT_M)
-            some.append(_some(every, rng))
+            if number in fitted:
+                some.append(_some(every, rng))
             self.fields[int(number)] = every if len(every.residual) <= most else _coarsened(*points, most)
         self._fit_correlation(some, len(np.unique(kind)) > 1)
         self._factor()

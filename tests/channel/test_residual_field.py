@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from radiotwin.channel import residual_field
 from radiotwin.channel.residual_field import ResidualField
 
 
@@ -57,3 +58,22 @@ def test_what_was_saved_predicts_the_same():
     again = ResidualField.from_state(*field.state())
     series, places_m, kinds = np.arange(50) % 3, place_m[:50] + 7.0, kind[:50]
     np.testing.assert_array_equal(field.predict(series, places_m, kinds), again.predict(series, places_m, kinds))
+
+
+def test_many_series_stay_within_the_memory_that_is_said(monkeypatch):
+    """200 series of 150 points on fields of 60 m: coarser than measured, fitted to some, and the length is found."""
+    monkeypatch.setattr(residual_field, "MAX_PAIRS", 200 * 70**2)
+    monkeypatch.setattr(residual_field, "MAX_SERIES_TO_FIT", 20)
+    rng = np.random.default_rng(5)
+    places_m, values = [], []
+    for _ in range(200):
+        place_m = np.column_stack([rng.uniform(0, 600, (150, 2)), np.zeros(150)])
+        apart_m = np.linalg.norm(place_m[:, None] - place_m[None], axis=2)
+        values.append(np.linalg.cholesky(np.exp(-apart_m / 60.0) + 1e-6 * np.eye(150)) @ rng.normal(size=150))
+        places_m.append(place_m)
+    field = ResidualField().fit(np.repeat(np.arange(200), 150), np.concatenate(places_m), np.concatenate(values), 0)
+    sizes = np.array([len(each.residual) for each in field.fields.values()])
+    assert len(sizes) == 200 and (sizes**2).sum() <= residual_field.MAX_PAIRS and sizes.min() > 20
+    assert field.length_m == pytest.approx(60.0, rel=0.25) and field.share > 0.9
+    mean, _ = field.predict(np.arange(200), np.array([place_m[0] for place_m in places_m]))
+    assert np.corrcoef(mean, [value[0] for value in values])[0, 1] > 0.7
