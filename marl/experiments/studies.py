@@ -170,7 +170,7 @@ def with_settings(runs: list[Run], given: list[str]) -> list[Run]:
     """
     for text in given:
         name, equals, value = text.partition("=")
-        if name in NAMING:
+        if name in NAMING or (name == "truth" and any(run.kind == "learning" for run in runs)):
             raise BadInput(f"--set {text}: the names of the runs say that, so it cannot be changed in them; choose "
                            "with --scenes, --only")
         changed = [_changed(run, name, value) if equals else None for run in runs]

@@ -153,6 +153,7 @@ def test_what_another_study_has_run_is_not_run_again(small_scene, tmp_path, caps
     (["pays", "--set", "flights=0"], ["--set flights=0", "1 or more"]),
     (["pays", "--set", "method=magic"], ["--set method=magic", "--only"]),
     (["twin", "--set", "truth=magic"], ["--set truth=magic", "traced or segmented"]),
+    (["curve", "--set", "truth=segmented"], ["--set truth=segmented", "the names of the runs say that", "--only"]),
     (["curve", "--scenes", "./nowhere"], ["nowhere", "radiotwin build-scene"]),
     (["quality", "--report", "--out", "nothing"], ["nothing/quality", "no finished run"])])
 def test_bad_input_is_one_message_and_leaves_nothing(words, parts, tmp_path, monkeypatch, capsys):
