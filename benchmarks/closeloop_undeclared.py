@@ -20,7 +20,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from radiotwin.closeloop.bases import RaytraceBase, TwinBase
+from radiotwin.closeloop.bases import TwinBase
+from radiotwin.closeloop.raytraced import RaytraceBase
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.closeloop.records import make_records
 from radiotwin.closeloop.report import make_report

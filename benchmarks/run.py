@@ -70,7 +70,8 @@ def close_loop_seconds() -> None:
     """Close the loop on one traced case; the reference is fitting the base that it starts from, once."""
     import warnings
 
-    from radiotwin.closeloop.bases import RaytraceBase, TwinBase
+    from radiotwin.closeloop.bases import TwinBase
+    from radiotwin.closeloop.raytraced import RaytraceBase
     from radiotwin.closeloop.records import make_records
     from radiotwin.closeloop.run import close_loop
     from tests.undeclared.cases import case

@@ -6,12 +6,10 @@ from typing import ClassVar
 
 import numpy as np
 import pandas as pd
-from scipy.optimize import minimize
 
 from radiotwin.channel import ChannelModel, Links, check_fit_data
 from radiotwin.channel.log_distance import LogDistance
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.closeloop.paths import COMPONENTS, paths_of
 from radiotwin.closeloop.records import Records
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
@@ -21,10 +19,6 @@ LEVEL_SPREAD_DB = 20.0
 SLOPE_SPREAD_DB = 10.0  # per decade
 ANY_LEVEL_DB = 300.0
 LOST_M = 40.0  # a device that may be that far from where it seems to be says nothing about the channel
-LEAST_HIDDEN = 30  # links without line of sight that the rest is fitted to
-REST_LOW_DB, REST_EXPONENT = -150.0, 3.0
-REST_BOUNDS = np.array([[REST_LOW_DB, 2.0], [-60.0, 6.0]])
-REST_SCALE_DB = 4.0
 
 
 class FittedBase(ABC):
@@ -80,7 +74,7 @@ class LogDistanceBase(Base):
         if np.isnan(records.device_m).any():
             assert self._scene is not None  # without one, links of devices that are nowhere have been left out
             twin = _fit_twin(records, self._scene, "log_distance", self._seed)
-            return FittedChannel(twin.channel, _located_m(twin), twin.devices)
+            return FittedChannel(twin.channel, relied_on_m(twin.devices), twin.devices)
         return _fit_channel(records, LogDistance(), self._seed)
 
 
@@ -91,90 +85,19 @@ class TwinBase(Base):
 
     def __init__(self, scene: Scene | None, seed: int):
         self._scene, self._seed = scene, seed
-        self._fitted: dict[bytes, FittedBase] = {}  # another base may ask for the same again
+        self._fitted: dict[bytes, FittedChannel] = {}  # another base may ask for the same again
 
-    def fit(self, records: Records) -> FittedBase:
+    def fit(self, records: Records) -> "FittedChannel":
         key = records.level_db.tobytes()
         if key not in self._fitted:
             self._fitted[key] = self._fit(records)
         return self._fitted[key]
 
-    def _fit(self, records: Records) -> FittedBase:
+    def _fit(self, records: Records) -> "FittedChannel":
         if self._scene is not None:
             twin = _fit_twin(records, self._scene, "segmented_log_distance", self._seed)
-            return FittedChannel(twin.channel, _located_m(twin, LOST_M), twin.devices)
+            return FittedChannel(twin.channel, relied_on_m(twin.devices, LOST_M), twin.devices)
         return _fit_channel(records, SegmentedLogDistance(), self._seed)
-
-
-class RaytraceBase(Base):
-    """Paths over the 3D map (`radiotwin.paths`), with a level of its own for each class of line of sight."""
-
-    name = "raytrace"
-
-    def __init__(self, twin: TwinBase):
-        self._twin = twin
-
-    def fit(self, records: Records) -> FittedBase:
-        law = self._twin.fit(records)
-        return FittedPaths(law, _fit_rest(records, law.device_m))
-
-
-class FittedPaths(FittedBase):
-    """Powers of paths, and of what reaches any place on ways that are not followed.
-
-    Attributes:
-        law: has the positions, and says what moving an end changes.
-        rest: power of the paths that are not followed (more bounces and edges, rough walls): gain at 100 m [dB], and
-            exponent of its fall with distance.
-    """
-
-    follows_paths = True
-
-    def __init__(self, law: FittedBase, rest: tuple[float, float]):
-        self.law, self.device_m, self.found, self.rest = law, law.device_m, law.found, rest
-
-    def mean_db(self, records: Records) -> np.ndarray:
-        return _with_rest_db(paths_of(records, COMPONENTS), records, *self.rest)
-
-    def shifted_db(self, records: Records, exact: bool = False) -> np.ndarray:
-        return self.mean_db(records) if exact else self.law.mean_db(records)
-
-    def columns(self, records: Records) -> tuple[np.ndarray, np.ndarray]:
-        los = records.los
-        return np.column_stack([los, ~los]).astype(float), np.full(2, ANY_LEVEL_DB)
-
-    def group(self, records: Records) -> np.ndarray:
-        return records.los.astype(int)
-
-
-def _with_rest_db(power: np.ndarray, records: Records, rest_db: float, exponent: float) -> np.ndarray:
-    return 10 * np.log10(power + 10 ** (rest_db / 10) * (records.distance_m / 100.0) ** -exponent)
-
-
-def _fit_rest(records: Records, device_m: np.ndarray) -> tuple[float, float]:
-    """What explains the levels of links without line of sight best, beside a level of their own."""
-    rows = np.isfinite(device_m).all(axis=1)[records.device]
-    placed = records.with_devices(np.where(np.isfinite(device_m), device_m, 0.0)).select(rows)
-    hidden = placed.select(~placed.los)
-    power = paths_of(hidden, COMPONENTS)
-    level_db = np.where(np.isnan(hidden.level_db), -np.inf if hidden.limit_db is None else hidden.limit_db,
-                        hidden.level_db)
-    blank, told = np.isnan(hidden.level_db), np.isfinite(level_db)
-    # Blanks alone say no more than that it is weak, and the least is.
-    if told.sum() < LEAST_HIDDEN or blank[told].all():
-        return REST_LOW_DB, REST_EXPONENT
-
-    def loss(numbers: np.ndarray) -> float:
-        rest_db, exponent = np.clip(numbers, *REST_BOUNDS)
-        error_db = level_db - _with_rest_db(power, hidden, rest_db, exponent)
-        error_db = error_db - np.median(error_db[told & ~blank])
-        error_db = np.where(blank, np.minimum(error_db, 0.0), error_db)[told]
-        return float(np.log1p((error_db / REST_SCALE_DB) ** 2).sum() + np.abs(numbers - [rest_db, exponent]).sum())
-
-    starts = [np.array([rest_db, REST_EXPONENT]) for rest_db in (-100.0, -110.0, -120.0, -130.0)]
-    found = minimize(loss, min(starts, key=loss), method="Nelder-Mead", options={"xatol": 0.1, "fatol": 0.5}).x
-    rest_db, exponent = np.clip(found, *REST_BOUNDS)
-    return float(rest_db), float(exponent)
 
 
 class FittedChannel(FittedBase):
@@ -205,16 +128,16 @@ def _links(records: Records) -> Links:
     return Links(records.device_m[records.device], records.receiver_m, records.los, records.device)
 
 
-def _fit_channel(records: Records, channel: ChannelModel, seed: int) -> FittedBase:
+def _fit_channel(records: Records, channel: ChannelModel, seed: int) -> FittedChannel:
     links = _links(records)
     check_fit_data(links, records.level_db, needs_los=channel.uses_map and records.city is not None)
     return FittedChannel(channel.fit(links, records.level_db, records.limit_db, seed), records.device_m)
 
 
-def _located_m(twin: Twin, lost_m: float = np.inf) -> np.ndarray:
+def relied_on_m(devices: Sequence[TwinDevice], lost_m: float = np.inf) -> np.ndarray:
     """(k, 3) positions that may be relied on: NaN where nine in ten of the guesses are farther off than `lost_m`."""
-    located = np.array([device.located and device.credible_radius_m <= lost_m for device in twin.devices])
-    return np.where(located[:, None], twin.device_m, np.nan)
+    located = np.array([device.located and device.credible_radius_m <= lost_m for device in devices])
+    return np.where(located[:, None], [(device.x_m, device.y_m, device.z_m) for device in devices], np.nan)
 
 
 def _fit_twin(records: Records, scene: Scene, model: str, seed: int) -> Twin:

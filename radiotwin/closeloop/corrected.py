@@ -6,8 +6,9 @@ import numpy as np
 
 import radiotwin
 from radiotwin.channel import ChannelModel
-from radiotwin.closeloop.bases import FittedBase, FittedChannel, FittedPaths
+from radiotwin.closeloop.bases import FittedBase, FittedChannel
 from radiotwin.closeloop.locate import Corrected, calibrated_temper, device_spread_db, whole_area
+from radiotwin.closeloop.raytraced import FittedPaths
 from radiotwin.closeloop.records import Records
 from radiotwin.closeloop.regression import Solution
 from radiotwin.closeloop.run import Loop
@@ -73,7 +74,7 @@ def corrected_map(twin: Twin, scene: Scene) -> RadioMap:
     found = twin.effects
     base: FittedBase = FittedChannel(twin.channel, twin.device_m)
     if found["base"] == "raytrace":
-        base = FittedPaths(FittedChannel(twin.channel, twin.device_m), tuple(found["rest"]))
+        base = FittedPaths(FittedChannel(twin.channel, twin.device_m), tuple(found["rest"]), twin.device_m)
     parts = [(_effect(part["name"], part["variant"]), part) for part in found["parts"]]
     shadowing = Shadowing.from_state(found["shadowing"]) if "shadowing" in found else None
     known = np.flatnonzero(np.isfinite(twin.device_m).all(axis=1))

@@ -11,9 +11,10 @@ from radiotwin.channel import Links
 from radiotwin.channel.likelihood import mean_if_detected
 from radiotwin.channel.log_distance import LogDistance
 from radiotwin.channel.regression_kriging import RegressionKriging
-from radiotwin.closeloop.bases import Base, LogDistanceBase, RaytraceBase, TwinBase
+from radiotwin.closeloop.bases import Base, LogDistanceBase, TwinBase
 from radiotwin.closeloop.between_flights import search_between_flights
 from radiotwin.closeloop.folds import Folds, make_folds
+from radiotwin.closeloop.raytraced import RaytraceBase
 from radiotwin.closeloop.records import Records, make_records
 from radiotwin.closeloop.search import Model, Search, add_shadowing, make_model, rmse_db, search_effects
 from radiotwin.closeloop.structure import Driver, find_drivers, variables

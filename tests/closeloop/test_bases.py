@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 
-from radiotwin.closeloop.bases import REST_EXPONENT, REST_LOW_DB, _fit_rest
+from radiotwin.closeloop.raytraced import REST_EXPONENT, REST_LOW_DB, _fit_rest
 from radiotwin.closeloop.records import make_records
 from radiotwin.scene.citymap import CityMap
 
