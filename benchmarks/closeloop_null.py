@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from radiotwin.closeloop.bases import TwinBase
-from radiotwin.closeloop.raytraced import RaytraceBase
 from radiotwin.closeloop.model import Side
+from radiotwin.closeloop.raytraced import RaytraceBase
 from radiotwin.closeloop.records import make_records
 from radiotwin.closeloop.regression import Solution
 from radiotwin.closeloop.run import close_loop

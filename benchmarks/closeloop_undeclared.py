@@ -21,8 +21,8 @@ import numpy as np
 import trimesh
 
 from radiotwin.closeloop.bases import TwinBase
-from radiotwin.closeloop.raytraced import RaytraceBase
 from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.raytraced import RaytraceBase
 from radiotwin.closeloop.records import make_records
 from radiotwin.closeloop.report import make_report
 from radiotwin.closeloop.run import close_loop
