@@ -23,6 +23,7 @@ from radiotwin.twin import TwinDevice
 
 LINKS = 150  # of a device, about
 LEAST_LINKS = 30
+MOST_DEVICES = 30  # of unknown position; each takes some ten seconds
 CELL_M, CELLS_APART_M = 7.0, 9.0
 LEAST_REACH_M = 70.0
 REACH_RADII, MOST_RADIUS_M = 1.5, 100.0  # of the law's circle; a wider one is not searched
@@ -42,17 +43,19 @@ class Relocation:
     """What was followed is remembered for other parts of the same links.
 
     Attributes:
-        above: of each device: a link takes part if its place's number is above that, in all parts of the links alike.
-        powers: city, device's place -> power by the number of the other end.
+        least: of each device: the least number of a link's place to take part, in all parts of the links.
         places: where each device was found before, which is worth a look with other links, too.
+        powers: city, device's place -> power by the number of the other end.
     """
 
-    above: dict[str, np.uint64] = field(default_factory=dict)
+    least: dict[str, np.uint64] = field(default_factory=dict)
     places: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     powers: dict[tuple, dict[int, float]] = field(default_factory=dict)
 
     def devices(self, records: Records, law: FittedBase, base: FittedBase, level_db: LevelOf) -> list[TwinDevice]:
         """The devices of a law, unknown ones where paths put them if these explain their links better than the law.
+
+        Where they are too many, all stay.
 
         Args:
             records: n links over a map.
@@ -60,6 +63,8 @@ class Relocation:
             base: follows paths.
             level_db: of the base.
         """
+        if sum(device.role == "unknown" for device in law.found) > MOST_DEVICES:
+            return list(law.found)
         everything = np.ones(len(records), dtype=bool)
         sides = [Side.make(records, everything, each, DOF) for each in (law, base)]
         fits = [side.fit() for side in sides]
@@ -79,9 +84,9 @@ class Relocation:
         rows = np.flatnonzero(records.device == device)
         numbers = _numbers(records.receiver_m[rows])
         name = records.device_names[device]
-        if name not in self.above:
-            self.above[name] = np.sort(numbers)[-LINKS] if len(rows) > LINKS else np.uint64(0)
-        return rows[numbers >= self.above[name]]
+        if name not in self.least:
+            self.least[name] = np.sort(numbers)[-LINKS] if len(rows) > LINKS else np.uint64(0)
+        return rows[numbers >= self.least[name]]
 
     def _follow(self, city: CityMap, place_m: tuple[float, float, float], ends_m: np.ndarray,
                 frequency_hz: float) -> np.ndarray:
