@@ -93,12 +93,12 @@ class Relocation:
         """(n,) power from a place to ends (n, 3)."""
         known = self.powers.setdefault((id(city), place_m), {})
         numbers = _numbers(ends_m).tolist()
-        missing = [row for row, number in enumerate(numbers) if number not in known]
+        missing = {number: row for row, number in enumerate(numbers) if number not in known}
         if missing:
-            new_m = ends_m[missing]
+            new_m = ends_m[list(missing.values())]
             followed = path_powers(city, np.array([place_m]), new_m, np.zeros(len(new_m), int), frequency_hz,
                                    "vertical")
-            known.update(zip((numbers[row] for row in missing), followed.total.tolist()))
+            known.update(zip(missing, followed.total.tolist()))
         return np.array([known[number] for number in numbers])
 
 
