@@ -17,8 +17,9 @@ from radiotwin.scene import Scene
 from radiotwin.survey.campaign import declared_devices, heading_deg, link_table
 from radiotwin.twin import Twin, fit_twin
 
-TWINS = {"nn": "segmented_nn", "log-distance": "log_distance", "kriging": "regression_kriging"}
-"""Name of a twin on the command line -> channel model."""
+TWINS = {"nn": "segmented_nn", "log-distance": "log_distance", "kriging": "regression_kriging",
+         "raytrace": "raytrace"}
+"""Name of a twin on the command line -> model of `fit_twin`."""
 
 
 @dataclass

@@ -26,7 +26,8 @@ from radiotwin.progress import progress
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 
-TRAINED_IN = {"nn": "NN twin", "log-distance": "log-distance twin", "kriging": "kriging twin", "truth": "the truth"}
+TRAINED_IN = {"nn": "NN twin", "log-distance": "log-distance twin", "kriging": "kriging twin",
+              "raytrace": "ray-traced twin", "truth": "the truth"}
 
 
 @dataclass(frozen=True)

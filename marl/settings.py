@@ -65,8 +65,9 @@ class RunSettings(BaseModel):
     scene: Path = Field(Path("scenes/rbm"), description="scene folder")
     truth: Literal["traced", "segmented"] = Field(
         "traced", description="what real flights meet: SCENE/truth.nc, or the statistical truth of the paper")
-    twin: Literal["nn", "log-distance", "kriging", "truth"] = Field(
-        "nn", description="channel model of the twin that is trained in; truth: a perfect twin, no flight is needed")
+    twin: Literal["nn", "log-distance", "kriging", "raytrace", "truth"] = Field(
+        "nn", description="model of the twin that is trained in; raytrace: paths over the 3D map, minutes a round; "
+        "truth: a perfect twin, no flight is needed")
     twin_shadowing: Literal["fitted", "slot"] = Field(
         "fitted", description="how long a simulated flight is off the twin's map by the same: as its errors say, or "
         "for a slot; preset paper: slot")

@@ -101,7 +101,7 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene, truth:
         scene: where both were measured; its devices' true positions are used to judge, never to learn.
         truth: the whole map to judge on, too, where there is one.
         seed: of all fits.
-        models: keys of `radiotwin.channel.MODELS`.
+        models: of `fit_twin`.
         twins: fitted already, judged beside the models, by the name that they get in the tables.
         maps: made already, judged on the truth map.
 
@@ -171,8 +171,7 @@ def predict(twin: Twin, scene: Scene, measurements: Measurements) -> np.ndarray:
     row = np.array([row_of.get(name, -1) for name in measurements.devices["device"]])[measurements.device_index]
     predicted_db = np.full(len(row), np.nan)
     if (row >= 0).any():
-        links = twin.links(measurements.receiver_m[row >= 0], row[row >= 0], scene.city)
-        mean_db, sigma_db = twin.channel.predict(links)
+        mean_db, sigma_db, _ = twin.predictor(scene)(measurements.receiver_m[row >= 0], row[row >= 0])
         limit_db = -np.inf if twin.limit_db is None else twin.limit_db
         predicted_db[row >= 0] = mean_if_detected(mean_db, sigma_db, limit_db)
     return predicted_db

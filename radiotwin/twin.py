@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -10,7 +11,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 import radiotwin
-from radiotwin.channel import MODELS, ChannelModel, Links, check_fit_data, load_channel, make_links, save_channel
+from radiotwin.channel import MODELS, ChannelModel, check_fit_data, load_channel, make_links, save_channel
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, require_writable
 from radiotwin.localize import LocalizeSettings, localize
@@ -18,13 +19,17 @@ from radiotwin.measurements import Measurements
 from radiotwin.progress import progress
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
-from radiotwin.scene.citymap import CityMap
 
 SCHEMA = "radiotwin.twin/1"
 CHANNEL_FILE = "channel.safetensors"
+RAYTRACE = "raytrace"  # a model that is not of distance, elevation and line of sight alone
 TWIN_FILES = {"twin.json", CHANNEL_FILE, "report.html"}  # the last one is what `radiotwin report` makes of the others
 MAP_CHUNK = 200_000  # links predicted at once
 FEW_BLANK, LIMIT_GAP_DB = 0.02, 10.0  # from which on blanks and the limit of detection are said not to fit together
+
+
+Predictor = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""See `Twin.predictor`."""
 
 
 @dataclass(frozen=True)
@@ -110,9 +115,24 @@ class Twin:
         """(k, 3) positions [m]; NaN where a device could not be located."""
         return np.array([(d.x_m, d.y_m, d.z_m) for d in self.devices], dtype=float).reshape(-1, 3)
 
-    def links(self, receiver_m: np.ndarray, device: np.ndarray, city: CityMap | None) -> Links:
-        """Links between receivers (n, 3) and the twin's devices (n,) at the positions that the twin knows."""
-        return make_links(self.device_m, receiver_m, device, city)
+    def predictor(self, scene: Scene) -> "Predictor":
+        """What tells the links between receivers (n, 3) and the twin's devices (n,), where it has them in a scene.
+
+        Returns:
+            receivers [m], indices of devices -> mean and standard deviation of the level [dB] (n,), also below what is
+            detected, and whether there is line of sight (n,)
+        """
+        if self.effects:
+            # Effects are built upon the twin, and only they know what they do; a twin without them would be wrong.
+            from radiotwin.closeloop.corrected import corrected_predictor
+
+            return corrected_predictor(self, scene)
+
+        def predict(receiver_m: np.ndarray, device: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            links = make_links(self.device_m, receiver_m, device, scene.city)
+            return *self.channel.predict(links), links.los
+
+        return predict
 
     def radio_map(self, scene: Scene) -> RadioMap:
         """Mean and standard deviation of the level over a scene's lattice, for all devices that have a position.
@@ -123,11 +143,7 @@ class Twin:
         if self.provenance.get("scene_hash", scene_hash) != scene_hash:
             warnings.warn(f"the twin was learnt in another scene ({self.provenance.get('scene')}) than {scene.folder}, "
                           "or this one has changed since: geometry, radio or declared devices differ", stacklevel=2)
-        if self.effects:
-            # Effects are built upon the twin, and only they know what they do; a map without them would be wrong.
-            from radiotwin.closeloop.corrected import corrected_map
-
-            return corrected_map(self, scene)
+        predict = self.predictor(scene)
         known = np.flatnonzero(np.isfinite(self.device_m).all(axis=1))
         receiver_m = scene.lattice.positions_m
         shape = (len(known), len(receiver_m))
@@ -137,17 +153,22 @@ class Twin:
                 for start in range(0, len(receiver_m), MAP_CHUNK):
                     part = slice(start, start + MAP_CHUNK)
                     ends = receiver_m[part]
-                    links = self.links(ends, np.full(len(ends), device), scene.city)
-                    mean_db[row, part], sigma_db[row, part] = self.channel.predict(links)
-                    los[row, part] = links.los
+                    mean_db[row, part], sigma_db[row, part], los[row, part] = predict(ends, np.full(len(ends), device))
                 advance(1)
         if self.level == "rssi_dbm":
             mean_db -= scene.config.radio.tx_power_dbm
-        attributes = {"source": f"twin:{self.channel.name}", "frequency_hz": scene.config.radio.frequency_hz,
+        attributes = {"source": f"twin:{self._described()}", "frequency_hz": scene.config.radio.frequency_hz,
                       "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene_hash,
                       "radiotwin_version": radiotwin.__version__}
         names = [self.devices[i].device for i in known]
         return RadioMap.build(names, scene.lattice, mean_db, los, sigma_db, attributes)
+
+    def _described(self) -> str:
+        if not self.effects:
+            return self.channel.name
+        from radiotwin.closeloop.corrected import described
+
+        return described(self)
 
     def save(self, folder: Path | str) -> None:
         """Write the twin's folder, whole or not at all.
@@ -206,16 +227,26 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
     Args:
         measurements: links to anchors and unknown devices.
         scene: its map and extent, and the receivers' sensitivity.
-        model: a key of `radiotwin.channel.MODELS`.
+        model: a key of `radiotwin.channel.MODELS`, or `raytrace`: paths over the 3D map, see
+            `radiotwin.closeloop.corrected.raytraced_twin`.
         seed: of the channel's and the search's random numbers.
         start: an earlier twin; the search also starts from its positions.
         allow_indoor: whether unknown devices may be inside buildings.
 
     Raises:
-        BadInput: no anchor, nothing detected, or links that no channel can be learned from.
+        BadInput: no anchor, nothing detected, links that no channel can be learned from, or devices that may be
+            indoors with `raytrace`.
     """
+    if model == RAYTRACE:
+        if allow_indoor:
+            raise BadInput(f"model {RAYTRACE} follows paths outside buildings only; take another model where unknown "
+                           "devices may be indoors")
+        # Built upon a law that is fitted here, and so imported late.
+        from radiotwin.closeloop.corrected import raytraced_twin
+
+        return raytraced_twin(measurements, scene, seed, start)
     if model not in MODELS:
-        raise BadInput(f"channel model {model!r} is unknown; allowed are {', '.join(MODELS)}")
+        raise BadInput(f"channel model {model!r} is unknown; allowed are {', '.join((*MODELS, RAYTRACE))}")
     _check_positions(measurements, scene)
     level = measurements.level_column
     radio = scene.config.radio

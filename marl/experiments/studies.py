@@ -13,6 +13,7 @@ from radiotwin.errors import BadInput
 
 TRUTHS = ("traced", "segmented")
 FLIGHTS = (1, 2, 3, 5, 10)  # real episodes that a twin is learnt from
+FEW_FLIGHTS = (1, 5)  # where that takes minutes
 SCENARIOS = ("nominal", "volumes", "positions", "loss", "everything")
 NAMING = ("scene", "twin", "model", "scenario", "method", "algorithm")  # what the names of runs say
 
@@ -43,6 +44,9 @@ def curve(scenes: list[str], seeds: int) -> list[Run]:
                          learning(algorithm="iql", twin="truth", **here), learning(algorithm="planner", **here)]
                 runs += [learning(algorithm=name, twin="truth", real_episodes=1, flights=64, **here)
                          for name in ("greedy", "random")]
+                if truth == "traced":  # in the statistical one there are no paths to follow
+                    runs += [learning(algorithm="planner", twin="raytrace", real_episodes=1, **here),
+                             learning(algorithm="fedqmix", twin="raytrace", real_episodes=1, episodes=8000, **here)]
     return runs
 
 
@@ -67,22 +71,23 @@ def federation(scenes: list[str], seeds: int) -> list[Run]:
 
 
 def twin(scenes: list[str], seeds: int) -> list[Run]:
-    """Which twin to train in: the same five real flights, five twins, one learner, flown in the ray-traced truth."""
+    """Which twin to train in: the same five real flights, six twins, one learner, flown in the ray-traced truth."""
     return [Run("twin", f"{label(scene)}-{name}", "trained in",
                 {"scene": scene, "truth": "traced", "twin": name, "survey_flights": 5, "noise_db": 1.0,
                  "episodes": 4000, "learner": learner(epsilon_slots=87_500), "planner_iterations": 60_000,
                  "flights": 64, "replayed_flights": 20}, seed)
             for seed in range(seeds) for scene in scenes
-            for name in ("nn", "segmented", "log-distance", "truth", "corrected")]
+            for name in ("nn", "segmented", "log-distance", "truth", "raytrace", "corrected")]
 
 
 def quality(scenes: list[str], seeds: int) -> list[Run]:
     """Map and positions against the number of real episodes."""
     return [Run("quality", f"{label(scene)}-{model}", "twin quality",
-                {"scene": scene, "truth": "traced", "model": model, "survey_flights": list(FLIGHTS), "noise_db": 1.0},
+                {"scene": scene, "truth": "traced", "model": model, "survey_flights": list(flights), "noise_db": 1.0},
                 seed)
             for seed in range(seeds) for scene in scenes
-            for model in ("segmented_nn", "log_distance", "regression_kriging")]
+            for model, flights in (("segmented_nn", FLIGHTS), ("log_distance", FLIGHTS),
+                                   ("regression_kriging", FLIGHTS), ("raytrace", FEW_FLIGHTS))]
 
 
 def pays(scenes: list[str], seeds: int) -> list[Run]:

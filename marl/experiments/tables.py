@@ -18,14 +18,17 @@ from marl.settings import LearnerSettings, RunSettings
 
 LABELS = {"fedqmix-nn": "model-aided FedQMIX", "qmix-nn": "model-aided QMIX",
           "qmix-log-distance": "model-aided QMIX, log-distance twin", "qmix-truth": "QMIX on real episodes",
-          "iql-truth": "IQL on real episodes", "planner-nn": "planner in the NN twin",
+          "fedqmix-raytrace": "FedQMIX, ray-traced twin", "iql-truth": "IQL on real episodes",
+          "planner-nn": "planner in the NN twin", "planner-raytrace": "planner in the ray-traced twin",
           "greedy": "greedy, distinct targets, true positions", "random": "random"}
 LEVELS = ("greedy", "random")
 PUBLISHED = {("rbm", 5): "15 m; 10 % above 100 m", ("rbm", 1): "22 m; 38 % above 100 m"}
 """Median error of positions of the published code, as (scene, real episodes)."""
 TWINS = {"nn": "segmented network (NN)", "segmented": "segmented log-distance", "log-distance": "log-distance",
-         "corrected": "corrected (after `close-loop`)", "truth": "the truth"}
-MODELS = {"segmented_nn": "NN", "log_distance": "log-distance", "regression_kriging": "kriging"}
+         "raytrace": "ray-traced (paths over the map)", "corrected": "corrected (after `close-loop`)",
+         "truth": "the truth"}
+MODELS = {"segmented_nn": "NN", "log_distance": "log-distance", "regression_kriging": "kriging",
+          "raytrace": "ray-traced twin"}
 METHODS = {"plan": "open-loop plan", "replan": "re-planning, link", "replan-no-link": "re-planning, no link",
            "policy": "policy, link", "policy-no-link": "policy, no link", "taught": "policy taught by the plan, link",
            "taught-no-link": "the same, no link", "greedy": "greedy"}
@@ -72,7 +75,7 @@ def factors(curves: dict, target: float) -> str:
     """How many times as many real episodes QMIX needs without a twin."""
     real = curves["qmix-truth"].needed(target) if "qmix-truth" in curves else np.nan
     told = []
-    for name in ("fedqmix-nn", "qmix-nn", "qmix-log-distance", "planner-nn"):
+    for name in ("fedqmix-nn", "qmix-nn", "qmix-log-distance", "fedqmix-raytrace", "planner-nn", "planner-raytrace"):
         if name in curves and real == real:
             aided = curves[name].needed(target)
             told.append(f"{LABELS[name]} {aided:.0f} (a factor of {real / aided:,.0f})" if aided == aided else

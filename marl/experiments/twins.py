@@ -26,8 +26,9 @@ from radiotwin.scene import Scene
 from radiotwin.survey import fly_survey
 from radiotwin.twin import Twin, fit_twin
 
-MODELS = {"nn": "segmented_nn", "segmented": "segmented_log_distance", "log-distance": "log_distance"}
-"""Name of a twin in the study -> channel model; `corrected` and `truth` besides."""
+MODELS = {"nn": "segmented_nn", "segmented": "segmented_log_distance", "log-distance": "log_distance",
+          "raytrace": "raytrace"}
+"""Name of a twin in the study -> model of `fit_twin`; `corrected` and `truth` besides."""
 SAMPLES = 10  # times that a sequence of actions is flown in a twin, whose shadowing differs from time to time
 
 
@@ -35,7 +36,7 @@ def judge_twin(settings: dict, seed: int, folder: Path, keep: Callable[[], None]
     """Learn a twin from more and more real flights, and hold it against the truth.
 
     Args:
-        settings: `scene`, `truth`, `model` (of `radiotwin.channel.MODELS`), `survey_flights` (how many, a list),
+        settings: `scene`, `truth`, `model` (of `fit_twin`), `survey_flights` (how many, a list),
             `noise_db`.
         seed: of flights, noise and fit.
         folder, keep: not used; a run takes a minute.

@@ -29,7 +29,8 @@ def fit(
     scene: SceneOption,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the twin.")] = Path("twin"),
     model: Annotated[str, typer.Option(
-        help="segmented_nn, segmented_log_distance, log_distance or regression_kriging.")] = "segmented_nn",
+        help="segmented_nn, segmented_log_distance, log_distance, regression_kriging, or raytrace: paths over the 3D "
+             "map, also to find devices in narrow streets; takes minutes.")] = "segmented_nn",
     devices: Annotated[Path | None, typer.Option(help="Table of devices [devices.csv beside the file].")] = None,
     start: Annotated[Path | None, typer.Option(help="An earlier twin, to start the search from.")] = None,
     allow_indoor: Annotated[bool, typer.Option("--allow-indoor", help="Unknown devices may be inside buildings.")
@@ -124,18 +125,22 @@ def compare(
         help="Judge on a whole map, too: traced (SCENE/truth.nc), segmented, or a radio map.")] = None,
     held_out: Annotated[int, typer.Option(help="Flights, the last ones, that no model is fitted to.")] = 1,
     devices: Annotated[Path | None, typer.Option(help="Table of devices [devices.csv beside the file].")] = None,
+    raytrace: Annotated[bool, typer.Option(
+        "--raytrace", help="Judge the model raytrace, too: paths over the 3D map. Takes minutes.")] = False,
     also: Annotated[list[Path] | None, typer.Option(
         help="A twin's folder, or (with --truth) a radio map, to be judged beside the models; may be repeated.")
         ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the fits and the search.")] = 0,
 ) -> None:
     """Hold all channel models against flights they have not seen, and against the truth map where there is one."""
+    from radiotwin.channel import MODELS
     from radiotwin.cli.world import read_truth
     from radiotwin.compare import compare_models, split_flights
     from radiotwin.comparison_output import judge_also, write_comparison
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
     from radiotwin.scene import Scene
+    from radiotwin.twin import RAYTRACE
 
     show_warnings_plainly()
     require_writable(out / "compare.json")
@@ -143,7 +148,8 @@ def compare(
     train, test = split_flights(read_measurements(measurements, devices), held_out)
     truth_map = read_truth(world, truth) if truth else None
     twins, maps = judge_also(also or [], truth_map, test.flights)
-    comparison = compare_models(train, test, world, truth_map, seed=seed, twins=twins, maps=maps)
+    models = (*MODELS, *[RAYTRACE] * raytrace)
+    comparison = compare_models(train, test, world, truth_map, seed=seed, models=models, twins=twins, maps=maps)
     write_comparison(comparison, world, truth_map, out)
     print_comparison(comparison)
     say(f"wrote {out}")

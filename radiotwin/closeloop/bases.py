@@ -84,7 +84,7 @@ class TwinBase(Base):
     name = "twin"
 
     def __init__(self, scene: Scene | None, seed: int):
-        self._scene, self._seed = scene, seed
+        self.scene, self._seed = scene, seed
         self._fitted: dict[bytes, FittedChannel] = {}  # another base may ask for the same again
 
     def fit(self, records: Records) -> "FittedChannel":
@@ -94,8 +94,8 @@ class TwinBase(Base):
         return self._fitted[key]
 
     def _fit(self, records: Records) -> "FittedChannel":
-        if self._scene is not None:
-            twin = _fit_twin(records, self._scene, "segmented_log_distance", self._seed)
+        if self.scene is not None:
+            twin = _fit_twin(records, self.scene, "segmented_log_distance", self._seed)
             return FittedChannel(twin.channel, relied_on_m(twin.devices, LOST_M), twin.devices)
         return _fit_channel(records, SegmentedLogDistance(), self._seed)
 

@@ -1,25 +1,28 @@
-"""The twin with what the loop found in it: saved in `twin.json`, and applied wherever the twin predicts a map."""
+"""Twins that are more than a channel: with what the loop found, or with paths over the map. Saved in `twin.json`, and
+applied wherever the twin predicts a map."""
 
+import warnings
 from typing import Any
 
 import numpy as np
 
 import radiotwin
 from radiotwin.channel import ChannelModel
-from radiotwin.closeloop.bases import FittedBase, FittedChannel
+from radiotwin.closeloop.bases import FittedBase, FittedChannel, TwinBase
 from radiotwin.closeloop.locate import Corrected, calibrated_temper, device_spread_db, whole_area
-from radiotwin.closeloop.raytraced import FittedPaths
-from radiotwin.closeloop.records import Records
-from radiotwin.closeloop.regression import Solution
+from radiotwin.closeloop.model import Side
+from radiotwin.closeloop.raytraced import FittedPaths, RaytraceBase
+from radiotwin.closeloop.records import Records, make_records
+from radiotwin.closeloop.regression import Solution, nll
 from radiotwin.closeloop.run import Loop
+from radiotwin.closeloop.search import best_dof
 from radiotwin.closeloop.shadowing import Shadowing
 from radiotwin.effects import CATALOGUE
 from radiotwin.effects.base import Effect
 from radiotwin.errors import BadInput
-from radiotwin.progress import progress
-from radiotwin.radiomap import RadioMap
+from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
-from radiotwin.twin import Twin, TwinDevice
+from radiotwin.twin import Predictor, Twin, TwinDevice
 
 CHUNK = 20_000  # links at once
 
@@ -30,7 +33,47 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     What belongs to a receiver (its offset, drift, antenna, …) is kept in the record, too, but a map is of what arrives
     at a faultless receiver.
     """
-    whole, fit = loop.after.whole, loop.after.fits[0]
+    more: dict[str, Any] = {"temper": _temper(loop)}
+    if loop.after.shadowing:
+        more["shadowing"] = loop.after.shadowing[0].state()
+    return _twin(loop.base, loop.after.whole, loop.after.fits[0], scene, more)
+
+
+def raytraced_twin(measurements: Measurements, scene: Scene, seed: int, start: Twin | None = None) -> Twin:
+    """The twin that predicts by paths over the 3D map, with unknown devices where these explain the levels best.
+
+    What these paths do not tell is learnt: a level for each class of line of sight, what reaches any place on ways that
+    are not followed, and the errors' sizes.
+
+    Args:
+        measurements: links to anchors and unknown devices.
+        scene: its map and materials.
+        seed: of the search by a law, which says where it is worth following paths.
+        start: an earlier twin; what it was sure of is looked for around there only.
+
+    Warns where paths explain the levels worse than the law.
+
+    Raises:
+        BadInput: no anchor, too few links, or links that nothing can be learned from.
+    """
+    records = make_records(measurements, scene)
+    for remark in records.remarks:
+        warnings.warn(remark, stacklevel=3)
+    law = TwinBase(scene, seed)
+    base = RaytraceBase(law, start, most_radius_m=np.inf).fit(records)
+    dof, everything = best_dof(records, base), np.ones(len(records), dtype=bool)
+    by_paths, by_law = (Side.make(records, everything, each, dof) for each in (base, law.fit(records)))
+    both = by_paths.usable & by_law.usable
+    if nll(by_paths.problem(both), by_paths.fit()).sum() > nll(by_law.problem(both), by_law.fit()).sum():
+        warnings.warn("paths over the 3D map explain these levels worse than a law of distance and line of sight does: "
+                      "is the map, with its materials, that of the place, and in the same frame? Otherwise take the "
+                      "model segmented_nn", stacklevel=3)
+    twin = _twin(RaytraceBase.name, by_paths, by_paths.fit(), scene, {"temper": 1.0})
+    twin.provenance.update(flights=measurements.flights, seed=seed)
+    return twin
+
+
+def _twin(base: str, whole: Side, fit: Solution, scene: Scene | None, more: dict[str, Any]) -> Twin:
     records, law = whole.records, whole.base
     split = whole.base_columns.shape[1]
     parts = [{"name": part.effect.name, "variant": part.effect.variant, "setting": part.setting,
@@ -39,14 +82,12 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     # Also devices whose place is too unsure to be learned from: a map with them is better than one without.
     devices = list(law.found) or [TwinDevice(name, float(x_m), float(y_m), float(z_m), "anchor", True, 0.0, None)
                                   for name, (x_m, y_m, z_m) in zip(records.device_names, law.device_m)]
-    effects = {"base": loop.base, "coefficients": fit.coefficients[:split].tolist(), "dof": whole.dof,
+    effects = {"base": base, "coefficients": fit.coefficients[:split].tolist(), "dof": whole.dof,
                "scale_db": fit.scale_db.tolist(), "receivers": records.receiver_names, "parts": parts,
                "first_s": None if np.isnan(records.first_s) else records.first_s,
-               "device_spread_db": device_spread_db(whole, fit), "temper": _temper(loop)}
+               "device_spread_db": device_spread_db(whole, fit)} | more
     if isinstance(law, FittedPaths):
         effects["rest"] = list(law.rest)
-    if loop.after.shadowing:
-        effects["shadowing"] = loop.after.shadowing[0].state()
     provenance = {"links": len(records), "radiotwin_version": radiotwin.__version__}
     if scene is not None:
         provenance |= {"scene": scene.config.name, "scene_hash": scene.content_hash()}
@@ -64,8 +105,8 @@ def _temper(loop: Loop) -> float:
     return calibrated_temper(models, held_out, whole_area(models[0], records), 0)
 
 
-def corrected_map(twin: Twin, scene: Scene) -> RadioMap:
-    """What a twin with effects predicts over a scene's lattice.
+def corrected_predictor(twin: Twin, scene: Scene) -> Predictor:
+    """What a twin with effects expects of links in a scene, at receivers without faults of their own.
 
     Raises:
         BadInput: effects that this version does not know, or a twin that was made without a 3D map.
@@ -73,36 +114,35 @@ def corrected_map(twin: Twin, scene: Scene) -> RadioMap:
     _require_same_map(twin, scene)
     found = twin.effects
     base: FittedBase = FittedChannel(twin.channel, twin.device_m)
-    if found["base"] == "raytrace":
+    if found["base"] == RaytraceBase.name:
         base = FittedPaths(FittedChannel(twin.channel, twin.device_m), tuple(found["rest"]), twin.device_m)
+    coefficients, error_db = np.array(found["coefficients"]), np.array(found["scale_db"])
+    deviation_db = error_db * np.sqrt(found["dof"] / (found["dof"] - 2))
     parts = [(_effect(part["name"], part["variant"]), part) for part in found["parts"]]
     shadowing = Shadowing.from_state(found["shadowing"]) if "shadowing" in found else None
-    known = np.flatnonzero(np.isfinite(twin.device_m).all(axis=1))
-    receiver_m = scene.lattice.positions_m
-    shape = (len(known), len(receiver_m))
-    mean_db, sigma_db, los = np.empty(shape), np.empty(shape), np.empty(shape, dtype=bool)
-    scale_db = np.array(found["scale_db"]) * np.sqrt(found["dof"] / (found["dof"] - 2))
-    with progress("mapping", total=len(known)) as advance:
-        for row, device in enumerate(known):
-            for start in range(0, len(receiver_m), CHUNK):
-                place = slice(start, start + CHUNK)
-                records = _records(twin, scene, receiver_m[place], int(device))
-                group = base.group(records)
-                mean_db[row, place] = _mean_db(base, records, np.array(found["coefficients"]), parts)
-                sigma_db[row, place] = scale_db[group]
-                if shadowing is not None and shadowing.receivers_move:
-                    shift, left = shadowing.at(records)
-                    mean_db[row, place] += shift * np.array(found["scale_db"])[group]
-                    sigma_db[row, place] *= left
-                los[row, place] = records.los
-            advance(1)
-    if twin.level == "rssi_dbm":
-        mean_db -= scene.config.radio.tx_power_dbm
-    names = [part["name"] for part in found["parts"]] + ["correlated_shadowing"] * (shadowing is not None)
-    attributes = {"source": f"twin:{found['base']} with {', '.join(names) or 'nothing'}",
-                  "frequency_hz": scene.config.radio.frequency_hz, "gain_limit_db": scene.config.gain_limit_db,
-                  "scene_hash": scene.content_hash(), "radiotwin_version": radiotwin.__version__}
-    return RadioMap.build([twin.devices[i].device for i in known], scene.lattice, mean_db, los, sigma_db, attributes)
+
+    def predict(receiver_m: np.ndarray, device: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        chunks = [slice(start, start + CHUNK) for start in range(0, max(len(device), 1), CHUNK)]
+        told = [predict_some(_records(twin, scene, receiver_m[chunk], device[chunk])) for chunk in chunks]
+        mean_db, sigma_db, los = (np.concatenate(values) for values in zip(*told))
+        return mean_db, sigma_db, los
+
+    def predict_some(records: Records) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        group = base.group(records)
+        mean_db, sigma_db = _mean_db(base, records, coefficients, parts), deviation_db[group]
+        if shadowing is not None and shadowing.receivers_move:
+            shift, left = shadowing.at(records)
+            mean_db, sigma_db = mean_db + shift * error_db[group], sigma_db * left
+        return mean_db, sigma_db, records.los
+
+    return predict
+
+
+def described(twin: Twin) -> str:
+    """The base and the effects of a twin in a few words."""
+    names = [part["name"] for part in twin.effects["parts"]]
+    names += ["correlated_shadowing"] * ("shadowing" in twin.effects)
+    return f"{twin.effects['base']} with {', '.join(names) or 'nothing'}"
 
 
 def corrected_model(twin: Twin, scene: Scene | None) -> Corrected:
@@ -122,7 +162,8 @@ def corrected_model(twin: Twin, scene: Scene | None) -> Corrected:
                        "measurements of devices whose positions are known")
     if found["base"] == "raytrace":
         raise BadInput("the twin's base is 'raytrace', and to follow paths from every place where a device may be "
-                       "takes too long; close the loop with --base twin")
+                       "takes too long; `radiotwin fit --model raytrace` finds devices along with the twin, and "
+                       "close-loop --base twin makes one for locate")
     _require_same_map(twin, scene)
     parts = [(_effect(part["name"], part["variant"]), part) for part in found["parts"]]
     coefficients = np.concatenate([found["coefficients"], *(part["coefficients"] for _, part in parts)])
@@ -160,12 +201,12 @@ def _mean_db(base: FittedBase, records: Records, coefficients: np.ndarray,
     return level_db + gain_db
 
 
-def _records(twin: Twin, scene: Scene, receiver_m: np.ndarray, device: int) -> Records:
+def _records(twin: Twin, scene: Scene, receiver_m: np.ndarray, device: np.ndarray) -> Records:
     """Links of nobody in particular: no receiver, no flight, no time."""
     n = len(receiver_m)
     nobody, unknown = np.full(n, -1), np.full(n, np.nan)
     anchors = frozenset(i for i, known in enumerate(twin.devices) if known.role == "anchor")
-    return Records(unknown, twin.limit_db, receiver_m, np.nan_to_num(twin.device_m), np.full(n, device), nobody, nobody,
+    return Records(unknown, twin.limit_db, receiver_m, np.nan_to_num(twin.device_m), device, nobody, nobody,
                    unknown, unknown, [known.device for known in twin.devices], [], [],
                    scene.config.radio.frequency_hz, scene.city, twin.level == "gain_db", anchors)
 

@@ -17,22 +17,36 @@ from radiotwin.closeloop.bases import (
 from radiotwin.closeloop.paths import COMPONENTS, paths_of
 from radiotwin.closeloop.records import Records
 from radiotwin.closeloop.relocation import Relocation
-from radiotwin.twin import TwinDevice
+from radiotwin.twin import Twin, TwinDevice
 
 LEAST_HIDDEN = 30  # links without line of sight that the rest is fitted to
 REST_LOW_DB, REST_EXPONENT = -150.0, 3.0
 REST_BOUNDS = np.array([[REST_LOW_DB, 2.0], [-60.0, 6.0]])
 REST_SCALE_DB = 4.0
+MOST_RADIUS_M = 100.0
+SURE_M = 15.0  # radius of a device of an earlier twin that is not looked for everywhere again
 
 
 class RaytraceBase(Base):
     """Paths over the 3D map (`radiotwin.paths`), with a level of its own for each class of line of sight, and unknown
-    devices where they explain the levels best."""
+    devices where they explain the levels best.
+
+    Args:
+        twin: says where it is worth looking for them.
+        start: an earlier twin; devices that it is sure of are looked for around its place, and the law's, only.
+        most_radius_m: devices stay where the law has them if it is less sure. In the loop one that is surely somewhere
+            else, because of what the map lacks, would be taken for an effect.
+    """
 
     name = "raytrace"
 
-    def __init__(self, twin: TwinBase):
-        self._twin, self._relocation = twin, Relocation()
+    def __init__(self, twin: TwinBase, start: Twin | None = None, most_radius_m: float = MOST_RADIUS_M):
+        sure = [device for device in start.devices if device.role == "unknown" and device.located
+                and device.credible_radius_m <= SURE_M] if start else []
+        self._twin = twin
+        assert twin.scene is not None
+        places = {device.device: [(device.x_m, device.y_m)] for device in sure}
+        self._relocation = Relocation(twin.scene.config.extent.bounds, most_radius_m, places=places)
 
     def fit(self, records: Records) -> FittedBase:
         law = self._twin.fit(records)

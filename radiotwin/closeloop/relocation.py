@@ -18,6 +18,7 @@ from radiotwin.closeloop.records import Records
 from radiotwin.closeloop.regression import Problem, Solution, expect, nll, residual_db
 from radiotwin.effects.base import View
 from radiotwin.paths import path_powers
+from radiotwin.progress import progress
 from radiotwin.scene.citymap import CityMap
 from radiotwin.twin import TwinDevice
 
@@ -25,11 +26,12 @@ LINKS = 150  # of a device, about
 LEAST_LINKS = 30
 MOST_DEVICES = 30  # of unknown position; each takes some ten seconds
 CELL_M, CELLS_APART_M = 7.0, 9.0
-LEAST_REACH_M = 70.0
-REACH_RADII, MOST_RADIUS_M = 1.5, 100.0  # of the law's circle; a wider one is not searched
+MOST_CELLS = 4000  # or wider ones
+LEAST_REACH_M, REACH_RADII = 70.0, 1.5  # of the law's circle
 FOLLOWED_SHARE, LEAST_FOLLOWED, MOST_FOLLOWED = 0.12, 16, 40  # of the cells
 DESCENTS, DESCENTS_APART_M = 2, 15.0
 STEPS_M = (4.0, 2.0, 1.0)
+AROUND_M = (14.0, 7.0)  # where a descent has ended it is looked around, in case it was a dent
 DOF = 4.0
 MOST_MISFIT = 4.0  # square of how many times the errors of other devices
 CREDIBLE = 0.9
@@ -43,11 +45,15 @@ class Relocation:
     """What was followed is remembered for other parts of the same links.
 
     Attributes:
+        bounds: west, east, south and north end of where devices may be [m].
+        most_radius_m: of the circle by the law; a device with a wider one stays.
         least: of each device: the least number of a link's place to take part, in all parts of the links.
         places: where each device was found before, which is worth a look with other links, too.
         powers: city, device's place -> power by the number of the other end.
     """
 
+    bounds: tuple[float, float, float, float]
+    most_radius_m: float
     least: dict[str, np.uint64] = field(default_factory=dict)
     places: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     powers: dict[tuple, dict[int, float]] = field(default_factory=dict)
@@ -63,20 +69,25 @@ class Relocation:
             base: follows paths.
             level_db: of the base.
         """
-        if sum(device.role == "unknown" for device in law.found) > MOST_DEVICES:
+        unknown = sum(device.role == "unknown" for device in law.found)
+        if unknown > MOST_DEVICES:
             return list(law.found)
         everything = np.ones(len(records), dtype=bool)
         sides = [Side.make(records, everything, each, DOF) for each in (law, base)]
         fits = [side.fit() for side in sides]
-        found = []
-        for number, device in enumerate(law.found):
-            rows = self._rows(records, number)
-            if device.role == "unknown" and device.credible_radius_m <= MOST_RADIUS_M and len(rows) >= LEAST_LINKS:
-                by_law, by_paths = (_Likelihood(side, fit, rows, number) for side, fit in zip(sides, fits))
-                places = self.places.setdefault(device.device, [])
-                device = _Search(by_law, by_paths, level_db, self._follow).from_law(device, places)
-                places.append((device.x_m, device.y_m))
-            found.append(device)
+        found = list(law.found)
+        with progress("looking for devices along paths", total=unknown) as advance:
+            for number, device in enumerate(law.found):
+                if device.role != "unknown":
+                    continue
+                rows = self._rows(records, number)
+                if device.credible_radius_m <= self.most_radius_m and len(rows) >= LEAST_LINKS:
+                    by_law, by_paths = (_Likelihood(side, fit, rows, number) for side, fit in zip(sides, fits))
+                    places = self.places.setdefault(device.device, [])
+                    search = _Search(by_law, by_paths, level_db, self._follow, self.bounds)
+                    found[number] = search.from_law(device, places)
+                    places.append((found[number].x_m, found[number].y_m))
+                advance()
         return found
 
     def _rows(self, records: Records, device: int) -> np.ndarray:
@@ -140,7 +151,7 @@ class _Search:
 
     Attributes:
         by_law, by_paths: its links' likelihood.
-        level_db, follow: see `Relocation`.
+        level_db, follow, bounds: see `Relocation`.
         tried: place -> negative log-likelihood by paths [nats].
     """
 
@@ -148,6 +159,7 @@ class _Search:
     by_paths: _Likelihood
     level_db: LevelOf
     follow: Callable[..., np.ndarray]
+    bounds: tuple[float, float, float, float]
     tried: dict[tuple[float, float], float] = field(default_factory=dict)
 
     def from_law(self, device: TwinDevice, known: list[tuple[float, float]]) -> TwinDevice:
@@ -159,6 +171,8 @@ class _Search:
         ranked_m = np.array(sorted(self.tried, key=self.tried.__getitem__))
         for place_m in _apart(ranked_m, DESCENTS_APART_M, 1 if known else DESCENTS):
             self._descend(place_m)
+        if not known:
+            self._look_around()
         best = min(self.tried, key=self.tried.__getitem__)
         view = self._view(best)
         # Of errors that are scattered as those of other devices the median is 1.
@@ -171,7 +185,8 @@ class _Search:
     def _likely_cells(self, device: TwinDevice) -> list[np.ndarray]:
         """Centres of cells around a device that are worth following paths from."""
         start_m = np.array([device.x_m, device.y_m])
-        cells_m = self._free(_cells(start_m, max(REACH_RADII * device.credible_radius_m, LEAST_REACH_M)))
+        reach_m = max(REACH_RADII * device.credible_radius_m, LEAST_REACH_M)
+        cells_m = self._free(_cells(start_m, reach_m, self.bounds))
         order = np.argsort([self._law_nll(cell_m) for cell_m in cells_m])
         most = int(np.clip(FOLLOWED_SHARE * len(cells_m), LEAST_FOLLOWED, MOST_FOLLOWED))
         return _apart(cells_m[order], CELLS_APART_M, most)
@@ -187,6 +202,19 @@ class _Search:
                 better = min(values, default=np.inf) < value
                 if better:
                     best, value = around_m[np.argmin(values)], min(values)
+
+    def _look_around(self) -> None:
+        """From the best place, as long as there is a better one near by."""
+        better = True
+        while better:
+            best = min(self.tried, key=self.tried.__getitem__)
+            angles = np.arange(8) * np.pi / 4
+            ring = np.column_stack([np.cos(angles), np.sin(angles)])
+            around_m = self._free(np.round(np.vstack([best + away_m * ring for away_m in AROUND_M])))
+            values = [self._try(place_m) for place_m in around_m]
+            better = min(values, default=np.inf) < self.tried[best]
+            if better:
+                self._descend(around_m[np.argmin(values)])
 
     def _free(self, places_m: np.ndarray) -> np.ndarray:
         """Those of places (c, 2) that are not within a building."""
@@ -241,11 +269,14 @@ def _apart(places_m: np.ndarray, apart_m: float, most: int) -> list[np.ndarray]:
     return chosen
 
 
-def _cells(around_m: np.ndarray, reach_m: float) -> np.ndarray:
-    """(c, 2) centres of cells within reach, of a grid that is the same wherever it is looked at."""
-    reach = int(reach_m / CELL_M) + 1
-    steps = np.arange(-reach, reach + 1)
-    cells_m = (np.floor(around_m / CELL_M) + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) + 0.5) * CELL_M
+def _cells(around_m: np.ndarray, reach_m: float, bounds: tuple[float, float, float, float]) -> np.ndarray:
+    """(c, 2) centres of cells within reach and bounds, of a grid that is the same wherever it is looked at."""
+    low, high = np.array(bounds[::2]), np.array(bounds[1::2])
+    low, high = np.maximum(around_m - reach_m, low), np.minimum(around_m + reach_m, high)
+    cell_m = max(CELL_M, float(np.sqrt(np.prod(np.maximum(high - low, 0)) / MOST_CELLS)))
+    first, last = np.floor(low / cell_m).astype(int), np.ceil(high / cell_m).astype(int)
+    axes = [(np.arange(start, end) + 0.5) * cell_m for start, end in zip(first, last)]
+    cells_m = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     return cells_m[np.linalg.norm(cells_m - around_m, axis=1) <= reach_m]
 
 

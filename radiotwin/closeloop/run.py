@@ -109,8 +109,9 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     folds = make_folds(records, seed, hold_out)
     names = [base] if base != "auto" else ["twin", "raytrace"] if scene is not None else ["log-distance"]
     twin = TwinBase(scene, seed)
-    bases: dict[str, Base] = {"twin": twin, "raytrace": RaytraceBase(twin),
-                              "log-distance": LogDistanceBase(scene, seed)}
+    bases: dict[str, Base] = {"twin": twin, "log-distance": LogDistanceBase(scene, seed)}
+    if scene is not None:
+        bases["raytrace"] = RaytraceBase(twin)
     models = {}
     for name in names:
         tell(f"fitting the base {name}")

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from radiotwin.closeloop.bases import Base
+from radiotwin.closeloop.bases import Base, FittedBase
 from radiotwin.closeloop.folds import Folds, evidence_blocks
 from radiotwin.closeloop.model import Side, add, exactly
 from radiotwin.closeloop.records import Records
@@ -126,7 +126,7 @@ def make_model(records: Records, base: Base, folds: Folds) -> Model:
     """Fit a base to all links and to those outside each fold."""
     everything = np.ones(len(records), dtype=bool)
     whole = base.fit(records)
-    dof = _best_dof(records, everything, whole)
+    dof = best_dof(records, whole)
     sides = []
     for number in range(folds.count):
         train = folds.index != number
@@ -138,7 +138,9 @@ def make_model(records: Records, base: Base, folds: Folds) -> Model:
     return model
 
 
-def _best_dof(records: Records, everything: np.ndarray, base) -> float:
+def best_dof(records: Records, base: FittedBase) -> float:
+    """Degrees of freedom of the errors that explain the links best."""
+    everything = np.ones(len(records), dtype=bool)
     sides = [Side.make(records, everything, base, dof) for dof in DOFS]
     return DOFS[int(np.argmin([side.fit().objective for side in sides]))]
 

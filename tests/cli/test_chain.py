@@ -83,3 +83,28 @@ def test_an_earlier_twin_can_start_the_search(chain, run):
     cold, warm = (json.loads((chain / name / "twin.json").read_text())["devices"] for name in ("twin", "warm"))
     for before, after in zip(cold, warm):
         assert np.hypot(before["x_m"] - after["x_m"], before["y_m"] - after["y_m"]) < 5
+
+
+def test_a_twin_by_paths_is_made_and_used_as_any_other(chain, run):
+    """Of two devices only: to follow paths takes long."""
+    survey = pd.read_csv(chain / "survey" / "measurements.csv.gz")
+    devices = pd.read_csv(chain / "survey" / "devices.csv")
+    (chain / "few").mkdir()
+    devices[devices["device"].isin(["d0", "d2", "d5"])].to_csv(chain / "few" / "devices.csv", index=False)
+    survey[survey["device"].isin(["d0", "d2", "d5"])].to_csv(chain / "few" / "measurements.csv", index=False)
+    for words, says in (
+        ("fit few/measurements.csv --scene scene --model raytrace -o by-paths", "by-paths (raytrace)"),
+        ("map by-paths --scene scene -o by-paths.nc", "3 devices"),
+        ("compare few/measurements.csv --scene scene --raytrace --also by-paths -o few/comparison", "by-paths"),
+    ):
+        result = run(words, cwd=chain)
+        assert result.returncode == 0 and says in result.stdout + result.stderr, result.stderr
+    with xr.open_dataset(chain / "by-paths.nc", engine="h5netcdf") as dataset:
+        assert dataset.attrs["source"] == "twin:raytrace with nothing"
+    twin = json.loads((chain / "by-paths" / "twin.json").read_text())
+    found = next(device for device in twin["devices"] if device["device"] == "d2")
+    assert np.hypot(found["x_m"] - 80, found["y_m"] - 200) < 10
+    scores = pd.read_csv(chain / "few" / "comparison" / "scores.csv")
+    assert {"segmented_nn", "raytrace", "by-paths"} <= set(scores["model"])
+    refused = run("locate few/measurements.csv --twin by-paths --scene scene -o nowhere.csv", cwd=chain)
+    assert refused.returncode == 2 and "radiotwin fit --model raytrace" in refused.stderr

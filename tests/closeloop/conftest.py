@@ -1,5 +1,6 @@
-"""Measurements without a scene, made by plain formulas of these tests' own."""
+"""Measurements without a scene, made by plain formulas of these tests' own, and of a city that Sionna RT has traced."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -7,8 +8,13 @@ import pandas as pd
 import pytest
 
 from radiotwin.measurements import Measurements
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.survey import fly_survey
 
 FLIGHTS, SLOTS, RECEIVERS, DEVICES = 6, 60, 2, 5
+RBM = Path(__file__).parents[2] / "scenes" / "rbm"
+IN_A_NARROW_STREET = "d4"
 
 
 def fly(seed, noise_db=2.0, limit_db=-110.0):
@@ -56,3 +62,18 @@ def measured(world, **columns):
 def open_ground():
     """The generator, and what makes measurements of what it made."""
     return SimpleNamespace(fly=fly, measured=measured)
+
+
+@pytest.fixture(scope="session")
+def narrow_street():
+    """RBM, links of its anchors and of one unknown device in a narrow street, and where that is."""
+    scene = Scene.load(RBM)
+    flown = fly_survey(scene, RadioMap.read(RBM / "truth.nc"), flights=3, pattern="random-waypoint", seed=0,
+                       noise_db=1.0)
+    devices = flown.devices[(flown.devices["role"] == "anchor") | (flown.devices["device"] == IN_A_NARROW_STREET)]
+    every_third = np.unique(flown.table["time_s"], return_inverse=True)[1] % 3 == 0
+    links = flown.table[flown.table["device"].isin(devices["device"]) & every_third]
+    place_m = next(np.array([each.x_m, each.y_m]) for each in scene.config.devices
+                   if each.device == IN_A_NARROW_STREET)
+    return SimpleNamespace(scene=scene, name=IN_A_NARROW_STREET, place_m=place_m, measured=Measurements(
+        links.reset_index(drop=True), devices.reset_index(drop=True)))

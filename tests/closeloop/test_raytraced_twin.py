@@ -1,0 +1,71 @@
+"""A twin that follows paths, of a city traced by Sionna RT, whose code the paths do not share."""
+
+import numpy as np
+import pytest
+
+from radiotwin.closeloop import relocation
+from radiotwin.compare import predict
+from radiotwin.errors import BadInput
+from radiotwin.measurements import Measurements
+from radiotwin.radiomap import RadioMap
+from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.twin import Twin, fit_twin
+
+
+@pytest.fixture(scope="module")
+def twin(narrow_street, tmp_path_factory):
+    """As it comes back from its folder."""
+    folder = tmp_path_factory.mktemp("raytraced") / "twin"
+    fit_twin(narrow_street.measured, narrow_street.scene, model="raytrace", seed=0).save(folder)
+    return Twin.load(folder)
+
+
+def judged(twin, scene, devices, seed):
+    """RMSE on flights of another seed, of all links and of those in the shadow [dB]."""
+    flown = fly_survey(scene, RadioMap.read(scene.folder / "truth.nc"), flights=1, pattern="random-waypoint", seed=seed,
+                       noise_db=0.0)
+    flown = flown.select(flown.table["device"].isin(devices).to_numpy())
+    error_db = predict(twin, scene, flown) - flown.level_db
+    los = scene.city.line_of_sight(flown.device_m[flown.device_index], flown.receiver_m)
+    return [np.sqrt(np.nanmean(error_db[rows] ** 2)) for rows in (slice(None), ~los)]
+
+
+def test_it_predicts_other_flights_far_better_than_a_law(narrow_street, twin):
+    scene, measured = narrow_street.scene, narrow_street.measured
+    law = fit_twin(measured, scene, model="segmented_nn", seed=0)
+    devices = list(measured.devices["device"])
+    for by_paths, by_law in zip(*(judged(each, scene, devices, 5) for each in (twin, law))):
+        assert by_paths < 3.5 and by_paths < 0.6 * by_law
+    device = next(each for each in twin.devices if each.role == "unknown")
+    assert np.hypot(*((device.x_m, device.y_m) - narrow_street.place_m)) < 4.0
+    assert device.located and device.credible_radius_m < 15
+
+
+def test_an_earlier_twin_saves_most_of_the_search(narrow_street, twin, monkeypatch):
+    places = set()
+    follow = relocation.Relocation._follow
+
+    def counted(self, city, place_m, *others):
+        places.add(place_m)
+        return follow(self, city, place_m, *others)
+
+    monkeypatch.setattr(relocation.Relocation, "_follow", counted)
+    again = fit_twin(narrow_street.measured, narrow_street.scene, model="raytrace", seed=0, start=twin)
+    for before, after in zip(twin.devices, again.devices):
+        assert np.hypot(before.x_m - after.x_m, before.y_m - after.y_m) <= 1.5
+    assert len(places) < 16  # at least that many cells are looked at where nothing is known
+
+
+def test_a_map_that_the_levels_know_nothing_of_is_told(narrow_street):
+    """In a statistical truth only line of sight is the map's."""
+    scene = narrow_street.scene
+    flown = fly_survey(scene, segmented_truth(scene), flights=1, pattern="random-waypoint", seed=0, noise_db=0.0)
+    anchors = flown.select(flown.is_anchor[flown.device_index])
+    measured = Measurements(anchors.table, narrow_street.measured.devices)
+    with pytest.warns(UserWarning, match="explain these levels worse than a law"):
+        fit_twin(measured, scene, model="raytrace", seed=0)
+
+
+def test_paths_do_not_go_indoors(narrow_street):
+    with pytest.raises(BadInput, match="outside buildings only"):
+        fit_twin(narrow_street.measured, narrow_street.scene, model="raytrace", seed=0, allow_indoor=True)
