@@ -66,9 +66,11 @@ def quality_figure(records: list[dict]) -> Figure:
     figure, panels = _figure(2 * len(found), 2, 3.8)
     for row, (scene, runs) in enumerate(found.items()):
         left, right = panels[2 * row:2 * row + 2]
+        episodes: set[float] = set()
         for number, name in enumerate(name for name in MODELS if name in runs):
             curve, colour = over_seeds(runs[name], y="map_rmse_db"), COLOURS[number]
             _line(left, curve, MODELS[name], number)
+            episodes |= set(curve.x)
             errors = [quantiles([error for record in runs[name] for error in record["curve"][at]["location_errors_m"]])
                       for at in range(len(curve.x))]
             right.plot(curve.x, [each[0] for each in errors], marker=MARKERS[number], markersize=4, color=colour)
@@ -77,7 +79,7 @@ def quality_figure(records: list[dict]) -> Figure:
         right.set(ylabel="error of positions [m]: median, dotted 90 %", yscale="log")
         for axes in (left, right):
             axes.set(xlabel="real episodes", xscale="log", title=f"{scene}, ray-traced truth")
-            axes.set_xticks(curve.x, [f"{x:.0f}" for x in curve.x], minor=False)
+            axes.set_xticks(sorted(episodes), [f"{x:.0f}" for x in sorted(episodes)], minor=False)
             axes.set_xticks([], minor=True)
             axes.grid(alpha=0.3)
     return _legend(figure, panels, 3)
@@ -115,7 +117,8 @@ def _figure(panels: int, columns: int, height_in: float) -> tuple[Figure, list]:
 
 def _line(axes, curve, label: str, number: int) -> None:
     colour = COLOURS[number % len(COLOURS)]
-    axes.plot(curve.x, curve.mean, marker=MARKERS[number % len(MARKERS)], markersize=4, color=colour, label=label)
+    alone = {"markersize": 9, "markeredgecolor": "black"} if len(curve.x) == 1 else {"markersize": 4}
+    axes.plot(curve.x, curve.mean, marker=MARKERS[number % len(MARKERS)], color=colour, label=label, **alone)
     axes.fill_between(curve.x, curve.mean - curve.spread, curve.mean + curve.spread, color=colour, alpha=0.18,
                       linewidth=0)
 

@@ -56,19 +56,13 @@ def curve_table(records: list[dict]) -> str:
                          "" if name in LEVELS else number(curve.needed(target), 0), str(curve.seeds),
                          number(mean_of(runs[name], "cpu_s"), 0)])
         heads = ["", "real episodes", "collected at the end", f"real episodes to {target:.3f}", "seeds", "CPU s each"]
-        how = ", learners explore slot by slot" if all(slot_by_slot(records) for records in runs.values()) else ""
-        text = f"**{shown(scene, truth)}**{how}\n\n{markdown(heads, rows)}"
+        text = f"**{shown(scene, truth)}**\n\n{markdown(heads, rows)}"
         parts.append(text + factors(curves, target))
     return "\n\n".join(parts) + (
         "\n\n±: standard deviation over seeds. \"Real episodes to\": the first round whose mean over seeds is as high; "
         f"the ratio is {ENOUGH:.0%} of what both model-aided FedQMIX and QMIX on real episodes reach at least. Rounds "
         "of training in the truth are 800 episodes and the flights that choose the policy, so there that column is an "
         "upper bound.")
-
-
-def slot_by_slot(records: list[dict]) -> bool:
-    """Whether no learner of these runs made excursions."""
-    return all(filled(record["settings"])["learner"]["excursion_slots"] == 1.0 for record in records)
 
 
 def factors(curves: dict, target: float) -> str:
