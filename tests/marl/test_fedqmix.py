@@ -102,7 +102,7 @@ def flat(value):
     ("--scene nowhere", ["nowhere", "radiotwin build-scene"]),
     ("--episodes 0", ["--episodes 0", "≥ 1"]),
     ("--compare perhaps", ["--compare perhaps", "true|false"]),
-    ("--twin magic", ["--twin magic", "nn|log-distance|kriging|truth"]),
+    ("--twin magic", ["--twin magic", "nn|log-distance|kriging|raytrace|truth"]),
     ("--batch 64 --replay 32", ["replay 32", "64"]),
     ("--guide planner --algorithm greedy", ["guide planner", "greedy does not learn"]),
     ("--device tpu", ["--device tpu", "auto|cpu|cuda"]),
