@@ -109,6 +109,8 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene, truth:
         BadInput: nothing detected to judge on, a truth of another scene, or what `fit_twin` refuses.
     """
     _check(test, scene, truth, twins or {})
+    for twin in (twins or {}).values():
+        twin.predictor(scene)  # complains before the others are fitted, which takes long
     fitted = {}
     with progress("comparing models", total=len(models)) as advance:
         for model in models:

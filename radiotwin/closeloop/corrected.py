@@ -2,6 +2,7 @@
 applied wherever the twin predicts a map."""
 
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from radiotwin.closeloop.model import Side
 from radiotwin.closeloop.raytraced import FittedPaths, RaytraceBase
 from radiotwin.closeloop.records import Records, make_records
 from radiotwin.closeloop.regression import Solution, nll
+from radiotwin.closeloop.relocation import MOST_DEVICES
 from radiotwin.closeloop.run import Loop
 from radiotwin.closeloop.search import best_dof
 from radiotwin.closeloop.shadowing import Shadowing
@@ -25,6 +27,8 @@ from radiotwin.scene import Scene
 from radiotwin.twin import Predictor, Twin, TwinDevice
 
 CHUNK = 20_000  # links at once
+LEAST_HEARD = 30  # links of a class of line of sight, to learn its level from
+LEAST_LOST_NATS = 0.02  # a link, to be worse than the law, which has more numbers to be fitted
 
 
 def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
@@ -47,7 +51,7 @@ def raytraced_twin(measurements: Measurements, scene: Scene, seed: int, start: T
 
     Args:
         measurements: links to anchors and unknown devices.
-        scene: its map and materials.
+        scene: its map; all surfaces are taken to be concrete.
         seed: of the search by a law, which says where it is worth following paths.
         start: an earlier twin; what it was sure of is looked for around there only.
 
@@ -63,12 +67,23 @@ def raytraced_twin(measurements: Measurements, scene: Scene, seed: int, start: T
     base = RaytraceBase(law, start, most_radius_m=np.inf).fit(records)
     dof, everything = best_dof(records, base), np.ones(len(records), dtype=bool)
     by_paths, by_law = (Side.make(records, everything, each, dof) for each in (base, law.fit(records)))
-    both = by_paths.usable & by_law.usable
-    if nll(by_paths.problem(both), by_paths.fit()).sum() > nll(by_law.problem(both), by_law.fit()).sum():
+    fit, both = by_paths.fit(), by_paths.usable & by_law.usable
+    heard = np.bincount(by_paths.group[by_paths.usable & np.isfinite(records.level_db)], minlength=2)
+    lost = nll(by_paths.problem(both), fit).sum() - nll(by_law.problem(both), by_law.fit()).sum()
+    if heard[0] >= LEAST_HEARD and lost > LEAST_LOST_NATS * both.sum():
         warnings.warn("paths over the 3D map explain these levels worse than a law of distance and line of sight does: "
-                      "is the map, with its materials, that of the place, and in the same frame? Otherwise take the "
-                      "model segmented_nn", stacklevel=3)
-    twin = _twin(RaytraceBase.name, by_paths, by_paths.fit(), scene, {"temper": 1.0})
+                      "is the map that of the place, and in the same frame? Otherwise take the model segmented_nn",
+                      stacklevel=3)
+    if heard.min() < LEAST_HEARD <= heard.max():
+        few, many = heard.argmin(), heard.argmax()
+        warnings.warn(f"only {heard[few]} links {('without', 'with')[few]} line of sight were heard: their level is "
+                      f"that of the others, {fit.coefficients[1 - many]:.1f} dB from what paths bring", stacklevel=3)
+        fit = replace(fit, coefficients=np.full(2, fit.coefficients[1 - many]), scale_db=np.full(2, fit.scale_db[many]))
+    unknown = sum(device.role == "unknown" for device in by_paths.base.found)
+    if unknown > MOST_DEVICES:
+        warnings.warn(f"{unknown} devices are unknown, and paths are followed to find {MOST_DEVICES} at most: they are "
+                      "where a law of distance and line of sight has them", stacklevel=3)
+    twin = _twin(RaytraceBase.name, by_paths, fit, scene, {"temper": 1.0})
     twin.provenance.update(flights=measurements.flights, seed=seed)
     return twin
 
@@ -142,7 +157,7 @@ def described(twin: Twin) -> str:
     """The base and the effects of a twin in a few words."""
     names = [part["name"] for part in twin.effects["parts"]]
     names += ["correlated_shadowing"] * ("shadowing" in twin.effects)
-    return f"{twin.effects['base']} with {', '.join(names) or 'nothing'}"
+    return twin.effects["base"] + (f" with {', '.join(names)}" if names else "")
 
 
 def corrected_model(twin: Twin, scene: Scene | None) -> Corrected:

@@ -23,7 +23,7 @@ from radiotwin.scene.citymap import CityMap
 from radiotwin.twin import TwinDevice
 
 LINKS = 150  # of a device, about
-LEAST_LINKS = 30
+LEAST_HEARD = 30  # of these; what is not heard tells little, and fits many places
 MOST_DEVICES = 30  # of unknown position; each takes some ten seconds
 CELL_M, CELLS_APART_M = 7.0, 9.0
 MOST_CELLS = 4000  # or wider ones
@@ -81,7 +81,8 @@ class Relocation:
                 if device.role != "unknown":
                     continue
                 rows = self._rows(records, number)
-                if device.credible_radius_m <= self.most_radius_m and len(rows) >= LEAST_LINKS:
+                heard = np.isfinite(records.level_db[rows]).sum()
+                if device.credible_radius_m <= self.most_radius_m and heard >= LEAST_HEARD:
                     by_law, by_paths = (_Likelihood(side, fit, rows, number) for side, fit in zip(sides, fits))
                     places = self.places.setdefault(device.device, [])
                     search = _Search(by_law, by_paths, level_db, self._follow, self.bounds)
@@ -166,12 +167,16 @@ class _Search:
         """The device where paths put it: around where the law does, or near places `known` from other links; or where
         it is, if paths explain its links nowhere better than the law there, or not as they explain those of others."""
         start_m = np.array([device.x_m, device.y_m])
-        for place_m in (np.round(start_m), *(np.array(known) if known else self._likely_cells(device))):
+        known_m = self._free(np.array(known).reshape(-1, 2))
+        worth_m = known_m if len(known_m) else self._likely_cells(device)
+        for place_m in (*self._free(np.round(start_m)[None]), *worth_m):
             self._try(place_m)
+        if not self.tried:
+            return device
         ranked_m = np.array(sorted(self.tried, key=self.tried.__getitem__))
-        for place_m in _apart(ranked_m, DESCENTS_APART_M, 1 if known else DESCENTS):
+        for place_m in _apart(ranked_m, DESCENTS_APART_M, 1 if len(known_m) else DESCENTS):
             self._descend(place_m)
-        if not known:
+        if not len(known_m):
             self._look_around()
         best = min(self.tried, key=self.tried.__getitem__)
         view = self._view(best)
@@ -217,7 +222,10 @@ class _Search:
                 self._descend(around_m[np.argmin(values)])
 
     def _free(self, places_m: np.ndarray) -> np.ndarray:
-        """Those of places (c, 2) that are not within a building."""
+        """Those of places (c, 2) that are within bounds and not within a building."""
+        west, east, south, north = self.bounds
+        x_m, y_m = places_m.T
+        places_m = places_m[(x_m >= west) & (x_m <= east) & (y_m >= south) & (y_m <= north)]
         records = self.by_law.side.records
         assert records.city is not None
         height_m = np.full(len(places_m), records.device_m[self.by_law.device, 2])
@@ -270,13 +278,14 @@ def _apart(places_m: np.ndarray, apart_m: float, most: int) -> list[np.ndarray]:
 
 
 def _cells(around_m: np.ndarray, reach_m: float, bounds: tuple[float, float, float, float]) -> np.ndarray:
-    """(c, 2) centres of cells within reach and bounds, of a grid that is the same wherever it is looked at."""
+    """(c, 2) whole metres near the centres of cells within reach and about the bounds, of a grid that is the same
+    wherever it is looked at, as long as its cells need not be wider."""
     low, high = np.array(bounds[::2]), np.array(bounds[1::2])
     low, high = np.maximum(around_m - reach_m, low), np.minimum(around_m + reach_m, high)
     cell_m = max(CELL_M, float(np.sqrt(np.prod(np.maximum(high - low, 0)) / MOST_CELLS)))
     first, last = np.floor(low / cell_m).astype(int), np.ceil(high / cell_m).astype(int)
     axes = [(np.arange(start, end) + 0.5) * cell_m for start, end in zip(first, last)]
-    cells_m = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    cells_m = np.round(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2))
     return cells_m[np.linalg.norm(cells_m - around_m, axis=1) <= reach_m]
 
 
