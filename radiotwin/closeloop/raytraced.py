@@ -17,7 +17,7 @@ from radiotwin.closeloop.bases import (
 from radiotwin.closeloop.paths import COMPONENTS, paths_of
 from radiotwin.closeloop.records import Records
 from radiotwin.closeloop.relocation import Relocation
-from radiotwin.twin import Twin, TwinDevice
+from radiotwin.twin import RAYTRACE, Twin, TwinDevice
 
 LEAST_HIDDEN = 30  # links without line of sight that the rest is fitted to
 REST_LOW_DB, REST_EXPONENT = -150.0, 3.0
@@ -38,7 +38,7 @@ class RaytraceBase(Base):
             else, because of what the map lacks, would be taken for an effect.
     """
 
-    name = "raytrace"
+    name = RAYTRACE
 
     def __init__(self, twin: TwinBase, start: Twin | None = None, most_radius_m: float = MOST_RADIUS_M):
         sure = [device for device in start.devices if device.role == "unknown" and device.located
