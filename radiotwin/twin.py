@@ -139,10 +139,7 @@ class Twin:
 
         The mean is given below sensitivity, too; attribute `gain_limit_db` says where detection ends.
         """
-        scene_hash = scene.content_hash()
-        if self.provenance.get("scene_hash", scene_hash) != scene_hash:
-            warnings.warn(f"the twin was learnt in another scene ({self.provenance.get('scene')}) than {scene.folder}, "
-                          "or this one has changed since: geometry, radio or declared devices differ", stacklevel=2)
+        self.warn_of_another_scene(scene)
         predict = self.predictor(scene)
         known = np.flatnonzero(np.isfinite(self.device_m).all(axis=1))
         receiver_m = scene.lattice.positions_m
@@ -158,10 +155,16 @@ class Twin:
         if self.level == "rssi_dbm":
             mean_db -= scene.config.radio.tx_power_dbm
         attributes = {"source": f"twin:{self._described()}", "frequency_hz": scene.config.radio.frequency_hz,
-                      "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene_hash,
+                      "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene.content_hash(),
                       "radiotwin_version": radiotwin.__version__}
         names = [self.devices[i].device for i in known]
         return RadioMap.build(names, scene.lattice, mean_db, los, sigma_db, attributes)
+
+    def warn_of_another_scene(self, scene: Scene) -> None:
+        """Warn where the twin was learnt elsewhere."""
+        if self.provenance.get("scene_hash") not in (None, scene.content_hash()):
+            warnings.warn(f"the twin was learnt in another scene ({self.provenance.get('scene')}) than {scene.folder}, "
+                          "or this one has changed since: geometry, radio or declared devices differ", stacklevel=3)
 
     def _described(self) -> str:
         if not self.effects:
@@ -237,6 +240,8 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
         BadInput: no anchor, nothing detected, links that no channel can be learned from, or devices that may be
             indoors with `raytrace`.
     """
+    if start is not None:
+        start.warn_of_another_scene(scene)
     if model == RAYTRACE:
         if allow_indoor:
             raise BadInput(f"model {RAYTRACE} follows paths outside buildings only; take another model where unknown "

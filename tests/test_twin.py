@@ -121,11 +121,13 @@ def test_receivers_off_the_map_are_mentioned(small_scene, flown):
         fit_twin(Measurements(table, flown.devices), small_scene, model="log_distance", seed=0)
 
 
-def test_a_map_of_another_scene_is_warned_of(small_scene, twin):
+def test_a_twin_of_another_scene_is_warned_of(small_scene, flown, twin):
     radio = small_scene.config.radio.model_copy(update={"frequency_hz": 3.5e9})
     other = Scene(small_scene.folder, small_scene.config.model_copy(update={"radio": radio}))
     with pytest.warns(UserWarning, match="another scene"):
         twin.radio_map(other)
+    with pytest.warns(UserWarning, match="another scene"):
+        fit_twin(flown, other, model="log_distance", seed=0, start=twin)
 
 
 def test_blanks_far_above_the_limit_of_detection_are_warned_of(small_scene, flown):

@@ -88,6 +88,15 @@ def test_a_killed_run_resumes_to_the_same_result_bit_for_bit(scene_option, tmp_p
     assert status == 2 and "--resume" in err
 
 
+def test_a_learner_may_train_in_a_twin_that_follows_paths(scene_option, tmp_path):
+    status, out, err = run(scene_option + SMALL + "--twin raytrace --compare false --algorithm qmix --out result",
+                           tmp_path)
+    assert status == 0, err
+    twin = json.loads((tmp_path / "result" / "twin" / "twin.json").read_text())
+    assert twin["effects"]["base"] == "raytrace" and len(twin["provenance"]["flights"]) == 2
+    assert all(0 < float(row["truth_ratio"]) <= 1 for row in metrics(tmp_path / "result" / "metrics.csv"))
+
+
 def flat(value):
     """All numbers of a nested state as texts of their bytes."""
     if isinstance(value, dict):
