@@ -5,6 +5,7 @@ import csv
 import json
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -88,12 +89,16 @@ def test_a_killed_run_resumes_to_the_same_result_bit_for_bit(scene_option, tmp_p
     assert status == 2 and "--resume" in err
 
 
-def test_a_learner_may_train_in_a_twin_that_follows_paths(scene_option, tmp_path):
-    status, out, err = run(scene_option + SMALL + "--twin raytrace --compare false --algorithm qmix --out result",
-                           tmp_path)
+def test_a_learner_may_train_in_a_twin_that_follows_paths(small_scene, tmp_path):
+    scene = shutil.copytree(small_scene.folder, tmp_path / "scene") / "scene.toml"
+    text = scene.read_text()
+    unknown = text.count('"unknown"')
+    scene.write_text(text.replace('"unknown"', '"anchor"', unknown - 1))  # to look for each takes seconds
+    status, out, err = run("--scene scene " + SMALL + "--real-episodes 1 --twin raytrace --compare false --algorithm qmix "
+                           "--out result", tmp_path)
     assert status == 0, err
     twin = json.loads((tmp_path / "result" / "twin" / "twin.json").read_text())
-    assert twin["effects"]["base"] == "raytrace" and len(twin["provenance"]["flights"]) == 2
+    assert twin["effects"]["base"] == "raytrace" and len(twin["provenance"]["flights"]) == 1
     assert all(0 < float(row["truth_ratio"]) <= 1 for row in metrics(tmp_path / "result" / "metrics.csv"))
 
 
