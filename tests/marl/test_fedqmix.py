@@ -94,8 +94,8 @@ def test_a_learner_may_train_in_a_twin_that_follows_paths(small_scene, tmp_path)
     text = scene.read_text()
     unknown = text.count('"unknown"')
     scene.write_text(text.replace('"unknown"', '"anchor"', unknown - 1))  # to look for each takes seconds
-    status, out, err = run("--scene scene " + SMALL + "--real-episodes 1 --twin raytrace --compare false --algorithm qmix "
-                           "--out result", tmp_path)
+    status, out, err = run("--scene scene " + SMALL + "--real-episodes 1 --twin raytrace --compare false "
+                           "--algorithm qmix --out result", tmp_path)
     assert status == 0, err
     twin = json.loads((tmp_path / "result" / "twin" / "twin.json").read_text())
     assert twin["effects"]["base"] == "raytrace" and len(twin["provenance"]["flights"]) == 1
