@@ -111,6 +111,19 @@ class Records:
         return self.time_s - first[self.track]
 
     @cached_property
+    def tracks(self) -> dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]:
+        """Of each receiver and flight: times (t,) in order [s], and where it was then (t, 3) [m]; only links with a
+        time count"""
+        rows = np.flatnonzero(np.isfinite(self.time_s))
+        keys = np.column_stack([self.receiver[rows], self.flight[rows]])
+        found = {}
+        for receiver, flight in np.unique(keys, axis=0):
+            mine = rows[(keys == (receiver, flight)).all(axis=1)]
+            time_s, first = np.unique(self.time_s[mine], return_index=True)
+            found[int(receiver), int(flight)] = time_s, self.receiver_m[mine[first]]
+        return found
+
+    @cached_property
     def first_s(self) -> float:
         """Time of the first measurement [s]; NaN without times"""
         return float(np.nanmin(self.time_s)) if np.isfinite(self.time_s).any() else np.nan
@@ -173,7 +186,7 @@ class Records:
         part = replace(self, **{name: value[rows] for name, value in values.items() if value is not None})
         for name in ("los", "time_in_flight_s"):  # costly, or not to be had from a part
             part.__dict__[name] = getattr(self, name)[rows]
-        part.__dict__.update(first_s=self.first_s, last_s=self.last_s)
+        part.__dict__.update(first_s=self.first_s, last_s=self.last_s, tracks=self.tracks)
         return part
 
     def with_devices(self, device_m: np.ndarray) -> "Records":

@@ -8,9 +8,9 @@ import pytest
 import trimesh
 
 from radiotwin.closeloop.corrected_scene import check_corrected_target, write_corrected_scene
+from radiotwin.effects.gain_drift import ReceiverDrift
 from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.position_errors import DevicePositionError
-from radiotwin.effects.receiver_drift import ReceiverDrift
 from radiotwin.effects.removed_obstacle import RemovedObstacle, buildings
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene

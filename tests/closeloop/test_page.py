@@ -14,9 +14,11 @@ from radiotwin.closeloop.run import Loop, close_loop
 from radiotwin.closeloop.search import Model, Search
 from radiotwin.closeloop.words import listed, parameter, variable
 from radiotwin.effects.body_shadowing import BodyShadowing
+from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.detection_limit import DetectionLimit
 from radiotwin.effects.excess_attenuation import ExcessAttenuation
 from radiotwin.effects.foliage import Foliage
+from radiotwin.effects.gain_drift import DeviceDrift, ReceiverDrift
 from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
 from radiotwin.effects.interference import Interference
 from radiotwin.effects.lock_loss import LockLoss
@@ -24,7 +26,6 @@ from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.noise_floor import NoiseFloor
 from radiotwin.effects.paths import WallReflection
 from radiotwin.effects.position_errors import DevicePositionError, ReceiverPositionError
-from radiotwin.effects.receiver_drift import ReceiverDrift
 from radiotwin.effects.receiver_saturation import ReceiverSaturation
 from radiotwin.effects.removed_obstacle import RemovedObstacle
 from radiotwin.effects.sector_antenna import SectorAntenna
@@ -193,6 +194,8 @@ def test_pictures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_
     (DeviceGainOffset, {"members": [0, 1, 2], "spread_db": 4.0}), (ExcessAttenuation, {"scale_height_m": 100.0}),
     (BodyShadowing, {"members": [0, 1]}),
     (ReceiverDrift, {"receivers": {"0": ["warm_up_each_flight", 8.0], "1": ["step", 150.0]}}),
+    (DeviceDrift, {"devices": {"1": ["step", 150.0]}, "span_s": [0.0, 300.0]}),
+    (ReceiverClockOffset, {"receiver": 0, "offset_s": 3.0, "speed_m_s": 10.0}),
     (ReceiverSaturation, {"receivers": {"0": [-85.0, 1.0]}}), (NoiseFloor, {"receivers": {"1": -95.0}}),
     (SectorAntenna, {"devices": {"1": [30.0, 65.0, 15.0, 0.0, 360.0, -35.0]}}),
     (TiltedDipole, {"receivers": {"0": [20.0, 90.0, -35.0]}}),

@@ -68,11 +68,33 @@ def test_a_step_after_the_first_flight_is_found_though_no_other_flight_tells_it(
     assert 59 <= value(report, "receiver_drift", "step_time_s[r1]") <= 200
 
 
+def test_a_device_that_has_changed_is_named(open_ground):
+    world = open_ground.fly(10)
+    world.gain_db[(world.device == 2) & (world.time_s > 530)] -= 7.0
+    report = run(open_ground.measured(world))
+    assert named(report) == ["device_drift"]
+    assert value(report, "device_drift", "step_db[d2]") == pytest.approx(-7.0, abs=1.0)
+
+
+def test_a_receiver_whose_clock_is_wrong_is_named(open_ground):
+    world = open_ground.fly(11)
+    mine, late_s = world.receiver == 1, 3  # each level is written down beside the place of three seconds before
+    there = np.flatnonzero(mine & (world.slot >= late_s))
+    before = there - late_s * len(world.device_m)  # the same device and flight, so many slots ago
+    measurements = open_ground.measured(world)
+    columns = [f"receiver_{axis}_m" for axis in "xyz"]
+    measurements.table.loc[there, columns] = world.receiver_m[before]
+    measurements = measurements.select(~mine | (world.slot >= late_s))
+    report = run(measurements)
+    assert named(report) == ["receiver_clock_offset"]
+    assert value(report, "receiver_clock_offset", "positions_late_by_s[r1]") == pytest.approx(late_s, abs=0.7)
+
+
 def test_flights_that_differ_anyhow_are_no_step(open_ground):
     world = open_ground.fly(9)
     each_db = np.array([[2.0, -2, 2, -2, 2, -2], [-3.0, 3, 0, 0, 3, -3]])
     world.gain_db += each_db[world.receiver, world.flight]
-    assert "receiver_drift" not in named(run(open_ground.measured(world)))
+    assert not {"receiver_drift", "device_drift"} & set(named(run(open_ground.measured(world))))
 
 
 def test_what_no_effect_explains_is_filled_in_over_the_variable_that_it_depends_on(open_ground):

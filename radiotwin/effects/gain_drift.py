@@ -1,16 +1,19 @@
-"""A receiver whose gain changes in time: it warms up, it ages, or something in it changed at one moment.
+"""A receiver or a device whose gain changes in time: it warms up, it ages, or something in it changed at one moment.
 
 Warm-up as a first-order thermal lag, A exp(−t / τ) from switch-on (amplifier gain falls linearly with temperature, and
 temperature follows first-order cooling); ageing as a slope in time; a step at an unknown time (two means, Hinkley 1970,
 'Inference about the change-point in a sequence of random variables', Biometrika 57).
 """
 
+from typing import ClassVar
 
 import numpy as np
 
 from radiotwin.effects.base import Effect, Parameter, Setting, Term, Variation, View, measured
 
 LEAST_LINKS = 60
+LEAST_FLIGHTS = 3
+MOST_DEVICES = 200
 LEAST_NATS = 5.0
 LEAST_SIDE = 20  # links before and after a step
 SPREAD_DB = 10.0
@@ -21,16 +24,31 @@ CLEARLY = 3.0  # standard deviations
 STEP_PENALTY = 1.0  # times log of the places where it may be
 
 
-class ReceiverDrift(Effect):
-    """The one of three forms that explains a receiver best; one step finds one receiver."""
+class _Drift(Effect):
+    """The one of several forms that explains an end of links best; one step finds one end.
 
-    name = "receiver_drift"
-    of_receiver = True
+    Class attributes:
+        forms: that it may have.
+        ends: what its setting calls them.
+    """
+
     repeatable = True
-    confused_with = ("receiver_gain_offset", "interference")
+    forms: ClassVar[tuple[str, ...]]
+    ends: ClassVar[str]
 
     def __init__(self, steps_only: bool = False):
-        self._steps_only = steps_only
+        self._forms = ("step",) if steps_only else self.forms
+
+    def index(self, records) -> np.ndarray:
+        """(n,) the end of each link."""
+        raise NotImplementedError
+
+    def _names(self, records) -> list[str]:
+        raise NotImplementedError
+
+    def _members(self, records) -> list[int]:
+        """Ends that may drift."""
+        return measured(self.index(records)[np.isfinite(records.time_s)], LEAST_LINKS)
 
     def lacks(self, records) -> str | None:
         if np.isfinite(records.time_s).sum() < LEAST_LINKS:
@@ -38,56 +56,60 @@ class ReceiverDrift(Effect):
         return None
 
     def propose(self, view: View) -> list[dict]:
-        receivers = measured(view.records.receiver[np.isfinite(view.records.time_s)], LEAST_LINKS)
-        known = {int(receiver) for kept in view.done(self.name, "receivers") for receiver in kept}
-        return self._best(view, sorted(set(receivers) - known))
+        known = {int(end) for kept in view.done(self.name, self.ends) for end in kept}
+        return self._best(view, sorted(set(self._members(view.records)) - known))
 
     def propose_like(self, view: View, setting: dict) -> list[dict]:
-        # Whether this receiver drifts is the question, and not whether any does.
-        return self._best(view, [int(receiver) for receiver in setting["receivers"]])
+        # Whether this end drifts is the question, and not whether any does.
+        return self._best(view, [int(end) for end in setting[self.ends]])
 
-    def _best(self, view: View, receivers: list[int]) -> list[dict]:
+    def _best(self, view: View, ends: list[int]) -> list[dict]:
         records, found = view.records, []
-        for receiver in receivers:
-            rows = np.flatnonzero((records.receiver == receiver) & np.isfinite(records.time_s))
+        for end in ends:
+            rows = np.flatnonzero((self.index(records) == end) & np.isfinite(records.time_s))
+            if not len(rows):  # a fold may have none of its links
+                continue
             candidates = _forms(
                 (records.time_s - records.first_s)[rows], records.time_s[rows], records.time_in_flight_s[rows],
                 records.flight[rows], view.residual_db[rows], view.weight[rows])
-            nats, form, number = max(each for each in candidates if each[1] == "step" or not self._steps_only)
+            nats, form, number = max(each for each in candidates if each[1] in self._forms)
             if nats > LEAST_NATS:
-                setting: Setting = {"receivers": {str(receiver): [form, float(number)]}}
-                if form == "ageing":  # is told from first to last, which other links are not to change
-                    setting["span_s"] = [records.first_s, records.last_s]
+                setting: Setting = {self.ends: {str(end): [form, float(number)]}}
+                if form == "ageing" or not self.of_receiver:  # is told from first to last, which other links are not
+                    setting["span_s"] = [records.first_s, records.last_s]  # to change
                 found.append((nats, setting))
         return [setting for _, setting in sorted(found, key=lambda each: -each[0])[:MOST_TRIED]]
 
     def term(self, records, setting, at) -> Term:
         columns, names = [], []
-        for receiver, (form, number) in setting["receivers"].items():
-            mine = (records.receiver == int(receiver)) & np.isfinite(records.time_s)
-            columns.append(np.where(mine, _shape(form, number, records.time_s - records.first_s, records.time_s,
+        index, ends, time_s = self.index(records), self._names(records), records.time_s
+        if not self.of_receiver:  # is part of a map, too, which is of what things came to
+            time_s = np.where(np.isnan(time_s), setting["span_s"][1], time_s)
+        for end, (form, number) in setting[self.ends].items():
+            mine = (index == int(end)) & np.isfinite(time_s)
+            columns.append(np.where(mine, _shape(form, number, time_s - records.first_s, time_s,
                                                  records.time_in_flight_s, setting.get("span_s")), 0.0))
             # An offset of its own, or the drift would have to stand for a constant error, too.
             columns.append(mine.astype(float))
-            names += [form, f"offset[{records.receiver_names[int(receiver)]}]"]
+            names += [form, f"offset[{ends[int(end)]}]"]
         return Term.of_columns(np.column_stack(columns), SPREAD_DB, names)
 
     def vary(self, setting) -> Variation | None:
-        warming = [receiver for receiver, (form, _) in setting["receivers"].items() if form in WARMING]
+        warming = [end for end, (form, _) in setting[self.ends].items() if form in WARMING]
         if not warming:
             return None
-        values = np.log([setting["receivers"][receiver][1] for receiver in warming])
+        values = np.log([setting[self.ends][end][1] for end in warming])
 
         def again(numbers: np.ndarray) -> dict:
-            changed = {receiver: [setting["receivers"][receiver][0], float(np.exp(number))]
-                       for receiver, number in zip(warming, numbers)}
-            return setting | {"receivers": setting["receivers"] | changed}
+            changed = {end: [setting[self.ends][end][0], float(np.exp(number))]
+                       for end, number in zip(warming, numbers)}
+            return setting | {self.ends: setting[self.ends] | changed}
         return Variation(values, np.full(len(values), 0.3), np.full(len(values), 0.0), np.full(len(values), 9.0), again)
 
     def parameters(self, records, setting, found) -> dict[str, Parameter]:
         result, warming = {}, 0
-        for number, (receiver, (form, value)) in enumerate(setting["receivers"].items()):
-            name = records.receiver_names[int(receiver)]
+        for number, (end, (form, value)) in enumerate(setting[self.ends].items()):
+            name = self._names(records)[int(end)]
             size, deviation = found.coefficients[2 * number], found.deviations[2 * number]
             result[f"{form}_db[{name}]"] = Parameter.normal(size, deviation, "dB")
             if form in WARMING:
@@ -98,6 +120,50 @@ class ReceiverDrift(Effect):
             elif form == "step":
                 result[f"step_time_s[{name}]"] = Parameter(value, value, value, "s")
         return result
+
+
+class ReceiverDrift(_Drift):
+    """A receiver that warms up, once or on each flight, ages, or has changed."""
+
+    name = "receiver_drift"
+    of_receiver = True
+    confused_with = ("receiver_gain_offset", "interference")
+    forms = ("warm_up", "warm_up_each_flight", "ageing", "step")
+    ends = "receivers"
+
+    def index(self, records) -> np.ndarray:
+        return records.receiver
+
+    def _names(self, records) -> list[str]:
+        return records.receiver_names
+
+
+class DeviceDrift(_Drift):
+    """A device whose battery sinks or that has changed. Within a flight a change of time is one of place, so it must
+    have been heard on some."""
+
+    name = "device_drift"
+    confused_with = ("device_gain_offset", "device_position_error")
+    forms = ("ageing", "step")
+    ends = "devices"
+
+    def index(self, records) -> np.ndarray:
+        return records.device
+
+    def _names(self, records) -> list[str]:
+        return records.device_names
+
+    def _members(self, records) -> list[int]:
+        flights = np.unique(np.column_stack([records.device, records.flight]), axis=0)[:, 0]
+        return sorted(set(super()._members(records)) & set(measured(flights, LEAST_FLIGHTS)))
+
+    def lacks(self, records) -> str | None:
+        if super().lacks(records) is not None:
+            return super().lacks(records)
+        members = self._members(records)
+        if len(members) > MOST_DEVICES:
+            return f"{len(members)} devices are too many to ask each; at most {MOST_DEVICES}"
+        return None if members else f"no device has {LEAST_LINKS} links on {LEAST_FLIGHTS} flights"
 
 
 def _shape(form: str, number: float, since_first_s: np.ndarray, time_s: np.ndarray,
