@@ -6,7 +6,7 @@
 
 Runs `close-loop` on the cases of `tests/undeclared` that are traced. A case that is in the file already is left out, so
 that a run that was stopped goes on. The oracle is the same base, fitted to the same links with the effect taken out of
-them; where a building is missing or gone, with the true map.
+them; where a building is missing or gone, with the true map, and where a clock is wrong, with the true places.
 """
 
 import argparse
@@ -32,8 +32,9 @@ from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
 from tests.undeclared.cases import FAMILIES, OUTSIDE, SEEDS, Case, case, stored
+from tests.undeclared.families import world_of
 
-UNITS = {"db": "dB", "m": "m", "deg": "°"}
+UNITS = {"db": "dB", "m": "m", "deg": "°", "s": "s"}
 GEOMETRY = ("missing_obstacle", "removed_obstacle")
 
 
@@ -138,6 +139,9 @@ def oracle_rmse_db(hidden: Case, base: str, hold_out: str) -> float:
     for effect in effects:
         if effect["name"] in GEOMETRY:
             scene = with_true_city(scene, effect)
+        if effect["name"] == "receiver_clock_offset":
+            where = world_of(hidden.family, hidden.seed)
+            table[[f"receiver_{axis}_m" for axis in "xyz"]] = np.repeat(where.points_m, len(where.names), axis=0)
     records = make_records(Measurements(table, measurements.devices), scene)
     twin = TwinBase(scene, 0)
     folds = make_folds(records, 0, hold_out)
@@ -182,6 +186,13 @@ def recovered(effect: dict, report: dict) -> dict:
         size = effect["step_db"] if effect["kind"] == "step" else -effect["final_db"]
         mine = [value for label, value in values.items() if label.endswith(f"_db[{effect['receiver']}]")]
         return {"amplitude_error_db": _near(mine[0] - size)} if mine else {}
+    if name == "device_drift":
+        size = effect["step_db"] if effect["kind"] == "step" else effect["last_db"]
+        mine = [value for label, value in values.items() if label.endswith(f"_db[{effect['device']}]")]
+        return {"amplitude_error_db": _near(mine[0] - size)} if mine else {}
+    if name == "receiver_clock_offset":
+        late_s = values.get(f"positions_late_by_s[{effect['receiver']}]", np.nan)
+        return {"clock_error_s": _near(late_s - effect["late_s"])}
     if name == "missing_obstacle":
         every = [each["parameters"] for each in report["effects"] if each["name"] == name]
         errors = []

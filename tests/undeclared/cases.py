@@ -14,7 +14,7 @@ import pandas as pd
 
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
-from tests.undeclared import tables
+from tests.undeclared import clocks, tables
 from tests.undeclared.cities import declared_scene
 from tests.undeclared.families import FAMILIES, GROUP, OUTSIDE, SEEDS, is_traced, rng_of, untraced, world_of
 from tests.undeclared.worlds import World
@@ -67,7 +67,10 @@ def case(family: str, seed: int) -> Case:
     read_db = _read(clean_db, arriving_db, declared_scene(where.city).config.gain_limit_db,
                     rng_of(family, seed, "noise"))
     unknown = {where.names[row]: where.device_m[row].tolist() for row in np.flatnonzero(~where.is_anchor)}
-    return Case(family, seed, Measurements(_links(where, read_db), _devices(where)), declared_scene(where.city),
+    written_m = next((clocks.written_m(effect, where) for effect in untraced_effects
+                      if effect["name"] == "receiver_clock_offset"), where.points_m)
+    measurements = Measurements(_links(where, written_m, read_db), _devices(where))
+    return Case(family, seed, measurements, declared_scene(where.city),
                 {"family": family, "effects": effects + untraced_effects, "device_m": unknown},
                 clean_db.T.ravel(), plain_db.T.ravel())
 
@@ -90,11 +93,11 @@ def _read(clean_db: np.ndarray, arriving_db: np.ndarray, limit_db: float, rng: n
     return np.where(detected, np.round((clean_db + noise_db) / STEP_DB) * STEP_DB, np.nan)
 
 
-def _links(where: World, read_db: np.ndarray) -> pd.DataFrame:
+def _links(where: World, points_m: np.ndarray, read_db: np.ndarray) -> pd.DataFrame:
     devices, points = read_db.shape
     columns = {"time_s": where.time_s, "flight": np.array([f"f{number}" for number in where.flight], dtype=object),
                "receiver": np.array([f"uav{number}" for number in where.receiver], dtype=object)}
-    columns |= {f"receiver_{axis}_m": where.points_m[:, i] for i, axis in enumerate("xyz")}
+    columns |= {f"receiver_{axis}_m": points_m[:, i] for i, axis in enumerate("xyz")}
     table = {name: np.repeat(column, devices) for name, column in columns.items()}
     table |= {"device": np.tile(np.array(where.names, dtype=object), points), "gain_db": read_db.T.ravel()}
     for name in ("heading_deg", "pitch_deg", "roll_deg"):

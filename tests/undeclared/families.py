@@ -4,21 +4,22 @@ import zlib
 
 import numpy as np
 
-from tests.undeclared import faults, hidden, losses, outside
+from tests.undeclared import clocks, faults, hidden, losses, outside
 from tests.undeclared.worlds import World, world
 
 SEEDS = range(5)
 GROUP = {
     "nothing": "receivers", "receiver_gain_offset": "receivers", "receiver_drift": "receivers",
-    "receiver_saturation": "receivers", "excess_attenuation": "receivers",
+    "receiver_saturation": "receivers", "excess_attenuation": "receivers", "device_drift": "receivers",
+    "receiver_clock_offset": "receivers",
     "foliage": "devices", "antenna_pattern": "devices", "device_position_error": "devices",
     "missing_obstacle": "obstacles", "removed_obstacle": "obstacles", "pairs": "pairs",
     "duty_cycled_jammer": "receivers", "agc_hysteresis": "receivers", "refractive_fading": "receivers",
 }
 OUTSIDE = ("duty_cycled_jammer", "agc_hysteresis", "refractive_fading")
-IN_THE_AIR = ("foliage", "excess_attenuation", "refractive_fading")
+BEFORE_RECEIVERS = ("foliage", "excess_attenuation", "refractive_fading", "device_drift")
 FAMILIES = tuple(name for name in GROUP if name not in OUTSIDE)
-DIPOLE_SEEDS, STEP_SEEDS = (3, 4), (3, 4)  # of antenna_pattern and receiver_drift: the second kind of each
+DIPOLE_SEEDS, STEP_SEEDS = (3, 4), (3, 4)  # of antenna_pattern, and of the two drifts: the second kind of each
 PAIRS = (("missing_obstacle", "receiver_drift"), ("device_position_error", "antenna_pattern"),
          ("foliage", "receiver_gain_offset"), ("missing_obstacle", "device_position_error"),
          ("removed_obstacle", "receiver_saturation"))
@@ -82,13 +83,17 @@ def untraced(family: str, seed: int, clean_db: np.ndarray) -> tuple[list[dict], 
         elif name == "excess_attenuation":
             found.append(losses.excess_attenuation(where, rng))
             clean_db = clean_db - losses.haze_loss_db(found[-1], where.device_m, where.points_m)
+        elif name == "receiver_clock_offset":  # of places; levels stay
+            found.append(clocks.receiver_clock_offset(where, rng))
         elif name in OUTSIDE:
             found.append(getattr(outside, name)(where, rng, clean_db))
             clean_db = outside.reading_db(found[-1], where, clean_db)
         elif name not in hidden.TRACED:
-            draw = {"receiver_drift": faults.step if family != "pairs" and seed in STEP_SEEDS else faults.warm_up}
+            second = family != "pairs" and seed in STEP_SEEDS
+            draw = {"receiver_drift": faults.step if second else faults.warm_up,
+                    "device_drift": faults.device_change if second else faults.battery}
             found.append(draw.get(name, getattr(faults, name, None))(where, rng, clean_db))
             clean_db = faults.reading_db(found[-1], where, clean_db)
-        if name in IN_THE_AIR:
+        if name in BEFORE_RECEIVERS:
             arriving_db = clean_db
     return found, arriving_db, clean_db

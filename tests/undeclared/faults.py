@@ -1,4 +1,4 @@
-"""Faults of a receiver, as its electronics would make them; each acts on the levels (k, p) of one UAV."""
+"""Faults of a receiver or a device, as its electronics would make them; each acts on the levels (k, p) of one."""
 
 import numpy as np
 
@@ -27,6 +27,20 @@ def step(world: World, rng: np.random.Generator, clean_db: np.ndarray) -> dict:
             "step_db": round(float(rng.choice([-1, -1, 1]) * rng.uniform(3, 6)), 2)}
 
 
+def device_change(world: World, rng: np.random.Generator, clean_db: np.ndarray) -> dict:
+    """Between two flights one device's antenna breaks off (or is mended): 4 to 8 dB."""
+    flight = int(rng.integers(2, 5))
+    return {"name": "device_drift", "kind": "step", "device": _device(world, rng),
+            "time_s": float(world.time_s[world.flight == flight].min()),
+            "step_db": round(float(rng.choice([-1, -1, 1]) * rng.uniform(4, 8)), 2)}
+
+
+def battery(world: World, rng: np.random.Generator, clean_db: np.ndarray) -> dict:
+    """One device's battery sinks, and its power with it, by 5 to 9 dB from the first slot to the last."""
+    return {"name": "device_drift", "kind": "ageing", "device": _device(world, rng),
+            "last_db": round(float(-rng.uniform(5, 9)), 2)}
+
+
 def receiver_saturation(world: World, rng: np.random.Generator, clean_db: np.ndarray) -> dict:
     """One receiver's amplifier compresses the strongest tenth to quarter of its links."""
     receiver = _one(rng)
@@ -37,21 +51,26 @@ def receiver_saturation(world: World, rng: np.random.Generator, clean_db: np.nda
 
 
 def reading_db(effect: dict, world: World, level_db: np.ndarray) -> np.ndarray:
-    """What the receivers read in place of the level at their antennas.
+    """What the receivers read in place of the level that arrives without the fault.
 
     Args:
         effect: of this module, as an entry of the answer.
-        world: names the links' receivers and times.
+        world: names the links' ends and times.
         level_db: (k, p) [dB]
 
     Returns:
         (k, p) [dB]
     """
-    faulty = (world.receiver == _number(effect["receiver"]))[None]
+    if "device" in effect:
+        faulty = (np.array(world.names) == effect["device"])[:, None]
+    else:
+        faulty = (world.receiver == _number(effect["receiver"]))[None]
     if effect["name"] == "receiver_gain_offset":
         return level_db + faulty * effect["offset_db"]
     if effect["name"] == "receiver_saturation":
         return np.where(faulty, _compressed(level_db, effect["saturation_db"], effect["knee"]), level_db)
+    if effect["kind"] == "ageing":
+        return level_db + faulty * effect["last_db"] * world.time_s / world.time_s.max()
     if effect["kind"] == "step":
         return level_db + faulty * (world.time_s >= effect["time_s"]) * effect["step_db"]
     return level_db + faulty * effect["final_db"] * _warmth(world.time_s, effect["time_constant_s"])
@@ -73,6 +92,11 @@ def _warmth(time_s: np.ndarray, time_constant_s: float) -> np.ndarray:
 
 def _one(rng: np.random.Generator) -> str:
     return f"uav{rng.integers(UAVS)}"
+
+
+def _device(world: World, rng: np.random.Generator) -> str:
+    """An anchor's name."""
+    return world.names[rng.choice(np.flatnonzero(world.is_anchor))]
 
 
 def _number(receiver: str) -> int:

@@ -106,6 +106,42 @@ def test_a_receivers_fault_is_in_its_links_only(family, seed):
         np.testing.assert_allclose(change[its & path], law[its & path], atol=0.02)
 
 
+@of("device_drift")
+def test_a_devices_power_changes_in_time_in_its_links_only(family, seed):
+    one = case(family, seed)
+    (effect,), change, time_s = one.answer["effects"], change_db(one), column(one, "time_s")
+    its = column(one, "device") == effect["device"]
+    path = np.isfinite(one.plain_gain_db)
+    assert np.abs(change[~its]).max() == 0 and effect["device"] not in one.answer["device_m"]
+    if effect["kind"] == "step":
+        law = np.where(time_s >= effect["time_s"], effect["step_db"], 0.0)
+    else:
+        law = effect["last_db"] * time_s / time_s.max()
+    np.testing.assert_allclose(change[its & path], law[its & path], atol=1e-9)
+    assert np.ptp(law[its]) > 4
+
+
+@of("receiver_clock_offset")
+def test_places_are_those_of_another_time(family, seed):
+    one, where = case(family, seed), world_of(family, seed)
+    (effect,) = one.answer["effects"]
+    np.testing.assert_array_equal(one.clean_gain_db, one.plain_gain_db)
+    given_m = one.measurements.receiver_m[::10]
+    its = column(one, "receiver")[::10] == effect["receiver"]
+    np.testing.assert_array_equal(given_m[~its], where.points_m[~its])
+    away_m = np.linalg.norm(given_m - where.points_m, axis=1)[its]
+    assert np.all(away_m < 12.5 * abs(effect["late_s"]) + 0.1) and np.median(away_m) > 6 * abs(effect["late_s"])
+    # A place that is so many seconds late comes beside the level of so much later.
+    late = effect["late_s"]
+    tracks = zip(given_m[its].reshape(6, 60, 3), where.points_m[its].reshape(6, 60, 3))
+    for written_m, true_m in tracks:
+        slots = np.arange(60.0)
+        inside = (slots - late >= 0) & (slots - late <= 59)
+        for axis in range(3):
+            np.testing.assert_allclose(written_m[inside, axis],
+                                       np.interp(slots[inside] - late, slots, true_m[:, axis]), atol=0.011)
+
+
 @of("antenna_pattern", "device_position_error")
 def test_a_devices_or_receivers_antenna_is_in_its_links_only(family, seed):
     one = case(family, seed)
