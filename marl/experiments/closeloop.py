@@ -33,7 +33,7 @@ def _case_row(name: str, case: dict) -> list[str]:
     hidden = {effect["name"] for effect in case["hidden"]}
     first = "–" if not named else f"`{named[0]}`" + (" ✓" if named[0] in hidden else "")
     if not hidden and not named:
-        first = "nothing ✓"
+        first = "no effect ✓"
     recovered = ", ".join(f"{name.replace('_error', '').rsplit('_', 1)[0].replace('_', ' ')} {value:+.1f} "
                           f"{ {'db': 'dB', 'deg': '°'}.get(name.rsplit('_', 1)[1], 'm')}"
                           for found in case["recovered"] for name, value in found.items()
