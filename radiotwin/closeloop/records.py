@@ -114,13 +114,13 @@ class Records:
     def tracks(self) -> dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]:
         """Of each receiver and flight: times (t,) in order [s], and where it was then (t, 3) [m]; only links with a
         time count"""
-        rows = np.flatnonzero(np.isfinite(self.time_s))
-        keys = np.column_stack([self.receiver[rows], self.flight[rows]])
         found = {}
-        for receiver, flight in np.unique(keys, axis=0):
-            mine = rows[(keys == (receiver, flight)).all(axis=1)]
-            time_s, first = np.unique(self.time_s[mine], return_index=True)
-            found[int(receiver), int(flight)] = time_s, self.receiver_m[mine[first]]
+        timed = np.flatnonzero(np.isfinite(self.time_s))
+        order = timed[np.lexsort((self.time_s[timed], self.flight[timed], self.receiver[timed]))]
+        ends = np.column_stack([self.receiver[order], self.flight[order]])
+        for rows in np.split(order, np.flatnonzero(np.diff(ends, axis=0).any(axis=1)) + 1) if len(order) else ():
+            time_s, first = np.unique(self.time_s[rows], return_index=True)
+            found[int(self.receiver[rows[0]]), int(self.flight[rows[0]])] = time_s, self.receiver_m[rows[first]]
         return found
 
     @cached_property

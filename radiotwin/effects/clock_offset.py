@@ -50,7 +50,7 @@ class ReceiverClockOffset(Effect):
             before_db = view.at(mine)
             for along_m in (sign * size for size in ALONG_M for sign in (-1, 1)):
                 setting = {"receiver": receiver, "offset_s": along_m / speed_m_s, "speed_m_s": speed_m_s}
-                moved_db = view.at(_at_other_time(mine, setting["offset_s"])) - before_db
+                moved_db = view.at(_at_other_time(mine, receiver, along_m / speed_m_s)) - before_db
                 nats = share * view.nats(rows, moved_db).sum()
                 if nats > best[0]:
                     best = nats, setting
@@ -60,7 +60,8 @@ class ReceiverClockOffset(Effect):
         offset_db = np.zeros(len(records))
         rows = np.flatnonzero(records.receiver == setting["receiver"])
         mine, exact = records.select(rows), setting.get("exact", False)
-        offset_db[rows] = at(_at_other_time(mine, setting["offset_s"]), exact) - at(mine, exact)
+        moved = _at_other_time(mine, setting["receiver"], setting["offset_s"])
+        offset_db[rows] = at(moved, exact) - at(mine, exact)
         return Term.of_offset(offset_db)
 
     def exact(self, setting) -> dict:
@@ -91,12 +92,14 @@ def _moving(records) -> dict[int, float]:
     return moving
 
 
-def _at_other_time(records, offset_s: float):
-    """The links, each receiver where its track has it `offset_s` later; links without a time stay."""
+def _at_other_time(records, receiver: int, offset_s: float):
+    """The links, all of one receiver, where its tracks have it `offset_s` later; links without a time stay."""
     receiver_m = records.receiver_m.copy()
-    for (receiver, flight), (time_s, place_m) in records.tracks.items():
-        rows = (records.receiver == receiver) & (records.flight == flight) & np.isfinite(records.time_s)
-        if rows.any():
-            for axis in range(3):
-                receiver_m[rows, axis] = np.interp(records.time_s[rows] + offset_s, time_s, place_m[:, axis])
+    timed = np.flatnonzero(np.isfinite(records.time_s))
+    order = timed[np.argsort(records.flight[timed], kind="stable")]
+    flights, first = np.unique(records.flight[order], return_index=True)
+    for flight, rows in zip(flights.tolist(), np.split(order, first[1:])):
+        time_s, place_m = records.tracks[receiver, flight]
+        for axis in range(3):
+            receiver_m[rows, axis] = np.interp(records.time_s[rows] + offset_s, time_s, place_m[:, axis])
     return records.with_receivers(receiver_m)
