@@ -182,13 +182,11 @@ def recovered(effect: dict, report: dict) -> dict:
     name = effect["name"]
     if name == "receiver_gain_offset":
         return {"offset_error_db": _near(values[f"offset_db[{effect['receiver']}]"] - effect["offset_db"])}
-    if name == "receiver_drift":
-        size = effect["step_db"] if effect["kind"] == "step" else -effect["final_db"]
-        mine = [value for label, value in values.items() if label.endswith(f"_db[{effect['receiver']}]")]
-        return {"amplitude_error_db": _near(mine[0] - size)} if mine else {}
-    if name == "device_drift":
-        size = effect["step_db"] if effect["kind"] == "step" else effect["last_db"]
-        mine = [value for label, value in values.items() if label.endswith(f"_db[{effect['device']}]")]
+    if name in ("receiver_drift", "device_drift"):
+        size = {"step": effect.get("step_db"), "ageing": effect.get("last_db"),
+                "warm_up": -effect.get("final_db", np.nan)}[effect["kind"]]
+        end = effect[name.removesuffix("_drift")]
+        mine = [value for label, value in values.items() if label.endswith(f"_db[{end}]")]
         return {"amplitude_error_db": _near(mine[0] - size)} if mine else {}
     if name == "receiver_clock_offset":
         late_s = values.get(f"positions_late_by_s[{effect['receiver']}]", np.nan)

@@ -139,7 +139,8 @@ class Twin:
 
         The mean is given below sensitivity, too; attribute `gain_limit_db` says where detection ends.
         """
-        self.warn_of_another_scene(scene)
+        scene_hash = scene.content_hash()
+        self._warn_of_another_scene(scene, scene_hash)
         predict = self.predictor(scene)
         known = np.flatnonzero(np.isfinite(self.device_m).all(axis=1))
         receiver_m = scene.lattice.positions_m
@@ -155,14 +156,14 @@ class Twin:
         if self.level == "rssi_dbm":
             mean_db -= scene.config.radio.tx_power_dbm
         attributes = {"source": f"twin:{self._described()}", "frequency_hz": scene.config.radio.frequency_hz,
-                      "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene.content_hash(),
+                      "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene_hash,
                       "radiotwin_version": radiotwin.__version__}
         names = [self.devices[i].device for i in known]
         return RadioMap.build(names, scene.lattice, mean_db, los, sigma_db, attributes)
 
-    def warn_of_another_scene(self, scene: Scene) -> None:
+    def _warn_of_another_scene(self, scene: Scene, scene_hash: str) -> None:
         """Warn where the twin was learnt elsewhere."""
-        if self.provenance.get("scene_hash") not in (None, scene.content_hash()):
+        if self.provenance.get("scene_hash") not in (None, scene_hash):
             warnings.warn(f"the twin was learnt in another scene ({self.provenance.get('scene')}) than {scene.folder}, "
                           "or this one has changed since: geometry, radio or declared devices differ", stacklevel=3)
 
@@ -241,7 +242,7 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
             indoors with `raytrace`.
     """
     if start is not None:
-        start.warn_of_another_scene(scene)
+        start._warn_of_another_scene(scene, scene.content_hash())
     if model == RAYTRACE:
         if allow_indoor:
             raise BadInput(f"model {RAYTRACE} follows paths outside buildings only; take another model where unknown "

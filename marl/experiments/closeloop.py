@@ -6,6 +6,7 @@ from pathlib import Path
 from marl.experiments.tables import markdown, number
 
 RESULTS = Path("docs/results")
+UNITS = {"db": "dB", "deg": "°", "m": "m", "s": "s"}
 FILES = ("closeloop_undeclared.json", "closeloop_null.json", "real_data.json")
 
 
@@ -35,7 +36,7 @@ def _case_row(name: str, case: dict) -> list[str]:
     if not hidden and not named:
         first = "no effect ✓"
     recovered = ", ".join(f"{name.replace('_error', '').rsplit('_', 1)[0].replace('_', ' ')} {value:+.1f} "
-                          f"{ {'db': 'dB', 'deg': '°'}.get(name.rsplit('_', 1)[1], 'm')}"
+                          f"{UNITS[name.rsplit('_', 1)[1]]}"
                           for found in case["recovered"] for name, value in found.items()
                           if "_error_" in name and value is not None)
     return [f"`{family}`", seed, first, _counted(named[1:]), recovered,

@@ -39,6 +39,7 @@ def search_between_flights(search: Search, base: Base, folds: Folds, seed: int, 
 
 def _search_one_kind(search: Search, effect: ReceiverDrift | DeviceDrift, base: Base, seed: int,
                      tell: Callable[[str], None]) -> None:
+    """The same for receivers, or for devices."""
     records = search.model.whole.records
     if not _stands_out(search.model, look_at(search.model, effect, 0)):
         return

@@ -75,8 +75,9 @@ class _Drift(Effect):
             nats, form, number = max(each for each in candidates if each[1] in self._forms)
             if nats > LEAST_NATS:
                 setting: Setting = {self.ends: {str(end): [form, float(number)]}}
-                if form == "ageing" or not self.of_receiver:  # is told from first to last, which other links are not
-                    setting["span_s"] = [records.first_s, records.last_s]  # to change
+                if form == "ageing" or not self.of_receiver:
+                    # It is told from first to last, and other links are not to change these.
+                    setting["span_s"] = [records.first_s, records.last_s]
                 found.append((nats, setting))
         return [setting for _, setting in sorted(found, key=lambda each: -each[0])[:MOST_TRIED]]
 
@@ -158,12 +159,11 @@ class DeviceDrift(_Drift):
         return sorted(set(super()._members(records)) & set(measured(flights, LEAST_FLIGHTS)))
 
     def lacks(self, records) -> str | None:
-        if super().lacks(records) is not None:
-            return super().lacks(records)
         members = self._members(records)
         if len(members) > MOST_DEVICES:
             return f"{len(members)} devices are too many to ask each; at most {MOST_DEVICES}"
-        return None if members else f"no device has {LEAST_LINKS} links on {LEAST_FLIGHTS} flights"
+        no_device = None if members else f"no device has {LEAST_LINKS} links on {LEAST_FLIGHTS} flights"
+        return super().lacks(records) or no_device
 
 
 def _shape(form: str, number: float, since_first_s: np.ndarray, time_s: np.ndarray,
