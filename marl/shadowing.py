@@ -39,11 +39,8 @@ def twin_shadowing(twin: Twin, radio_map: RadioMap, measurements: Measurements, 
                    seed: int) -> Shadowing:
     """That of a twin's errors: what its field says, where it interpolates and so leaves next to nothing over of what it
     has learnt from; otherwise what `fit_shadowing` finds."""
-    if isinstance(twin.channel, RegressionKriging):
-        found = Shadowing(twin.channel.field.share, twin.channel.field.length_m)
-    elif "shadowing" in twin.effects:
-        settings = twin.effects["shadowing"]["settings"]
-        found = Shadowing(settings["share"], settings["length_m"])
+    if twin.residual_field is not None:
+        found = Shadowing(twin.residual_field.share, twin.residual_field.length_m)
     else:
         found = fit_shadowing(radio_map, measurements, limit_db, seed)
     # What is over within a cell cannot be told from what is over within a slot, and next to nothing takes as long to

@@ -9,8 +9,8 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from radiotwin.closeloop.corrected import corrected_twin
-    from radiotwin.closeloop.report import make_report
+    from radiotwin.closeloop.corrected_twin import corrected_twin
+    from radiotwin.closeloop.result_file import make_report
     from radiotwin.closeloop.run import Loop, close_loop
     from radiotwin.compare import Comparison, compare_models, score_map, split_flights
     from radiotwin.errors import BadInput, RunFailed
@@ -30,8 +30,8 @@ except PackageNotFoundError:  # run from a source tree that was never installed
     __version__ = "0+source"
 
 _MODULES = {
-    "closeloop.corrected": ["corrected_twin"],
-    "closeloop.report": ["make_report"],
+    "closeloop.corrected_twin": ["corrected_twin"],
+    "closeloop.result_file": ["make_report"],
     "closeloop.run": ["Loop", "close_loop"],
     "compare": ["Comparison", "compare_models", "score_map", "split_flights"],
     "errors": ["BadInput", "RunFailed"],

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from radiotwin.channel import MODELS
-from radiotwin.channel.likelihood import mean_if_detected
+from radiotwin.inference.gaussian import mean_if_detected
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.progress import progress
@@ -15,6 +14,7 @@ from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin, fit_twin
 
+DEFAULT_MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging")
 CLASSES = ("all", "LoS", "NLoS")
 
 
@@ -92,7 +92,7 @@ def split_flights(measurements: Measurements, held_out: int) -> tuple[Measuremen
 
 
 def compare_models(train: Measurements, test: Measurements, scene: Scene, truth: RadioMap | None, *, seed: int,
-                   models: tuple[str, ...] = tuple(MODELS), twins: dict[str, Twin] | None = None,
+                   models: tuple[str, ...] = DEFAULT_MODELS, twins: dict[str, Twin] | None = None,
                    maps: dict[str, RadioMap] | None = None) -> Comparison:
     """Fit every model to the same links and judge all of them on the same others.
 
@@ -110,7 +110,7 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene, truth:
     """
     _check(test, scene, truth, twins or {})
     for twin in (twins or {}).values():
-        twin.predictor(scene)  # complains before the others are fitted, which takes long
+        twin.require_map(scene)  # complains before the others are fitted, which takes long
     fitted = {}
     with progress("comparing models", total=len(models)) as advance:
         for model in models:
@@ -173,9 +173,10 @@ def predict(twin: Twin, scene: Scene, measurements: Measurements) -> np.ndarray:
     row = np.array([row_of.get(name, -1) for name in measurements.devices["device"]])[measurements.device_index]
     predicted_db = np.full(len(row), np.nan)
     if (row >= 0).any():
-        mean_db, sigma_db, _ = twin.predictor(scene)(measurements.receiver_m[row >= 0], row[row >= 0])
+        links = twin.links(measurements.receiver_m[row >= 0], row[row >= 0], scene)
+        found = twin.predict(links)
         limit_db = -np.inf if twin.limit_db is None else twin.limit_db
-        predicted_db[row >= 0] = mean_if_detected(mean_db, sigma_db, limit_db)
+        predicted_db[row >= 0] = mean_if_detected(found.mean_db, found.sd_db, limit_db)
     return predicted_db
 
 

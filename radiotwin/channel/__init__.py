@@ -1,7 +1,8 @@
-"""Channel models: gain of a link from its geometry, learned from measurements."""
+"""Channel models: level of a link from its geometry, learnt from measurements."""
 
 from radiotwin.channel.base import ChannelModel, check_fit_data
-from radiotwin.channel.links import Links, make_links
-from radiotwin.channel.store import MODELS, load_channel, save_channel
+from radiotwin.channel.registry import channel_models, channel_named, register
+from radiotwin.channel.store import load_channel, save_channel
 
-__all__ = ["MODELS", "ChannelModel", "Links", "check_fit_data", "load_channel", "make_links", "save_channel"]
+__all__ = ["ChannelModel", "channel_models", "channel_named", "check_fit_data", "load_channel",
+           "register", "save_channel"]

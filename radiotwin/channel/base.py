@@ -8,10 +8,12 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 
-from radiotwin.channel.links import Links
+from radiotwin.links import LinkGeometry
 from radiotwin.errors import BadInput
 
-MIN_DETECTED = 20
+MIN_DETECTED = 20  # links that a channel can be learnt from
+LEVEL_SD_DB, SLOPE_SD_DB = 20.0, 10.0  # priors of a refitted level, and of its slope per decade
+ANY_LEVEL_SD_DB = 300.0  # prior of a level that is free
 
 
 class ChannelModel(ABC):
@@ -22,7 +24,7 @@ class ChannelModel(ABC):
     """True where predictions depend on line of sight, which only a 3D map can tell."""
 
     @abstractmethod
-    def fit(self, links: Links, level_db: np.ndarray, limit_db: float | None, seed: int) -> Self:
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None, seed: int) -> Self:
         """Fits to n links and returns itself.
 
         level_db: (n,) gain [dB] or received power [dBm], NaN = not detected. limit_db: the level below which the
@@ -32,7 +34,7 @@ class ChannelModel(ABC):
         """
 
     @abstractmethod
-    def predict(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
+    def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Mean [dB] and standard deviation [dB] of n links, (n,) each, before any limit of detection."""
 
     @property
@@ -40,6 +42,39 @@ class ChannelModel(ABC):
         """The part that holds for any device, measured before or not: the model itself, unless it keeps something
         per device."""
         return self
+
+    follows_paths: ClassVar[bool] = False
+    """Whether predictions follow paths over the map, so that `quick` is much quicker."""
+
+    @property
+    def quick(self) -> ChannelModel:
+        """A quicker model of what small changes do: moved ends, other lines of sight."""
+        return self
+
+    def level_columns(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        """Return what of the channel is fitted again together with effects.
+
+        By default, a level and a slope for each class of line of sight, or one of both for all links
+        where there is no map or the model does not use it.
+
+        Args:
+            links: n links.
+
+        Returns:
+            (n, p) design, and (p,) prior standard deviations [dB].
+        """
+        slope = np.log10(links.distance_m / 100.0)
+        classes = [links.los, ~links.los] if self._by_class(links) else [np.ones(len(links), bool)]
+        columns = [column for each in classes for column in (each, each * slope)]
+        prior_sd_db = np.tile([LEVEL_SD_DB, SLOPE_SD_DB], len(classes))
+        return np.column_stack(columns).astype(float), prior_sd_db
+
+    def error_group(self, links: LinkGeometry) -> np.ndarray:
+        """Return the index (n,) of the error scale: with line of sight 1, without 0, or 0 for all."""
+        return links.los.astype(int) if self._by_class(links) else np.zeros(len(links), dtype=int)
+
+    def _by_class(self, links: LinkGeometry) -> bool:
+        return links.city is not None and self.uses_map
 
     @abstractmethod
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -51,7 +86,7 @@ class ChannelModel(ABC):
         """The model that `state` described."""
 
 
-def check_fit_data(links: Links, level_db: np.ndarray, *, needs_los: bool) -> None:
+def check_fit_data(links: LinkGeometry, level_db: np.ndarray, *, needs_los: bool) -> None:
     """Raises BadInput where no channel can be learned from the links.
 
     Every model needs MIN_DETECTED detected links. With `needs_los` (a model with `uses_map`, and a map given) at
@@ -78,8 +113,8 @@ def check_fit_data(links: Links, level_db: np.ndarray, *, needs_los: bool) -> No
 
 
 def drop_uninformative(
-    links: Links, level_db: np.ndarray, limit_db: float | None
-) -> tuple[Links, np.ndarray]:
+    links: LinkGeometry, level_db: np.ndarray, limit_db: float | None
+) -> tuple[LinkGeometry, np.ndarray]:
     """The links that a fit can use, and their levels (n,) [dB]: all of them, or, without a limit of detection, the
     detected ones. Raises BadInput where too few are detected or a level is infinite."""
     level_db = np.asarray(level_db, float)

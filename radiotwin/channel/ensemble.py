@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from radiotwin.channel.adam import Adam
-from radiotwin.channel.likelihood import gaussian_nll_torch
+from radiotwin.inference.gaussian import gaussian_nll_torch
 from radiotwin.progress import progress
 
 WEIGHTS = ("w1", "b1", "w2", "b2", "w3", "b3")

@@ -7,8 +7,8 @@ from typing import Any, Self
 import numpy as np
 
 from radiotwin.channel.base import ChannelModel, drop_uninformative
-from radiotwin.channel.censored_line import LogDistanceLine, fit_line
-from radiotwin.channel.links import Links
+from radiotwin.inference.censored_line import LogDistanceLine, fit_line
+from radiotwin.links.geometry import LinkGeometry
 
 
 class LogDistance(ChannelModel):
@@ -20,13 +20,13 @@ class LogDistance(ChannelModel):
     def __init__(self, line: LogDistanceLine | None = None) -> None:
         self.line: LogDistanceLine = line  # type: ignore[assignment]  # None only until it is fitted
 
-    def fit(self, links: Links, level_db: np.ndarray, limit_db: float | None, seed: int = 0) -> Self:
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None, seed: int = 0) -> Self:
         """Maximum likelihood with censoring; see ChannelModel.fit. The seed changes nothing."""
         links, level_db = drop_uninformative(links, level_db, limit_db)
         self.line = fit_line(links.log_distance, level_db, limit_db)
         return self
 
-    def predict(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
+    def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Mean and standard deviation [dB], (n,) each."""
         return self.line.mean_db(links.log_distance), np.full(len(links), self.line.sigma_db)
 

@@ -7,8 +7,8 @@ from typing import Any, Self
 import numpy as np
 
 from radiotwin.channel.base import ChannelModel, drop_uninformative
-from radiotwin.channel.likelihood import standardised
-from radiotwin.channel.links import Links
+from radiotwin.inference.gaussian import standardised
+from radiotwin.links.geometry import LinkGeometry
 from radiotwin.channel.residual_field import ResidualField
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 
@@ -22,7 +22,7 @@ class RegressionKriging(ChannelModel):
     A link that was not detected enters with its conditional mean below the limit: left out, the map would fill a
     shadow with the detected levels around it.
 
-    A device is its index in `Links.device`: use the same indices for fitting and predicting.
+    A device is its index in `LinkGeometry.device`: use the same indices for fitting and predicting.
     """
 
     name = "regression_kriging"
@@ -32,7 +32,7 @@ class RegressionKriging(ChannelModel):
         self.law = SegmentedLogDistance()
         self.field = ResidualField()
 
-    def fit(self, links: Links, level_db: np.ndarray, limit_db: float | None, seed: int = 0) -> Self:
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None, seed: int = 0) -> Self:
         """Law first, then the process on its residual; see ChannelModel.fit. The seed picks points where there are
         too many."""
         links, level_db = drop_uninformative(links, level_db, limit_db)
@@ -42,7 +42,7 @@ class RegressionKriging(ChannelModel):
         self.field.fit(links.device, links.receiver_m, residual, seed)
         return self
 
-    def predict(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
+    def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Mean and standard deviation [dB], (n,) each."""
         mean_db, sigma_db = self.law.predict(links)
         mean, sigma = self.field.predict(links.device, links.receiver_m)

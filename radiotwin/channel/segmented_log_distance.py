@@ -9,8 +9,8 @@ from typing import Any, Self
 import numpy as np
 
 from radiotwin.channel.base import MIN_DETECTED, ChannelModel, drop_uninformative
-from radiotwin.channel.censored_line import LogDistanceLine, fit_line, shift_line
-from radiotwin.channel.links import Links
+from radiotwin.inference.censored_line import LogDistanceLine, fit_line, shift_line
+from radiotwin.links.geometry import LinkGeometry
 
 NLOS_LOSS_DB, NLOS_LOSS_SPREAD_DB = 20.0, 10.0
 """Prior of the gap between the lines: in 3GPP TR 38.901 UMi, at 100 m and 2.4 GHz, LoS lies 19 dB above NLoS."""
@@ -40,7 +40,7 @@ class SegmentedLogDistance(ChannelModel):
         self.nlos: LogDistanceLine = nlos  # type: ignore[assignment]
         self.borrowed = borrowed
 
-    def fit(self, links: Links, level_db: np.ndarray, limit_db: float | None, seed: int = 0) -> Self:
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None, seed: int = 0) -> Self:
         """Maximum likelihood with censoring, each class by itself; see ChannelModel.fit. The seed changes nothing."""
         links, level_db = drop_uninformative(links, level_db, limit_db)
         data = {
@@ -68,7 +68,7 @@ class SegmentedLogDistance(ChannelModel):
         self.los, self.nlos = lines["los"], lines["nlos"]
         return self
 
-    def predict(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
+    def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Mean and standard deviation [dB], (n,) each."""
         intercept_db, exponent, sigma_db = self.state()[0]["lines"][links.los.astype(np.intp)].T
         return intercept_db + 10.0 * exponent * links.log_distance, sigma_db

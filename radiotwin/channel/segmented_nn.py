@@ -8,15 +8,15 @@ import numpy as np
 import torch
 
 from radiotwin.channel.base import ChannelModel, drop_uninformative
-from radiotwin.channel.censored_line import fit_sigma
+from radiotwin.inference.censored_line import fit_sigma
 from radiotwin.channel.ensemble import MEMBERS, WEIGHTS, TrainingData, forward, one_thread, train
-from radiotwin.channel.links import Links
+from radiotwin.links.geometry import LinkGeometry
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 
 BLOCK_M = 100.0
 TABLE = 129
 TRIM = 0.005
-LEAST_SPAN = np.array([0.1, 10.0])
+MIN_SPAN = np.array([0.1, 10.0])
 """Least range of log-distance and of height difference [m] that counts as a difference."""
 
 
@@ -45,7 +45,7 @@ class SegmentedNN(ChannelModel):
         self.sigma_db = np.ones(2)
         self.weights: dict[str, np.ndarray] = {}
 
-    def fit(self, links: Links, level_db: np.ndarray, limit_db: float | None, seed: int = 0) -> Self:
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None, seed: int = 0) -> Self:
         """Law first, then the residual; see ChannelModel.fit. Equal data and seed give equal bits."""
         links, level_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)
@@ -80,7 +80,7 @@ class SegmentedNN(ChannelModel):
         self._tabulate()
         return self
 
-    def predict(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
+    def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Mean and standard deviation [dB], (n,) each."""
         segment = links.los.astype(np.intp)
         scale = (TABLE - 1) / np.maximum(self.high - self.low, 1e-9)
@@ -103,7 +103,7 @@ class SegmentedNN(ChannelModel):
         place = np.clip(place, self.low[segment], self.high[segment])
         elevation_rad = np.arcsin(np.clip(place[:, 1] / 10.0 ** place[:, 0], -1.0, 1.0))
         low, high = self.low.min(axis=0), self.high.max(axis=0)
-        scaled = (2.0 * place - low - high) / np.maximum(high - low, LEAST_SPAN)
+        scaled = (2.0 * place - low - high) / np.maximum(high - low, MIN_SPAN)
         return np.column_stack([scaled[:, 0], elevation_rad, 2.0 * segment - 1.0, scaled[:, 1]])
 
     def _tabulate(self) -> None:
@@ -136,13 +136,13 @@ class SegmentedNN(ChannelModel):
         return model
 
 
-def _place(links: Links) -> np.ndarray:
+def _place(links: LinkGeometry) -> np.ndarray:
     """(n, 2) log-distance and height of the receiver above the device [m]: with these as axes, unlike elevation, the
     box around the data of a few altitudes is full of data."""
     return np.column_stack([links.log_distance, links.receiver_m[:, 2] - links.device_m[:, 2]])
 
 
-def _folds(links: Links, rng: np.random.Generator) -> np.ndarray:
+def _folds(links: LinkGeometry, rng: np.random.Generator) -> np.ndarray:
     """(n,) the member that holds a link out: whole blocks of one device and BLOCK_M of ground go together, because
     neighbouring links share their obstacles and would only tell a member what it has learned already."""
     cell = np.floor(links.receiver_m[:, :2] / BLOCK_M).astype(np.int64)

@@ -10,17 +10,9 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from radiotwin.channel.base import ChannelModel
-from radiotwin.channel.log_distance import LogDistance
-from radiotwin.channel.regression_kriging import RegressionKriging
-from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.channel.segmented_nn import SegmentedNN
+from radiotwin.channel.registry import channel_models
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
-
-MODELS: dict[str, type[ChannelModel]] = {
-    model.name: model for model in (LogDistance, SegmentedLogDistance, SegmentedNN, RegressionKriging)
-}
-
 
 def save_channel(model: ChannelModel, path: str | Path) -> None:
     """Writes a fitted model; `load_channel` gives one with equal predictions."""
@@ -40,9 +32,9 @@ def load_channel(path: str | Path) -> ChannelModel:
         bad = [name for name, array in arrays.items() if not np.isfinite(array).all()]
         if bad:
             raise ValueError(f"{', '.join(bad)} holds values that are not finite")
-        return MODELS[header["model"]].from_state(arrays, header["settings"])
+        return channel_models()[header["model"]].from_state(arrays, header["settings"])
     except (OSError, SafetensorError, KeyError, ValueError, TypeError, IndexError, RuntimeError) as error:
         raise BadInput(
-            f"{path}: not a whole channel model of one of {', '.join(MODELS)} ({type(error).__name__}: {error}); "
+            f"{path}: not a whole channel model of one of {', '.join(channel_models())} ({type(error).__name__}: {error}); "
             "run `radiotwin fit` again"
         ) from error

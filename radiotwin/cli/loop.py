@@ -30,11 +30,11 @@ def close_loop(
     seed: Annotated[int, typer.Option(min=0, help="Of folds, fits and permutations.")] = 0,
 ) -> None:
     """Find what the model lacks, add it, and say by how much the error falls."""
-    from radiotwin.closeloop.corrected import corrected_twin
+    from radiotwin.closeloop.corrected_twin import corrected_twin
     from radiotwin.closeloop.corrected_scene import check_corrected_target, write_corrected_scene
     from radiotwin.closeloop.figures import draw_figures
     from radiotwin.closeloop.page import lead, write_page
-    from radiotwin.closeloop.report import make_report, write_report
+    from radiotwin.closeloop.result_file import make_report, write_report
     from radiotwin.closeloop.residual_table import write_residuals
     from radiotwin.closeloop.run import close_loop as run
     from radiotwin.files import require_writable
@@ -58,8 +58,8 @@ def close_loop(
     write_residuals(loop, out / "residuals.csv.gz")
     corrected_twin(loop, world).save(out / "twin")
     write_page(report, out, f"What the model of {measurements.name} lacks")
-    for remark in report["remarks"]:
-        say(f"note: {remark}")
+    for note in report["notes"]:
+        say(f"note: {note}")
     error = report["error"]
     rows = [[name, when, float(both[when]["rmse_db"] or "nan"), float(both[when]["mae_db"] or "nan"),
              float(both[when]["bias_db"] if both[when]["bias_db"] is not None else "nan")]
@@ -91,13 +91,12 @@ def locate(
     out: Annotated[Path, typer.Option("--out", "-o", help="Table of the places.")] = Path("located.csv"),
 ) -> None:
     """Find devices of role unknown by a corrected model, with or without a 3D map."""
-    from radiotwin.closeloop.corrected import corrected_model
-    from radiotwin.closeloop.locate_file import locate_file, off_by
     from radiotwin.files import atomic_path, require_writable
     from radiotwin.measurements import read_devices, read_measurements
     from radiotwin.progress import progress
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin
+    from radiotwin.twin.locate import locate_file, position_errors
 
     show_warnings_plainly()
     data, known = read_measurements(measurements, devices), Twin.load(twin)
@@ -106,13 +105,13 @@ def locate(
     unknown = int((data.devices["role"] == "unknown").sum())
     with progress("locating", total=unknown) as advance:
         world = Scene.load(scene) if scene else None
-        places, remarks = locate_file(data, known, corrected_model(known, world), world, lambda: advance(1))
-    for remark in remarks:
-        say(f"note: {remark}")
+        places, notes = locate_file(data, known, world, lambda: advance(1))
+    for note in notes:
+        say(f"note: {note}")
     with atomic_path(out) as temporary:
         places.to_csv(temporary, index=False)
     if true is not None:
-        error = off_by(places, true)
+        error = position_errors(places, true)
         print_rows("How far off [m]", {"devices": "right", "median": "right", "90 %": "right",
                                        "within the 90 % radius": "right"},
                    [[error["devices"], error["median_m"], error["ninety_m"], f"{error['within']:.0%}"]])

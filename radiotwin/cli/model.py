@@ -133,14 +133,12 @@ def compare(
     seed: Annotated[int, typer.Option(min=0, help="Of the fits and the search.")] = 0,
 ) -> None:
     """Hold all channel models against flights they have not seen, and against the truth map where there is one."""
-    from radiotwin.channel import MODELS
     from radiotwin.cli.world import read_truth
-    from radiotwin.compare import compare_models, split_flights
+    from radiotwin.compare import DEFAULT_MODELS, compare_models, split_flights
     from radiotwin.comparison_output import judge_also, write_comparison
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
     from radiotwin.scene import Scene
-    from radiotwin.twin import RAYTRACE
 
     show_warnings_plainly()
     require_writable(out / "compare.json")
@@ -148,7 +146,7 @@ def compare(
     train, test = split_flights(read_measurements(measurements, devices), held_out)
     truth_map = read_truth(world, truth) if truth else None
     twins, maps = judge_also(also or [], truth_map, test.flights)
-    models = (*MODELS, *[RAYTRACE] * raytrace)
+    models = (*DEFAULT_MODELS, *["raytrace"] * raytrace)
     comparison = compare_models(train, test, world, truth_map, seed=seed, models=models, twins=twins, maps=maps)
     write_comparison(comparison, world, truth_map, out)
     print_comparison(comparison)

@@ -1,1 +1,1 @@
-"""Close the loop: find what a model lacks in measured data, trace it to an effect, add it, say what it brought."""
+"""Closing the loop: find what a twin lacks in measured data, trace it to an effect, add that."""

@@ -11,9 +11,10 @@ import trimesh
 from radiotwin.closeloop.run import Loop
 from radiotwin.effects.boxes import Box
 from radiotwin.effects.missing_obstacle import MissingObstacle
-from radiotwin.effects.position_errors import DevicePositionError, site_of
+from radiotwin.effects.position_errors import DevicePositionError
 from radiotwin.effects.removed_obstacle import RemovedObstacle, buildings
 from radiotwin.errors import BadInput
+from radiotwin.links import site_of
 from radiotwin.files import atomic_folder, require_writable
 from radiotwin.scene import Scene
 from radiotwin.scene.build import check_target
@@ -58,16 +59,16 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
     Raises:
         BadInput: the folder cannot be written or holds something else, or what was found makes no scene.
     """
-    parts = loop.after.whole.parts
+    effects = loop.after.whole.effects
     label, centres_m = buildings(scene.city)
-    gone = [part.setting["building"] for part in parts if isinstance(part.effect, RemovedObstacle)]
+    gone = [each.params.building for each in effects if isinstance(each.effect, RemovedObstacle)]
     keep = ~np.isin(label, gone)
     config, moves = _moved(loop, scene, CityMap(scene.city.vertices, scene.city.faces[keep]) if keep.any() else None)
     free_m = np.array([*((d.x_m, d.y_m, d.z_m) for d in config.devices),
                        *((x_m, y_m, uav.altitude_m) for uav in config.uavs
                          for x_m, y_m in ((uav.start_x_m, uav.start_y_m), (uav.terminal_x_m, uav.terminal_y_m)))])
-    boxes = [_pulled_back(Box(*part.setting["box"]), free_m.reshape(-1, 3)) for part in parts
-             if isinstance(part.effect, MissingObstacle)]
+    boxes = [_pulled_back(Box(*each.params.box), free_m.reshape(-1, 3)) for each in effects
+             if isinstance(each.effect, MissingObstacle)]
     changes = [f"a box of {box.length_m:.0f} x {box.width_m:.0f} m, {box.height_m:.0f} m high, stands at "
                f"({box.x_m:.0f}, {box.y_m:.0f}) m" for box in boxes]
     changes += ["the building at ({:.0f}, {:.0f}) m, {:.0f} m high, is taken out".format(*centres_m[building])
@@ -88,13 +89,13 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
 
 def _moved(loop: Loop, scene: Scene, city: CityMap | None) -> tuple[SceneConfig, list[str]]:
     """The configuration with anchors where they were found, as near as `city` leaves room, and what was moved."""
-    records = loop.after.whole.records
+    links = loop.after.whole.links
     found_m: dict[str, np.ndarray] = {}
-    for part in loop.after.whole.parts:
-        if isinstance(part.effect, DevicePositionError):
-            for row in site_of(records, part.setting["device"]):
-                name = records.device_names[row]
-                found_m[name] = found_m.get(name, records.device_m[row, :2]) + part.setting["move_m"]
+    for each in loop.after.whole.effects:
+        if isinstance(each.effect, DevicePositionError):
+            for row in site_of(links, each.params.device):
+                name = links.device_names[row]
+                found_m[name] = found_m.get(name, links.device_m[row, :2]) + each.params.move_m
     devices, changes = [], []
     for device in scene.config.devices:
         if device.device in found_m:

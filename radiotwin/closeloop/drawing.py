@@ -7,13 +7,13 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from radiotwin.closeloop.records import Records
+from radiotwin.links.link_data import LinkData
 from radiotwin.closeloop.words import variable
 from radiotwin.files import atomic_path
 
 BEFORE, AFTER, FITTED, FOUND = "#c2571a", "#1f6f8b", "#22272c", "#7a0177"
 RESIDUAL_COLOURS = "RdBu"  # red: measured less than predicted
-LEAST_LINKS = 6  # of a mean that is drawn
+MIN_LINKS = 6  # of a mean that is drawn
 DPI = 110
 TIMES = (("days", 86_400.0), ("h", 3600.0), ("s", 1.0))
 
@@ -53,19 +53,19 @@ def means(level: np.ndarray, value: np.ndarray, residual_db: np.ndarray, block: 
     # No smaller than that of independent links, whose deviations cancel where a bin has one block.
     error = np.sqrt(np.maximum(np.bincount(pairs[:, 0], weights=sums**2), rest)) / np.maximum(count, 1)
     at = np.bincount(level, weights=value) / np.maximum(count, 1)
-    used = count >= LEAST_LINKS
+    used = count >= MIN_LINKS
     return Means(at[used], mean[used], error[used])
 
 
-def on_axis(records: Records, name: str, value: np.ndarray) -> tuple[np.ndarray, str]:
+def on_axis(links: LinkData, name: str, value: np.ndarray) -> tuple[np.ndarray, str]:
     """A variable as it is drawn, and its label; times count from the first measurement, in units that suit them."""
     words, unit = variable(name)
     if name == "time_s":
-        words, value = "time since the first measurement", value - records.first_s
+        words, value = "time since the first measurement", value - links.first_s
         span_s = np.nanmax(value, initial=0.0)
         unit, size_s = next((unit, size_s) for unit, size_s in TIMES if span_s >= 3 * size_s or unit == "s")
         value = value / size_s
-    unit = "dBm" if unit == "dB" and not records.is_gain else unit
+    unit = "dBm" if unit == "dB" and not links.is_gain else unit
     return value, f"{words} [{unit}]" if unit else words
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from radiotwin.closeloop.acting import BINS, Acting, acting_alone, acts_through
+from radiotwin.closeloop.partial_effects import BINS, Acting, acting_alone, acts_through
 from radiotwin.closeloop.drawing import (
     AFTER,
     BEFORE,
@@ -23,11 +23,11 @@ from radiotwin.closeloop.drawing import (
 from radiotwin.closeloop.folds import evidence_blocks
 from radiotwin.closeloop.map_figures import Ground, draw_added, draw_links
 from radiotwin.closeloop.run import Loop
-from radiotwin.closeloop.shadowing import NAME as LAST_RESORT
-from radiotwin.closeloop.structure import variables
+from radiotwin.effects.correlated_shadowing import NAME as LAST_RESORT
+from radiotwin.inference.residual_tests import variables
 from radiotwin.closeloop.words import parameter
 
-MOST_BARS = 40
+MAX_BARS = 40
 EXPLAINED = 0.3  # share of what an effect does that a variable must stand for, to be drawn over it
 PLACED = ("box", "building", "move_m", "place_m")
 DIRECTIONS = {"device": "azimuth_deg", "receiver": "body_azimuth_deg"}
@@ -47,15 +47,15 @@ def draw_effects(loop: Loop, ground: Ground, folder: Path) -> None:
 
 def _draw(acting: Acting, ground: Ground, path: Path) -> None:
     """The picture that suits the effect."""
-    effect, setting = acting.part.effect, acting.part.setting
-    if any(key in setting for key in PLACED):
+    effect, params = acting.part.effect, acting.part.params
+    if any(key in params for key in PLACED):
         draw_links(acting.part, acting.without_db, acting.with_db, ground, path)
     elif effect.stage == "paths":
         _draw_histogram(acting, path)
     elif effect.name.endswith("_gain_offset") or effect.stage in ("detection", "limit"):
         _draw_bars(acting, path)
     elif effect.stage == "receiver":
-        unit = "dB" if acting.records.is_gain else "dBm"
+        unit = "dB" if acting.links.is_gain else "dBm"
         _draw_over(acting, acting.without_db, f"expected level [{unit}]", path, reading=True)
     elif effect.name in ("antenna_pattern", "body_shadowing"):
         _draw_compass(acting, path)
@@ -64,19 +64,19 @@ def _draw(acting: Acting, ground: Ground, path: Path) -> None:
         if share < EXPLAINED:
             draw_added(acting.added_db, ground, path)
         else:
-            value = variables(acting.records, acting.without_db)[name]
-            _draw_over(acting, *on_axis(acting.records, name, value), path)
+            value = variables(acting.links, acting.without_db)[name]
+            _draw_over(acting, *on_axis(acting.links, name, value), path)
 
 
 def _draw_over(acting: Acting, value: np.ndarray, label: str, path: Path, reading: bool = False) -> None:
     """Residual without the effect against a variable, and what was fitted; or readings against what is expected."""
-    records = acting.records
+    links = acting.links
     figure, axes = _grid(len(acting.panels()))
-    block = evidence_blocks(records)
+    block = evidence_blocks(links)
     for number, (ax, (name, rows)) in enumerate(zip(axes, acting.panels())):
         rows = rows[np.isfinite(value[rows])]
         level = bins(value[rows], BINS)
-        offset_db = value if reading else np.zeros(len(records))
+        offset_db = value if reading else np.zeros(len(links))
         found, fitted = (means(level, value[rows], (offset_db + part_db)[rows], block[rows])
                          for part_db in (acting.residual_db, acting.added_db))
         ax.plot(value[rows], (offset_db + acting.residual_db)[rows], ".", color="0.8", markersize=2, zorder=0,
@@ -100,8 +100,8 @@ def _draw_over(acting: Acting, value: np.ndarray, label: str, path: Path, readin
 
 def _draw_compass(acting: Acting, path: Path) -> None:
     """Residual without the effect round the compass, and the fitted pattern."""
-    records, block = acting.records, evidence_blocks(acting.records)
-    angle_deg = variables(records, acting.without_db)[DIRECTIONS[acting.members or "device"]]
+    links, block = acting.links, evidence_blocks(acting.links)
+    angle_deg = variables(links, acting.without_db)[DIRECTIONS[acting.members or "device"]]
     figure, axes = _grid(len(acting.panels()), projection="polar")
     for ax, (name, rows) in zip(axes, acting.panels()):
         rows = rows[np.isfinite(angle_deg[rows])]
@@ -136,8 +136,8 @@ def _round(fitted: Means) -> tuple[np.ndarray, np.ndarray]:
 def _draw_histogram(acting: Acting, path: Path) -> None:
     """Residuals of the links that it acts on, without and with it."""
     rows = np.isfinite(acting.residual_db)
-    nlos = acting.part.effect.nlos_only and (rows & ~acting.records.los).any()
-    rows = rows & ~acting.records.los if nlos else rows
+    nlos = acting.part.effect.nlos_only and (rows & ~acting.links.los).any()
+    rows = rows & ~acting.links.los if nlos else rows
     residuals_db = acting.residual_db[rows], acting.residual_db[rows] - acting.added_db[rows]
     most_db = float(np.quantile(np.abs(residuals_db[0]), 0.995)) + 1.0
     figure = new_figure(7.0, 3.8)
@@ -155,7 +155,7 @@ def _draw_histogram(acting: Acting, path: Path) -> None:
 
 def _draw_bars(acting: Acting, path: Path) -> None:
     """A value with its 90 % interval for each member."""
-    chosen = sorted(acting.parameters.items(), key=lambda item: -abs(item[1].value))[:MOST_BARS]
+    chosen = sorted(acting.parameters.items(), key=lambda item: -abs(item[1].value))[:MAX_BARS]
     chosen.sort(key=lambda item: item[1].value)
     value = np.array([p.value for _, p in chosen])
     spread = np.abs(np.array([(p.value - p.low, p.high - p.value) for _, p in chosen]).T)
@@ -186,7 +186,7 @@ def _limits(everything_db: np.ndarray, drawn_db: np.ndarray) -> tuple[float, flo
 
 def _finish(figure, axes: list, acting: Acting, path: Path) -> None:
     if axes:
-        only = acting.records.los[acting.shown].all() and not acting.records.los.all()
+        only = acting.links.los[acting.shown].all() and not acting.links.los.all()
         figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, frameon=False,
                       title="links with line of sight" if only else None)
     save(figure, path)

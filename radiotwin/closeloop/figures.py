@@ -21,20 +21,20 @@ from radiotwin.closeloop.effect_figures import draw_effects
 from radiotwin.closeloop.folds import evidence_blocks
 from radiotwin.closeloop.map_figures import Ground, draw_level_map, draw_residual_map
 from radiotwin.closeloop.run import Loop, significant
-from radiotwin.closeloop.structure import variables
+from radiotwin.inference.residual_tests import variables
 from radiotwin.closeloop.words import LAST_RESORTS, plainly
 from radiotwin.scene import Scene
 
 BINS = 20
-MOST_PANELS = 6
-MOST_MEMBERS = 24  # receivers, devices or flights in one panel
+MAX_PANELS = 6
+MAX_MEMBERS = 24  # receivers, devices or flights in one panel
 ADDED = "what the effects add"
 PLACES = ("place_of_ray", "place_of_receiver")  # the map shows them
 
 
 def draw_figures(loop: Loop, scene: Scene | None, report: dict, folder: Path) -> None:
     """Write all pictures of a report into its folder."""
-    ground = Ground(loop.after.whole.records, scene)
+    ground = Ground(loop.after.whole.links, scene)
     draw_waterfall(report, folder / "waterfall.png")
     draw_residual_map(loop, ground, folder / "residual_map.png")
     draw_level_map(loop, ground, folder / "level_map.png")
@@ -83,20 +83,20 @@ def draw_waterfall(report: dict, path: Path) -> None:
 
 def draw_drivers(loop: Loop, path: Path) -> None:
     """Mean held-out residual against the strongest variables before and after, and what the effects add there."""
-    records = loop.after.whole.records
-    values = variables(records, loop.before.held_out_mean_db)
+    links = loop.after.whole.links
+    values = variables(links, loop.before.held_out_mean_db)
     names = _strongest(loop, values)
-    residual_db = [records.level_db - model.held_out_mean_db for model in (loop.before, loop.after)]
+    residual_db = [links.level_db - model.held_out_mean_db for model in (loop.before, loop.after)]
     seen = np.isfinite(residual_db[0]) & np.isfinite(residual_db[1])
-    block = evidence_blocks(records)
+    block = evidence_blocks(links)
     columns = {1: 1, 2: 2, 4: 2}.get(len(names), 3)
     rows = max(-(-len(names) // columns), 1)
     figure = new_figure(4.1 * columns, 3.2 * rows + 0.4)
     for number, name in enumerate(names):
         ax = figure.add_subplot(rows, columns, number + 1)
-        value, axis_label = on_axis(records, name, values[name])
+        value, axis_label = on_axis(links, name, values[name])
         used = seen & np.isfinite(value)
-        labels = _labels(records, name)
+        labels = _labels(links, name)
         level = bins(value[used], BINS) if labels is None else value[used]
         before, after = (means(level, value[used].astype(float), each[used], block[used]) for each in residual_db)
         if labels is None:
@@ -117,14 +117,14 @@ def draw_drivers(loop: Loop, path: Path) -> None:
 
 def _strongest(loop: Loop, values: dict[str, np.ndarray]) -> list[str]:
     """Variables that matter before, then those that matter after; where none does, the likeliest three."""
-    found = [driver.variable for driver in (*significant(loop.drivers_before), *significant(loop.drivers_after))]
-    found = found or [driver.variable for driver in loop.drivers_before][:3]
-    return [name for name in dict.fromkeys(found) if name in values and name not in PLACES][:MOST_PANELS]
+    found = [driver.variable for driver in (*significant(loop.dependences_before), *significant(loop.dependences_after))]
+    found = found or [driver.variable for driver in loop.dependences_before][:3]
+    return [name for name in dict.fromkeys(found) if name in values and name not in PLACES][:MAX_PANELS]
 
 
-def _labels(records, name: str) -> list[str] | None:
+def _labels(links, name: str) -> list[str] | None:
     """Names of the values of a variable that is no number."""
-    return {"receiver": records.receiver_names, "device": records.device_names, "flight": records.flight_names,
+    return {"receiver": links.receiver_names, "device": links.device_names, "flight": links.flight_names,
             "los": ["without", "with"]}.get(name)
 
 
@@ -140,7 +140,7 @@ def _curves(ax, before: Means, after: Means, changed: bool) -> None:
 
 
 def _categories(ax, before: Means, after: Means, labels: list[str], changed: bool) -> None:
-    shown = np.sort(np.argsort(-np.abs(before.mean))[:MOST_MEMBERS])
+    shown = np.sort(np.argsort(-np.abs(before.mean))[:MAX_MEMBERS])
     place = np.arange(len(shown))
     shift = 0.16 if changed else 0.0
     ax.errorbar(place - shift, before.mean[shown], before.error[shown], fmt="o", color=BEFORE, markersize=5,

@@ -23,7 +23,7 @@ VERDICTS = {
               "(RMSE).",
     "none": "Nothing is missing: what the model leaves over ({before} dB) depends on none of the variables that were "
             "tested, and no effect of the catalogue lowers it.",
-    "unexplained": "Something is missing, and none of the effects in the catalogue explains it: the error "
+    "unexplained": "Something is missing, and none of the effects in the catalogue is_cause it: the error "
                    "({before} dB) depends on {drivers}.",
 }
 BADGES = {"effect": "found: ", "none": "nothing is missing", "unexplained": "unexplained"}
@@ -33,8 +33,8 @@ COLUMNS = {"n": "links", "bias_db": "mean [dB]", "std_db": "standard deviation [
            "rmse_db": "RMSE [dB]", "mae_db": "MAE [dB]", "nll": "−log-likelihood [nats]"}
 FIGURES_OF_MERIT = (("rmse_db", "error, RMSE", "dB"), ("bias_db", "mean error", "dB"),
                     ("std_db", "standard deviation", "dB"), ("correlation", "correlation", ""))
-MOST_NAMED = 4  # variables in a sentence
-MOST_ROWS = 40  # of a group in the tables
+MAX_NAMED = 4  # variables in a sentence
+MAX_ROWS = 40  # of a group in the tables
 MORE_STYLE = """
 body { background: #fff } h2 { font-size: 1.25rem; border-top: 1px solid #dde2e6; padding-top: 1.2rem }
 h3 { font-size: 1.05rem; margin: 1.6rem 0 .2rem } summary { cursor: pointer; font-weight: 600; margin: .8rem 0 }
@@ -59,11 +59,11 @@ def lead(report: dict) -> str:
     text = VERDICTS[report["verdict"]].format(
         names=listed(names), it="it" if len(explaining) == 1 else "them", before=before,
         after=_number(explained[-1]) if filled and explained else after,
-        drivers=listed((drivers or [_variable(driver) for driver in report.get("structure_before", [])])[:MOST_NAMED]))
+        drivers=listed((drivers or [_variable(driver) for driver in report.get("structure_before", [])])[:MAX_NAMED]))
     if report["verdict"] == "effect" and drivers:
-        text += f" What is left still depends on {listed(drivers[:MOST_NAMED])}."
+        text += f" What is left still depends on {listed(drivers[:MAX_NAMED])}."
     if filled:
-        text += f" Interpolating the rest, which explains nothing, brings it to {after} dB."
+        text += f" Interpolating the rest, which is_cause nothing, brings it to {after} dB."
     return text
 
 
@@ -146,7 +146,7 @@ def _errors(report: dict, kinds: tuple[str, ...]) -> str:
     for kind in kinds:
         group = report["error"].get(f"by_{kind}", {})
         groups += [(LABELS.get(name, KINDS[kind] + name), both) for name, both in group.items()
-                   if len(group) <= MOST_ROWS and both["before"]["n"]
+                   if len(group) <= MAX_ROWS and both["before"]["n"]
                    and (kind != "los" or both["before"]["n"] < report["error"]["before"]["n"])]
     for number, (label, both) in enumerate(groups):
         rows += [[label if when == "before" else "", when, *(_number(both[when].get(key)) for key in columns)]
@@ -179,10 +179,10 @@ def _remaining(report: dict) -> str:
 
 
 def _remarks(report: dict) -> str:
-    if not report["remarks"]:
+    if not report["notes"]:
         return ""
     return "<h2>Remarks on the data</h2><ul>" + "".join(f"<li>{html.escape(remark)}</li>"
-                                                        for remark in report["remarks"]) + "</ul>"
+                                                        for remark in report["notes"]) + "</ul>"
 
 
 def _facts(report: dict) -> str:

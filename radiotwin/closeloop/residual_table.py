@@ -15,16 +15,16 @@ def residual_table(loop: Loop) -> pd.DataFrame:
     Columns: time_s, flight, receiver, receiver_x_m, …, device, device_x_m, … (as the model has it), los (1, 0),
     measured_db (dBm for power), before_db, after_db (empty where it was not detected or never held out).
     """
-    records = loop.after.whole.records
-    device_m = records.device_m[records.device]
-    before_db, after_db = (records.level_db - model.held_out_mean_db for model in (loop.before, loop.after))
+    links = loop.after.whole.links
+    device_m = links.device_m[links.device]
+    before_db, after_db = (links.level_db - model.held_out_mean_db for model in (loop.before, loop.after))
     return pd.DataFrame({
-        "time_s": records.time_s, "flight": np.array(records.flight_names)[records.flight],
-        "receiver": np.array(records.receiver_names)[records.receiver],
-        **{f"receiver_{axis}_m": records.receiver_m[:, i] for i, axis in enumerate("xyz")},
-        "device": np.array(records.device_names)[records.device],
-        **{f"device_{axis}_m": device_m[:, i] for i, axis in enumerate("xyz")}, "los": records.los.astype(int),
-        "measured_db": records.level_db, "before_db": before_db, "after_db": after_db})
+        "time_s": links.time_s, "flight": np.array(links.flight_names)[links.flight],
+        "receiver": np.array(links.receiver_names)[links.receiver],
+        **{f"receiver_{axis}_m": links.receiver_m[:, i] for i, axis in enumerate("xyz")},
+        "device": np.array(links.device_names)[links.device],
+        **{f"device_{axis}_m": device_m[:, i] for i, axis in enumerate("xyz")}, "los": links.los.astype(int),
+        "measured_db": links.level_db, "before_db": before_db, "after_db": after_db})
 
 
 def write_residuals(loop: Loop, path: Path) -> None:

@@ -1,4 +1,6 @@
-"""The loop: residual, structure, effects one by one, and the error before and after on links that took no part."""
+"""The loop: residual, dependences, effects one by one, and the error before and after, held out."""
+
+from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
@@ -7,87 +9,98 @@ from functools import cached_property
 
 import numpy as np
 
-from radiotwin.channel import Links
-from radiotwin.channel.likelihood import mean_if_detected
+from radiotwin.channel import ChannelModel
 from radiotwin.channel.log_distance import LogDistance
 from radiotwin.channel.regression_kriging import RegressionKriging
-from radiotwin.closeloop.bases import Base, LogDistanceBase, TwinBase
-from radiotwin.closeloop.between_flights import search_between_flights
+from radiotwin.closeloop.bases import BASES, make_bases
+from radiotwin.closeloop.change_points import select_change_points
+from radiotwin.closeloop.criteria import SelectionCriteria
+from radiotwin.closeloop.cross_validation import (
+    CrossValidatedModel,
+    cross_validate,
+    training_parts,
+)
 from radiotwin.closeloop.folds import Folds, make_folds
-from radiotwin.closeloop.raytraced import RaytraceBase
-from radiotwin.closeloop.records import Records, make_records
-from radiotwin.closeloop.search import Model, Search, add_shadowing, make_model, rmse_db, search_effects
-from radiotwin.closeloop.structure import Driver, find_drivers, variables
-from radiotwin.closeloop.trends import UnexplainedTrend
-from radiotwin.effects import CATALOGUE
-from radiotwin.effects.base import Effect, Parameter
+from radiotwin.closeloop.residual_tests import ResidualDependence, residual_dependences
+from radiotwin.closeloop.selection import SelectionResult, add_shadowing, forward_selection
+from radiotwin.effects.params import Parameter
+from radiotwin.effects.registry import catalogue
+from radiotwin.effects.unexplained_trend import UnexplainedTrend
 from radiotwin.errors import BadInput
+from radiotwin.inference.gaussian import mean_if_detected
+from radiotwin.links import LinkData, prepare_links, residual_variables
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
-
-BASES = ("twin", "raytrace", "log-distance")
-STRUCTURED = 0.01
-LEAST_EFFECT_DB = 0.5  # a dependence that is weaker is of no use to anybody
-MOST_TRENDS = 4  # variables, the strongest drivers
-MOST_FOR_KRIGING = 30_000
 
 
 @dataclass(eq=False)
 class Loop:
-    """What came out.
+    """What the loop found.
 
     Attributes:
-        base: name of the base model.
-        records: links that were used.
+        base: name of the base.
+        links: that were used.
         folds: how they were held out.
-        before, search: the base alone; base and effects.
-        drivers_before, drivers_after: what the held-out residual depends on.
-        baselines: (n,) held-out expectation of other models for each link [dB].
-        noise_floor_db: from links measured twice at one place; NaN where there are none.
+        before: the base alone.
+        selection: base and effects.
+        dependences_before, dependences_after: of the held-out residual.
+        baselines: (n,) held-out prediction of other models for each link [dB].
+        noise_floor_db: from links measured twice at one position; NaN where there are none.
     """
 
     base: str
-    records: Records
+    links: LinkData
     folds: Folds
-    before: Model
-    search: Search
-    drivers_before: list[Driver]
-    drivers_after: list[Driver]
+    before: CrossValidatedModel
+    selection: SelectionResult
+    dependences_before: list[ResidualDependence]
+    dependences_after: list[ResidualDependence]
     baselines: dict[str, np.ndarray] = field(default_factory=dict)
     noise_floor_db: float = np.nan
 
     @property
-    def after(self) -> Model:
-        return self.search.model
+    def after(self) -> CrossValidatedModel:
+        """Base and effects."""
+        return self.selection.model
 
     @property
-    def remaining(self) -> list[Driver]:
-        """Drivers that are left."""
-        return significant(self.drivers_after)
+    def criteria(self) -> SelectionCriteria:
+        """Thresholds that decided."""
+        return self.selection.criteria
+
+    @property
+    def remaining(self) -> list[ResidualDependence]:
+        """Dependences that are left."""
+        return significant(self.dependences_after, self.criteria)
 
     @property
     def verdict(self) -> str:
         """`effect`, `none` or `unexplained`."""
-        parts = self.after.whole.parts
-        if any(part.effect.explains for part in parts):
+        effects = self.after.whole.effects
+        if any(each.effect.is_cause for each in effects):
             return "effect"
-        return "unexplained" if parts or self.after.shadowing or significant(self.drivers_before) else "none"
+        structured = significant(self.dependences_before, self.criteria)
+        return "unexplained" if effects or self.after.shadowing or structured else "none"
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:
         """Of each kept effect; their intervals take a fit for each end."""
         whole = self.after.whole
-        return [part.effect.parameters(whole.records, part.setting, found)
-                for part, found in zip(whole.parts, whole.found(self.after.fits[0]))]
+        estimates = whole.estimates(self.after.fits[0])
+        return [each.effect.parameters(whole.links, each.params, estimate)
+                for each, estimate in zip(whole.effects, estimates, strict=True)]
 
 
-def significant(drivers: list[Driver]) -> list[Driver]:
-    """Those that are no chance and strong enough to matter."""
-    return [driver for driver in drivers if driver.p_value <= STRUCTURED and driver.effect_db >= LEAST_EFFECT_DB]
+def significant(dependences: list[ResidualDependence],
+                criteria: SelectionCriteria) -> list[ResidualDependence]:
+    """Return those that are not chance and strong enough to matter."""
+    return [each for each in dependences if each.p_value <= criteria.max_dependence_p_value
+            and each.effect_db >= criteria.min_dependence_db]
 
 
-def close_loop(measurements: Measurements, scene: Scene | None = None, base: str = "auto", seed: int = 0,
-               tell: Callable[[str], None] = lambda _: None, hold_out: str = "auto") -> Loop:
+def close_loop(measurements: Measurements, scene: Scene | None = None, base: str = "auto",
+               seed: int = 0, on_progress: Callable[[str], None] = lambda _: None,
+               hold_out: str = "auto", criteria: SelectionCriteria | None = None) -> Loop:
     """Find what a base model lacks.
 
     Args:
@@ -95,8 +108,12 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         scene: 3D map and radio; None: every link counts as one with line of sight.
         base: one of `BASES`, or `auto`: the one with the least held-out error.
         seed: of folds, fits and permutations.
-        tell: called with what is being done.
+        on_progress: called with what is being done.
         hold_out: which links are held out together, see `make_folds`.
+        criteria: thresholds; None: the defaults.
+
+    Returns:
+        what was found, with the error before and after on links that took no part.
 
     Raises:
         BadInput: an unknown base or way to hold out, or data of which nothing can be used.
@@ -104,81 +121,81 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     if base not in (*BASES, "auto"):
         raise BadInput(f"base {base!r} is unknown; allowed are auto, {', '.join(BASES)}")
     if scene is None and base == "raytrace":
-        raise BadInput("base 'raytrace' follows paths over a 3D map; give --scene, or take the base log-distance")
-    records = make_records(measurements, scene)
-    folds = make_folds(records, seed, hold_out)
-    names = [base] if base != "auto" else ["twin", "raytrace"] if scene is not None else ["log-distance"]
-    twin = TwinBase(scene, seed)
-    bases: dict[str, Base] = {"twin": twin, "log-distance": LogDistanceBase(scene, seed)}
-    if scene is not None:
-        bases["raytrace"] = RaytraceBase(twin)
-    models = {}
+        raise BadInput("base 'raytrace' follows paths over a 3D map; give --scene, or take the base "
+                       "log-distance")
+    criteria = criteria or SelectionCriteria()
+    links = prepare_links(measurements, scene)
+    folds = make_folds(links, seed, hold_out)
+    names = [base]
+    if base == "auto":
+        names = ["log-distance"] if scene is None else ["twin", "raytrace"]
+    bases = make_bases(scene, seed)
+    models, parts = {}, training_parts(links, folds)
     for name in names:
-        tell(f"fitting the base {name}")
-        models[name] = make_model(records, bases[name], folds)
-    everything = np.ones(len(records), dtype=bool)
-    best = min(models, key=lambda name: rmse_db(models[name], everything))
+        on_progress(f"fitting the base {name}")
+        models[name] = cross_validate(links, bases[name], folds, parts)
+    best = min(models, key=lambda name: models[name].rmse_db())
     before = models[best]
-    tell("looking at the residual")
-    drivers_before = _drivers(before, seed)
-    search = Search(before)
-    search_effects(search, [effect() for effect in CATALOGUE], seed, tell)
-    search_between_flights(search, bases[best], folds, seed, tell)
-    search.explained = search.model
-    tell("looking at what is left")
-    drivers_after = _drivers(search.model, seed) if search.model is not before else drivers_before
-    if significant(drivers_after):
-        values = variables(search.model.whole.records, search.model.held_out_mean_db)
-        trends: list[Effect] = [UnexplainedTrend(driver.variable) for driver in significant(drivers_after)
-                  if values[driver.variable].dtype.kind == "f"]  # labels have no order that a curve could follow
-        search_effects(search, trends[:MOST_TRENDS], seed, tell)
-        tell("correlated_shadowing")
-        add_shadowing(search, seed)
-    tell("other models")
-    return Loop(best, records, folds, before, search, drivers_before, drivers_after,
-                _baselines(before, records), _noise_floor_db(records))
+    on_progress("looking at the residual")
+    dependences_before = _dependences(before, seed)
+    selection = SelectionResult(before, criteria)
+    forward_selection(selection, [effect() for effect in catalogue()], seed, on_progress)
+    select_change_points(selection, links, bases[best], folds, seed, on_progress)
+    selection.explained = selection.model
+    on_progress("looking at what is left")
+    dependences_after = dependences_before
+    if selection.model is not before:
+        dependences_after = _dependences(selection.model, seed)
+    left = significant(dependences_after, criteria)
+    if left:
+        values = residual_variables(selection.model.links, selection.model.held_out_mean_db)
+        trends = [UnexplainedTrend(each.variable) for each in left
+                  if values[each.variable].dtype.kind == "f"]  # a curve needs an order
+        forward_selection(selection, [*trends[:criteria.max_trends]], seed, on_progress)
+        on_progress("correlated_shadowing")
+        add_shadowing(selection, seed)
+    on_progress("other models")
+    return Loop(best, links, folds, before, selection, dependences_before, dependences_after,
+                _baselines(before, criteria), _noise_floor_db(links, criteria))
 
 
-def _drivers(model: Model, seed: int) -> list[Driver]:
+def _dependences(model: CrossValidatedModel, seed: int) -> list[ResidualDependence]:
     mean_db = model.held_out_mean_db
-    scale_db = model.held_out_expected[1]
-    return find_drivers(model.whole.records, model.whole.records.level_db - mean_db, scale_db, mean_db, seed)
+    return residual_dependences(model.links, model.links.level_db - mean_db,
+                                model.held_out_reading[1], mean_db, seed)
 
 
-def _baselines(model: Model, records: Records) -> dict[str, np.ndarray]:
-    """(n,) held-out expectation of the log-distance law and of regression kriging [dB], at the base's positions."""
+def _baselines(model: CrossValidatedModel, criteria: SelectionCriteria) -> dict[str, np.ndarray]:
+    """Return the held-out prediction (n,) of other models [dB], with devices where the base has them."""
+    kinds: list[type[ChannelModel]] = [LogDistance]
+    if len(model.links) <= criteria.max_links_for_kriging:
+        kinds.append(RegressionKriging)
     result = {}
-    for name, channel in (("log_distance", LogDistance), ("regression_kriging", RegressionKriging)):
-        if name == "regression_kriging" and len(records) > MOST_FOR_KRIGING:
-            continue
-        mean_db = np.full(len(records), np.nan)
-        for number, side in enumerate(model.folds):
-            test = (model.index == number) & side.usable
-            train, links = side.train, side.records
+    for kind in kinds:
+        mean_db = np.full(len(model.links), np.nan)
+        for number, fold in enumerate(model.folds):
+            test, train, links = (model.index == number) & fold.usable, fold.train, fold.links
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of classes with few links: nothing is predicted for them here
-                fitted = channel().fit(_links(links, train), links.level_db[train], links.limit_db, 0)
-            expected_db, sigma_db = fitted.predict(_links(links, test))
-            mean_db[test] = expected_db if links.limit_db is None else mean_if_detected(
-                expected_db, sigma_db, links.limit_db)
-        result[name] = mean_db
+                warnings.simplefilter("ignore")  # of classes with few links
+                fitted = kind().fit(links.geometry.select(train), links.level_db[train],
+                                    links.limit_db, 0)
+            own_db, sd_db = fitted.predict(links.geometry.select(test))
+            mean_db[test] = own_db if links.limit_db is None else mean_if_detected(
+                own_db, sd_db, links.limit_db)
+        result[kind.name] = mean_db
     return result
 
 
-def _links(records: Records, rows: np.ndarray) -> Links:
-    part = records.select(rows)
-    return Links(part.device_m[part.device], part.receiver_m, part.los, part.device)
-
-
-def _noise_floor_db(records: Records) -> float:
-    """Standard deviation of one measurement [dB], from links measured more than once at one place."""
-    place = np.round(np.column_stack([records.receiver_m, records.device, records.receiver]), 1)
+def _noise_floor_db(links: LinkData, criteria: SelectionCriteria) -> float:
+    """Return the standard deviation of one measurement [dB], from repeats at one position."""
+    place = np.round(np.column_stack([links.receiver_m, links.device, links.receiver]), 1)
     group = np.unique(place, axis=0, return_inverse=True)[1].ravel()
-    seen = np.isfinite(records.level_db)
+    seen = np.isfinite(links.level_db)
     count = np.bincount(group[seen], minlength=group.max() + 1)
-    mean = np.bincount(group[seen], weights=records.level_db[seen], minlength=len(count)) / np.maximum(count, 1)
+    sums = np.bincount(group[seen], weights=links.level_db[seen], minlength=len(count))
+    mean = sums / np.maximum(count, 1)
     again = seen & (count[group] > 1)
     freedom = int((count[count > 1] - 1).sum())
-    if freedom < 30:
+    if freedom < criteria.min_repeats_for_noise:
         return float("nan")
-    return float(np.sqrt(((records.level_db - mean[group])[again] ** 2).sum() / freedom))
+    return float(np.sqrt(((links.level_db - mean[group])[again] ** 2).sum() / freedom))

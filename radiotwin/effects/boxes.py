@@ -1,19 +1,26 @@
-"""Boxes that stand in the way of links, and where in a city they would explain what is missing."""
+"""Boxes that obstruct links, and where in a city they would explain missing power."""
 
 from typing import NamedTuple
 
 import numpy as np
 
-SAMPLES_M = 5.0  # along a link
-CELL_M = 12.5
-HEIGHTS_M = (6.0, 9.0, 12.0, 16.0, 22.0, 30.0, 40.0, 52.0, 66.0, 85.0, 110.0)
-APART_M = 25.0
-MISSES, DOF = 0.4, 4.0
-CHUNK, MOST_POINTS = 2000, 4_000_000  # links, and points on them, a time: bounds memory
+SAMPLE_M = 5.0  # between points on a link, while it is back-projected
+CELL_M = 12.5  # side of a cell of the back-projection
+HEIGHTS_M = (6.0, 9.0, 12.0, 16.0, 22.0, 30.0, 40.0, 52.0, 66.0, 85.0, 110.0)  # that are tried
+MIN_APART_M = 25.0  # between the best cells
+CHUNK, MAX_POINTS = 2000, 4_000_000  # links, and points on them, at a time: bounds memory
+P_MISS = 0.4  # probability that a link through a cell misses the box there, which is smaller
+DOF = 4.0  # degrees of freedom of the errors
 
 
 class Box(NamedTuple):
-    """An upright box on the ground: centre, sides [m], height [m], and by how much it is turned [deg]."""
+    """An upright box on the ground.
+
+    Attributes:
+        x_m, y_m: centre [m].
+        length_m, width_m, height_m: sides and height [m].
+        turn_deg: angle of the length, counter-clockwise from east [deg].
+    """
 
     x_m: float
     y_m: float
@@ -27,12 +34,12 @@ class Crossing(NamedTuple):
     """How n links cross a box; NaN where a link's ground track does not.
 
     Attributes:
-        inside_m: length of the link within the box; 0 where it passes above.
-        enter_over_m, leave_over_m: height of the roof above the link where it enters and where it leaves; negative
-            where the link passes above.
-        left_m, right_m: how far the box reaches across the link's track to each side.
-        before_m, between_m, behind_m: distance along the ground from the first end to where the link enters, from there
-            to where it leaves, and on to the second end.
+        inside_m: (n,) length of the link within the box; 0 where it passes above.
+        enter_over_m, leave_over_m: (n,) height of the roof above the link where it enters and where
+            it leaves; negative where the link passes above.
+        left_m, right_m: (n,) how far the box reaches across the link's track to each side.
+        before_m, between_m, behind_m: (n,) distance along the ground from the first end to where
+            the link enters, from there to where it leaves, and on to the second end.
     """
 
     inside_m: np.ndarray
@@ -46,133 +53,186 @@ class Crossing(NamedTuple):
 
 
 def cross(box: Box, a_m: np.ndarray, b_m: np.ndarray) -> Crossing:
-    """How links cross a box.
+    """Return how links cross a box.
 
     Args:
-        a_m, b_m: (n, 3) ends [m].
+        box: on the ground.
+        a_m: (n, 3) first ends [m].
+        b_m: (n, 3) second ends [m].
     """
     turn = np.radians(box.turn_deg)
     axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     half = 0.5 * np.array([box.length_m, box.width_m])
     start, end = ((point[:, :2] - (box.x_m, box.y_m)) @ axes.T for point in (a_m, b_m))
+    enter, leave, crosses = _shares_within(start, end, half)
+    rise = b_m[:, 2] - a_m[:, 2]
+    step = end - start
+    track = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
+    unit = step / track[:, None]
+    corners = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * half
+    across = (unit[:, 0, None] * (corners[None, :, 1] - start[:, 1, None])
+              - unit[:, 1, None] * (corners[None, :, 0] - start[:, 0, None]))
+    below = _share_below(a_m[:, 2], rise, enter, leave, box.height_m)
+    inside_m = np.maximum(below, 0) * np.linalg.norm(b_m - a_m, axis=1)
+    over_m = (box.height_m - (a_m[:, 2] + share * rise) for share in (enter, leave))
+    values = (*over_m, across.max(axis=1), -across.min(axis=1), enter * track,
+              (leave - enter) * track, (1 - leave) * track)
+    return Crossing(np.where(crosses, inside_m, 0.0),
+                    *(np.where(crosses, value, np.nan) for value in values))
+
+
+def _shares_within(start: np.ndarray, end: np.ndarray,
+                   half: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the shares of ground tracks (n, 2) at which they enter and leave, and if they do."""
     step = end - start
     with np.errstate(divide="ignore", invalid="ignore"):
         sides = np.stack([(-half - start) / step, (half - start) / step])
     # A track along an axis: within the box all the way, or never.
     parallel = np.abs(step) < 1e-9
     within = np.abs(start) <= half
-    low = np.where(parallel, np.where(within, -np.inf, np.inf), np.nanmin(np.where(parallel, np.inf, sides), axis=0))
-    high = np.where(parallel, np.where(within, np.inf, -np.inf), np.nanmax(np.where(parallel, -np.inf, sides), axis=0))
-    enter, leave = np.clip(low.max(axis=1), 0, 1), np.clip(high.min(axis=1), 0, 1)
-    crosses = (leave > enter) & (low.max(axis=1) < 1) & (high.min(axis=1) > 0)
-    length = np.linalg.norm(b_m - a_m, axis=1)
-    rise = b_m[:, 2] - a_m[:, 2]
+    low = np.where(parallel, np.where(within, -np.inf, np.inf),
+                   np.nanmin(np.where(parallel, np.inf, sides), axis=0)).max(axis=1)
+    high = np.where(parallel, np.where(within, np.inf, -np.inf),
+                    np.nanmax(np.where(parallel, -np.inf, sides), axis=0)).min(axis=1)
+    enter, leave = np.clip(low, 0, 1), np.clip(high, 0, 1)
+    return enter, leave, (leave > enter) & (low < 1) & (high > 0)
+
+
+def _share_below(start_z_m: np.ndarray, rise_m: np.ndarray, enter: np.ndarray, leave: np.ndarray,
+                 height_m: float) -> np.ndarray:
+    """Return the share (n,) of links between `enter` and `leave` that is below a height."""
+    level = np.abs(rise_m) < 1e-9
     with np.errstate(divide="ignore", invalid="ignore"):
-        under = np.where(np.abs(rise) < 1e-9, np.where(a_m[:, 2] < box.height_m, np.inf, -np.inf),
-                         (box.height_m - a_m[:, 2]) / rise)
-    below = (np.where(rise > 0, np.minimum(leave, under), leave)
-             - np.where(rise < 0, np.maximum(enter, under), enter))
-    below = np.where((np.abs(rise) < 1e-9) & (a_m[:, 2] >= box.height_m), 0.0, below)
-    track = np.maximum(np.linalg.norm(step, axis=1), 1e-9)
-    unit = step / track[:, None]
-    corners = np.array([(1, 1), (1, -1), (-1, -1), (-1, 1)]) * half
-    across = unit[:, 0, None] * (corners[None, :, 1] - start[:, 1, None]) \
-        - unit[:, 1, None] * (corners[None, :, 0] - start[:, 0, None])
-    values = (np.maximum(below, 0) * length, *(box.height_m - (a_m[:, 2] + at * rise) for at in (enter, leave)),
-              across.max(axis=1), -across.min(axis=1), enter * track, (leave - enter) * track, (1 - leave) * track)
-    return Crossing(np.where(crosses, values[0], 0.0), *(np.where(crosses, value, np.nan) for value in values[1:]))
+        roof = np.where(level, np.where(start_z_m < height_m, np.inf, -np.inf),
+                        (height_m - start_z_m) / rise_m)
+    below = (np.where(rise_m > 0, np.minimum(leave, roof), leave)
+             - np.where(rise_m < 0, np.maximum(enter, roof), enter))
+    return np.where(level & (start_z_m >= height_m), 0.0, below)
 
 
 def near_box(box: Box, a_m: np.ndarray, b_m: np.ndarray, within_m: float) -> np.ndarray:
-    """(n,) bool, links whose ground tracks come that near to a box [m]."""
+    """Return whether (n,) links' ground tracks come that near to a box [m]."""
     larger = box._replace(length_m=box.length_m + 2 * within_m, width_m=box.width_m + 2 * within_m)
     return np.isfinite(cross(larger, a_m, b_m).left_m)
 
 
-def lacks_nats(residual_db: np.ndarray, scale_db: np.ndarray, losses_db: tuple[float, ...]) -> np.ndarray:
-    """(n,) how much likelier a residual is if something may be in the link's way than if nothing is [nats].
+def obstruction_nats(residual_db: np.ndarray, scale_db: np.ndarray,
+                     losses_db: tuple[float, ...]) -> np.ndarray:
+    """Return how much likelier residuals are if a box may obstruct the link [nats].
 
-    "May": a cell of the search is not the box, and a link through it misses the box in `MISSES` of the cases; so a link
-    that lacks nothing speaks against a box only a little.
+    "May": a cell of the search is larger than the box, and a link through it misses the box with
+    probability `P_MISS`. So a link without a loss is only weak evidence against a box.
+
+    Args:
+        residual_db: (n,) [dB].
+        scale_db: (n,) of the errors [dB].
+        losses_db: that a box may cause, equally likely.
     """
-    def density(value_db):
+    def density(value_db: np.ndarray) -> np.ndarray:
         return (1 + (value_db / scale_db) ** 2 / DOF) ** (-0.5 * (DOF + 1))
 
     lossy = np.mean([density(residual_db + loss_db) for loss_db in losses_db], axis=0)
-    return np.log(MISSES + (1 - MISSES) * lossy / density(residual_db))
+    return np.log(P_MISS + (1 - P_MISS) * lossy / density(residual_db))
 
 
-def best_cells(centres_m: np.ndarray, total: np.ndarray, count: int) -> list[tuple[np.ndarray, int, float]]:
-    """The best cells that are not neighbours: centre, index of the height, and nats."""
+def best_cells(centres_m: np.ndarray, total: np.ndarray,
+               count: int) -> list[tuple[np.ndarray, int, float]]:
+    """Return the centre, index of the height and nats of the best cells that are apart.
+
+    Args:
+        centres_m: (m, 2) of the cells [m].
+        total: (m, heights) [nats].
+        count: of cells at most.
+    """
     found: list[tuple[np.ndarray, int, float]] = []
-    for place in np.argsort(-total.max(axis=1)):
-        if all(np.linalg.norm(centres_m[place] - other[0]) > APART_M for other in found):
-            height = int(total[place].argmax())
-            found.append((centres_m[place], height, float(total[place, height])))
+    for cell in np.argsort(-total.max(axis=1)):
+        if all(np.linalg.norm(centres_m[cell] - other[0]) > MIN_APART_M for other in found):
+            height = int(total[cell].argmax())
+            found.append((centres_m[cell], height, float(total[cell, height])))
         if len(found) == count:
             break
     return found
 
 
-def back_project(a_m: np.ndarray, b_m: np.ndarray, gain: np.ndarray, ground_m: float = 0.0):
-    """Where a box would cover the links that want one and leave out those that do not.
+def back_project(a_m: np.ndarray, b_m: np.ndarray,
+                 gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sum what links gain from a box over the cells of the ground that they pass.
+
+    The sum is greatest where a box would obstruct the links that gain from one and no others.
 
     Args:
-        a_m, b_m: (n, 3) ends [m].
-        gain: (n,) what is won if the link is crossed [nats]; negative where a box there would be wrong.
+        a_m: (n, 3) first ends [m].
+        b_m: (n, 3) second ends [m].
+        gain: (n,) if the link is obstructed [nats]; negative where a box there would be wrong.
 
     Returns:
-        (m, 2) centres of the cells [m], and (m, heights) the sum over links that pass each cell below each of
-        `HEIGHTS_M`
+        (m, 2) centres of the cells [m], and (m, heights) the sum over the links that pass each cell
+        below each of `HEIGHTS_M` [nats].
     """
     low = np.floor(np.minimum(a_m, b_m)[:, :2].min(axis=0) / CELL_M).astype(int)
     shape = np.ceil(np.maximum(a_m, b_m)[:, :2].max(axis=0) / CELL_M).astype(int) - low + 1
     total = np.zeros((len(HEIGHTS_M), shape[0] * shape[1]))
     length_m = np.linalg.norm((b_m - a_m)[:, :2], axis=1)
-    step = max(min(CHUNK, int(MOST_POINTS * SAMPLES_M / length_m.max(initial=1.0))), 1)
+    step = max(min(CHUNK, int(MAX_POINTS * SAMPLE_M / length_m.max(initial=1.0))), 1)
     for first in range(0, len(a_m), step):
         part = slice(first, first + step)
-        share = np.linspace(0, 1, max(int(length_m[part].max(initial=1.0) / SAMPLES_M), 2))
+        share = np.linspace(0, 1, max(int(length_m[part].max(initial=1.0) / SAMPLE_M), 2))
         points = a_m[part, None] + share[:, None] * (b_m - a_m)[part, None]
         cell = np.floor(points[..., :2] / CELL_M).astype(int) - low
         flat = cell[..., 0] * shape[1] + cell[..., 1]
         link = np.broadcast_to(np.arange(len(points))[:, None], flat.shape)
         # Of each link and cell the lowest point.
         key = (link * total.shape[1] + flat).ravel()
-        order = np.lexsort((points[..., 2].ravel(), key))
+        height_m = points[..., 2].ravel()
+        order = np.lexsort((height_m, key))
         lowest = order[np.r_[True, np.diff(key[order]) > 0]]
-        height, cells = points[..., 2].ravel()[lowest] - ground_m, flat.ravel()[lowest]
+        height_m, cells = height_m[lowest], flat.ravel()[lowest]
         value = gain[part][link.ravel()[lowest]]
-        for row, top in enumerate(HEIGHTS_M):
-            under = height < top
+        for row, top_m in enumerate(HEIGHTS_M):
+            under = height_m < top_m
             total[row] += np.bincount(cells[under], weights=value[under], minlength=total.shape[1])
-    centres = (np.stack(np.unravel_index(np.arange(total.shape[1]), shape), axis=1) + low + 0.5) * CELL_M
-    return centres, total.T
+    corners = np.stack(np.unravel_index(np.arange(total.shape[1]), shape), axis=1) + low
+    return (corners + 0.5) * CELL_M, total.T
 
 
-def knife_edge_db(height_m: np.ndarray, first_m: np.ndarray, second_m: np.ndarray, wavelength_m: float) -> np.ndarray:
-    """Loss over an edge that reaches `height_m` above the straight line (ITU-R P.526-15, Eq. 26 and 31) [dB]."""
+def knife_edge_db(over_m: np.ndarray, first_m: np.ndarray | float, second_m: np.ndarray | float,
+                  wavelength_m: float) -> np.ndarray:
+    """Return the loss over a knife edge (ITU-R P.526-15, Eq. 26 and 31) [dB].
+
+    Args:
+        over_m: (n,) height of the edge above the straight line [m].
+        first_m: (n,) distance of the edge from the first end [m].
+        second_m: (n,) distance of the edge from the second end [m].
+        wavelength_m: of the radio [m].
+    """
     near, far = np.maximum(first_m, 1.0), np.maximum(second_m, 1.0)
-    nu = height_m * np.sqrt(2 * (near + far) / (wavelength_m * near * far))
+    nu = over_m * np.sqrt(2 * (near + far) / (wavelength_m * near * far))
     shifted = np.maximum(nu, -0.78) - 0.1
     return np.where(nu > -0.78, 6.9 + 20 * np.log10(np.sqrt(shifted**2 + 1) + shifted), 0.0)
 
 
-def two_edges_db(first_over_m: np.ndarray, second_over_m: np.ndarray, before_m: np.ndarray, between_m: np.ndarray,
-                 behind_m: np.ndarray, wavelength_m: float) -> np.ndarray:
-    """Loss over two edges one behind the other, of which either may be the higher (ITU-R P.526-15, Sec. 4.4.1, second
-    method, Eq. 37-42) [dB].
+def two_edges_db(first_over_m: np.ndarray, second_over_m: np.ndarray,
+                 before_m: np.ndarray | float, between_m: np.ndarray | float,
+                 behind_m: np.ndarray | float, wavelength_m: float) -> np.ndarray:
+    """Return the loss over two knife edges in a row, of which either may be the higher [dB].
+
+    ITU-R P.526-15, Sec. 4.4.1, second method, Eq. 37-42.
 
     Args:
-        first_over_m, second_over_m: (n,) how far they reach above the straight line [m].
-        before_m, between_m, behind_m: (n,) the three sections of the way [m].
+        first_over_m: (n,) height of the first edge above the straight line [m].
+        second_over_m: (n,) height of the second edge above it [m].
+        before_m: (n,) distance from the first end to the first edge [m].
+        between_m: (n,) distance between the edges [m].
+        behind_m: (n,) distance from the second edge to the second end [m].
+        wavelength_m: of the radio [m].
     """
     a, b, c = np.maximum(before_m, 1.0), np.maximum(between_m, 0.1), np.maximum(behind_m, 1.0)
     whole = a + b + c
     first, second = (h * np.sqrt(2 * whole / (wavelength_m * near * (whole - near)))
                      for h, near in ((first_over_m, a), (second_over_m, a + b)))
     leads = first > second
-    main_over_m, main_near = np.where(leads, first_over_m, second_over_m), np.where(leads, a, a + b)
+    main_over_m = np.where(leads, first_over_m, second_over_m)
+    main_near = np.where(leads, a, a + b)
     # The other edge, above the line from the main one to the end behind it.
     own, beyond = np.where(leads, second_over_m, first_over_m), np.where(leads, c, a)
     other_over_m = own - main_over_m * beyond / (b + beyond)
@@ -181,5 +241,7 @@ def two_edges_db(first_over_m: np.ndarray, second_over_m: np.ndarray, before_m: 
     p, q = np.maximum(first, second), np.minimum(first, second)
     alpha = np.arctan(np.sqrt(b * whole / (a * c)))
     with np.errstate(divide="ignore", invalid="ignore"):
-        too_much_db = (12 - 20 * np.log10(2 / (1 - alpha / np.pi))) * np.maximum(q / p, 0.0) ** (2 * p)
-    return loss_db + np.maximum(other_db - np.where((p > 0) & (q > 0), too_much_db, 0.0), 0.0)
+        correction_db = ((12 - 20 * np.log10(2 / (1 - alpha / np.pi)))
+                         * np.maximum(q / p, 0.0) ** (2 * p))
+    correction_db = np.where((p > 0) & (q > 0), correction_db, 0.0)
+    return loss_db + np.maximum(other_db - correction_db, 0.0)

@@ -1,67 +1,83 @@
-"""A receiver that is deafer than declared: its links are blank below a limit of its own.
+"""A receiver less sensitive than declared: its links are blank below a limit of its own.
 
-A blank then says "below that limit" (Tobin 1958, 'Estimation of relationships for limited dependent variables',
-Econometrica 26) and not "below the declared one". The likeliest limit is the lowest level that the receiver has read.
+A blank then means "below that limit" (Tobin 1958, 'Estimation of relationships for limited
+dependent variables', Econometrica 26) and not "below the declared one". The likeliest limit is the
+lowest level that the receiver has read.
 """
 
 import numpy as np
+from pydantic import Field
 from scipy.stats import t
+from typing_extensions import override
 
-from radiotwin.effects.base import Effect, Parameter, Term, View, measured
+from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.base import LimitEffect
+from radiotwin.effects.params import EffectParams, Estimate, Parameter
+from radiotwin.effects.residual_view import ResidualView
+from radiotwin.links import LinkData
 
-LEAST_READ = 40
-LEAST_BLANK = 10
-LEAST_NATS = 4.0
-LEAST_RISE_DB = 2.0
-DOF = 4.0
-LOWEST = 0.005  # quantile: one odd reading below the limit does not count
-NEAREST = 10  # readings that tell how close to the limit they come
-CHANCE = np.log(10.0)  # a gap this many times the usual one is as rare as one in ten
+MIN_READINGS, MIN_BLANKS = 40, 10  # of a receiver
+MIN_NATS = 4.0  # that a limit must gain to be proposed for a receiver
+MIN_RISE_DB = 2.0  # above the declared limit
+DOF = 4.0  # of the errors: heavy tails
+LOWEST = 0.005  # quantile: a single odd reading below the limit does not count
+NEAREST = 10  # readings above the limit, for their usual gap
 
 
-class DetectionLimit(Effect):
-    """A limit for each receiver that it helps."""
+class DetectionLimit(LimitEffect):
+    """A limit for each receiver whose blanks become likelier by it."""
 
     name = "noise_floor_censoring"
     variant = "a receiver's own limit of detection"
-    of_receiver = True
-    stage = "limit"
     confused_with = ("lock_loss", "missing_obstacle", "receiver_gain_offset")
 
-    def lacks(self, records) -> str | None:
-        return None if np.isnan(records.level_db).any() else "no link is blank"
+    class Params(EffectParams):
+        """Limits of receivers."""
 
-    def propose(self, view: View) -> list[dict]:
-        records, found = view.records, {}
-        blank = np.isnan(records.level_db)
-        for receiver in measured(records.receiver[~blank], LEAST_READ):
-            mine = records.receiver == receiver
+        receivers: dict[int, float] = Field(
+            description="Limit of detection of each receiver, by index [dB].")
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        return None if np.isnan(links.level_db).any() else "no link is blank"
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links, found = view.links, {}
+        blank = np.isnan(links.level_db)
+        declared_db = -np.inf if links.limit_db is None else links.limit_db
+        for receiver in frequent_labels(links.receiver[~blank], MIN_READINGS):
+            mine = links.receiver == receiver
             missed = mine & blank
-            if missed.sum() < LEAST_BLANK:
+            if missed.sum() < MIN_BLANKS:
                 continue
-            limit_db = float(np.quantile(records.level_db[mine & ~blank], LOWEST))
-            declared_db = -np.inf if records.limit_db is None else records.limit_db
+            limit_db = float(np.quantile(links.level_db[mine & ~blank], LOWEST))
             mean_db, scale_db = view.mean_db[missed], view.scale_db[missed]
-            nats = (t.logcdf((limit_db - mean_db) / scale_db, DOF)
-                    - (t.logcdf((declared_db - mean_db) / scale_db, DOF) if np.isfinite(declared_db) else 0.0))
-            if limit_db > declared_db + LEAST_RISE_DB and nats.sum() / view.design_effect > LEAST_NATS:
-                found[str(receiver)] = limit_db
-        return [{"receivers": found}] if found else []
+            nats = t.logcdf((limit_db - mean_db) / scale_db, DOF)
+            if np.isfinite(declared_db):
+                nats = nats - t.logcdf((declared_db - mean_db) / scale_db, DOF)
+            if (limit_db > declared_db + MIN_RISE_DB
+                    and nats.sum() / view.design_effect > MIN_NATS):
+                found[receiver] = limit_db
+        return [self.Params(receivers=found)] if found else []
 
-    def term(self, records, setting, at) -> Term:
-        return Term.of_offset(np.zeros(len(records)))
+    @override
+    def limits_db(self, links: LinkData, params: Params) -> np.ndarray:
+        by_receiver_db = np.full(len(links.receiver_names), -np.inf)
+        by_receiver_db[list(params.receivers)] = list(params.receivers.values())
+        return by_receiver_db[links.receiver]
 
-    def limits_db(self, records, setting) -> np.ndarray:
-        limit_db = np.full(len(records.receiver_names), -np.inf)
-        for receiver, value in setting["receivers"].items():
-            limit_db[int(receiver)] = value
-        return limit_db[records.receiver]
-
-    def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        result = {}
-        for receiver, limit_db in setting["receivers"].items():
-            read_db = np.sort(records.level_db[(records.receiver == int(receiver)) & (records.level_db >= limit_db)])
-            gap_db = (read_db[min(NEAREST, len(read_db) - 1)] - read_db[0]) / min(NEAREST, len(read_db) - 1)
-            result[f"limit[{records.receiver_names[int(receiver)]}]"] = Parameter(
-                limit_db, limit_db - CHANCE * float(gap_db), float(read_db[0]), "dB" if records.is_gain else "dBm")
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        result, unit = {}, "dB" if links.is_gain else "dBm"
+        for receiver, limit_db in params.receivers.items():
+            mine = (links.receiver == receiver) & (links.level_db >= limit_db)
+            read_db = np.sort(links.level_db[mine])
+            nearest = min(NEAREST, len(read_db) - 1)
+            gap_db = (read_db[nearest] - read_db[0]) / nearest
+            # Gaps are exponential: one ln(10) times the usual is exceeded in 10 % of cases.
+            low_db = limit_db - np.log(10.0) * float(gap_db)
+            result[f"limit[{links.receiver_names[receiver]}]"] = Parameter(
+                limit_db, low_db, float(read_db[0]), unit)
         return result

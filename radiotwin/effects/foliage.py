@@ -1,60 +1,101 @@
-"""Vegetation that no map shows.
+"""Vegetation that the map does not show.
 
-Loss of d metres through it: A_m (1 − exp(−γ d / A_m)), which saturates (ITU-R P.833-10, Eq. 1). Its place is found by
-back-projection. A grove that links of one device only pass cannot be placed along their rays: the box then says in
-which direction it lies.
+Loss of d metres through it: A_m (1 − exp(−γ d / A_m)), which saturates (ITU-R P.833-10, Eq. 1). It
+is located by back-projection. A grove that only links of one device pass cannot be located along
+these links: the box then gives the direction in which it lies.
 """
 
+from typing import NamedTuple
+
 import numpy as np
+from pydantic import Field
+from typing_extensions import override
 
-from radiotwin.effects.base import Effect, Parameter, Term, Variation, View
-from radiotwin.effects.boxes import CELL_M, HEIGHTS_M, Box, back_project, best_cells, cross, lacks_nats
-from radiotwin.effects.missing_obstacle import NAMES
+from radiotwin.effects.base import GainEffect
+from radiotwin.effects.boxes import (
+    CELL_M,
+    HEIGHTS_M,
+    Box,
+    back_project,
+    best_cells,
+    cross,
+    obstruction_nats,
+)
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.residual_view import ResidualView
+from radiotwin.links import LinkData
 
-LEAST_NATS = 6.0
-LOWEST, HIGHEST = 3.0, 26.0  # tops of trees [m]
-LOSSES_DB = (3.0, 6.0, 9.0, 12.0, 16.0, 20.0)
-STARTS = 3
-SIDES_M = (25.0, 55.0)
-MOST_DB = 25.0  # what loses more is no vegetation
-FIRST_LAW = (0.6, 15.0)  # specific attenuation [dB/m], greatest loss [dB]
+MIN_NATS = 6.0  # that a cell must gain to be proposed
+MAX_CELLS = 3  # that are proposed, with each of `SIDES_M`
+SIDES_M = (25.0, 55.0)  # of a proposed box
+MIN_HEIGHT_M, MAX_PROPOSED_HEIGHT_M = 3.0, 26.0  # of tree tops
+LOSSES_DB = (3.0, 6.0, 9.0, 12.0, 16.0, 20.0)  # of a link through it, equally likely
+MAX_LOSS_DB = 25.0  # anything that costs more is not vegetation
 
 
-class Foliage(Effect):
+class VegetationLoss(NamedTuple):
+    """Law of the loss over the metres inside.
+
+    Attributes:
+        specific_db_m: specific attenuation γ [dB/m].
+        max_db: greatest loss A_m [dB].
+    """
+
+    specific_db_m: float = 0.6
+    max_db: float = 15.0
+
+
+class Foliage(GainEffect):
     """A box of vegetation; one step finds one."""
 
     name = "foliage"
+    figure = "map"
     repeatable = True
-    confused_with = ("missing_obstacle", "excess_attenuation", "device_gain_offset", "antenna_pattern")
+    confused_with = ("missing_obstacle", "excess_attenuation", "device_gain_offset",
+                     "antenna_pattern")
 
-    def propose(self, view: View) -> list[dict]:
-        records = view.records
-        nats = lacks_nats(view.residual_db, view.scale_db, LOSSES_DB) / view.design_effect
-        centres_m, total = back_project(records.device_m[records.device], records.receiver_m, nats)
-        allowed = [i for i, height in enumerate(HEIGHTS_M) if LOWEST <= height <= HIGHEST]
-        return [{"box": [*map(float, centre_m), side, side, HEIGHTS_M[allowed[height]], 0.0], "law": list(FIRST_LAW)}
-                for centre_m, height, nats in best_cells(centres_m, total[:, allowed], STARTS) if nats > LEAST_NATS
-                for side in SIDES_M]
+    class Params(EffectParams):
+        """A grove."""
 
-    def term(self, records, setting, at) -> Term:
-        crossing = cross(Box(*setting["box"]), records.device_m[records.device], records.receiver_m)
-        specific_db_m, most_db = setting["law"]
-        return Term.of_offset(-most_db * (1 - np.exp(-crossing.inside_m * specific_db_m / most_db)))
+        box: Box = Field(description="Up to the tree tops.")
+        law: VegetationLoss = Field(VegetationLoss(), description="Loss over the metres inside.")
 
-    def vary(self, setting) -> Variation:
-        x_m, y_m = setting["box"][:2]
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links = view.links
+        nats = obstruction_nats(view.residual_db, view.scale_db, LOSSES_DB) / view.design_effect
+        centres_m, total = back_project(links.device_m[links.device], links.receiver_m, nats)
+        allowed = [i for i, height_m in enumerate(HEIGHTS_M)
+                   if MIN_HEIGHT_M <= height_m <= MAX_PROPOSED_HEIGHT_M]
+        return [self.Params(box=Box(*centre_m.tolist(), side_m, side_m, HEIGHTS_M[allowed[height]],
+                                    0.0))
+                for centre_m, height, gain in best_cells(centres_m, total[:, allowed], MAX_CELLS)
+                if gain > MIN_NATS for side_m in SIDES_M]
+
+    @override
+    def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
+        crossing = cross(params.box, links.device_m[links.device], links.receiver_m)
+        specific_db_m, max_db = params.law
+        return -max_db * (1 - np.exp(-crossing.inside_m * specific_db_m / max_db))
+
+    @override
+    def variation(self, params: Params) -> Variation:
+        x_m, y_m = params.box[:2]
+        low = [x_m - 80, y_m - 80, 5.0, 5.0, MIN_HEIGHT_M, -90.0, np.log(0.05), np.log(3.0)]
+        high = [x_m + 80, y_m + 80, 200.0, 200.0, 30.0, 90.0, np.log(5.0), np.log(MAX_LOSS_DB)]
         return Variation(
-            np.array([*setting["box"], *np.log(setting["law"])]),
+            np.array([*params.box, *np.log(params.law)]),
             np.array([CELL_M, CELL_M, 12.0, 12.0, 3.0, 20.0, 0.4, 0.3]),
-            np.array([x_m - 80, y_m - 80, 5.0, 5.0, LOWEST, -90.0, np.log(0.05), np.log(3.0)]),
-            np.array([x_m + 80, y_m + 80, 200.0, 200.0, 30.0, 90.0, np.log(5.0), np.log(MOST_DB)]),
-            lambda numbers: {"box": [float(v) for v in numbers[:6]], "law": [float(v) for v in np.exp(numbers[6:])]})
+            np.array(low), np.array(high),
+            lambda numbers: self.Params(box=Box(*numbers[:6].tolist()),
+                                        law=VegetationLoss(*np.exp(numbers[6:]).tolist())))
 
-    def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        result = {name: Parameter.normal(value, spread, "deg" if name == "turn_deg" else "m")
-                  for name, value, spread in zip(NAMES, setting["box"], found.setting_deviations)}
-        for name, unit, value, spread in zip(("specific_attenuation_db_m", "greatest_loss_db"), ("dB/m", "dB"),
-                                             setting["law"], found.setting_deviations[6:]):
-            low, high = value * np.exp([-1.645 * spread, 1.645 * spread])
-            result[name] = Parameter(value, float(low), float(high), unit)
-        return result
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        box_sd, law_sd = estimate.params_sd[:6], estimate.params_sd[6:]
+        reported = {name: Parameter.normal(value, sd, "deg" if name == "turn_deg" else "m")
+                    for name, value, sd in zip(Box._fields, params.box, box_sd, strict=True)}
+        names = {"specific_attenuation_db_m": "dB/m", "greatest_loss_db": "dB"}
+        return reported | {name: Parameter.log_normal(value, sd, unit) for (name, unit), value, sd
+                           in zip(names.items(), params.law, law_sd, strict=True)}

@@ -1,219 +1,256 @@
-"""A receiver or a device whose gain changes in time: it warms up, it ages, or something in it changed at one moment.
+"""A gain that changes with time: a receiver or a device warms up, ages, or changes at one moment.
 
-Warm-up as a first-order thermal lag, A exp(−t / τ) from switch-on (amplifier gain falls linearly with temperature, and
-temperature follows first-order cooling); ageing as a slope in time; a step at an unknown time (two means, Hinkley 1970,
-'Inference about the change-point in a sequence of random variables', Biometrika 57).
+Warm-up as a first-order thermal lag, A exp(−t / τ) since switch-on (amplifier gain falls linearly
+with temperature, and temperature follows first-order cooling); ageing as a slope in time; a step at
+an unknown time (two means, Hinkley 1970, 'Inference about the change-point in a sequence of random
+variables', Biometrika 57).
 """
 
-from typing import ClassVar
+from collections.abc import Iterator
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
+from pydantic import Field
+from typing_extensions import override
 
-from radiotwin.effects.base import Effect, Parameter, Setting, Term, Variation, View, measured
+from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.base import GainEffect, Term
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.links import LinkData
 
-LEAST_LINKS = 60
-LEAST_FLIGHTS = 3
-MOST_DEVICES = 200
-LEAST_NATS = 5.0
-LEAST_SIDE = 20  # links before and after a step
-SPREAD_DB = 10.0
+MIN_LINKS = 60  # of a receiver or device, with a time
+MIN_FLIGHTS = 3  # that a device was heard on: within a flight, time and position change together
+MAX_DEVICES = 200  # bounds the time of the search
+MIN_NATS = 5.0  # that a drift must gain to be proposed
+MIN_SIDE = 20  # links before and after a step
+MIN_GAP_SD = 3.0  # of a step's size, in standard deviations from flight to flight
+MAX_PROPOSALS = 2  # members: how much a drift explains shows once all else is fitted again
+PRIOR_SD_DB = 10.0
 TIME_CONSTANTS_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
-WARMING = ("warm_up", "warm_up_each_flight")
-MOST_TRIED = 2  # receivers: how much a drift explains shows when all else is fitted again
-CLEARLY = 3.0  # standard deviations
-STEP_PENALTY = 1.0  # times log of the places where it may be
+WARM_UPS = ("warm_up", "warm_up_each_flight")
 
 
-class _Drift(Effect):
-    """The one of several forms that explains an end of links best; one step finds one end.
+class Drift(NamedTuple):
+    """The form of a drift in time.
 
-    Class attributes:
+    Attributes:
+        form: warm-up since the first measurement or since each take-off, ageing, or a step.
+        number: time constant of a warm-up, middle of the ageing, or time of the step [s].
+    """
+
+    form: Literal["warm_up", "warm_up_each_flight", "ageing", "step"]
+    number: float
+
+
+class _DriftParams(EffectParams):
+    span_s: tuple[float, float] | None = Field(
+        None, description="First and last time that was learnt from [s]; ageing is relative to it.")
+
+
+class _GainDrift(GainEffect):
+    """A drift of one receiver or device, in the form that explains its links best.
+
+    Attributes:
         forms: that it may have.
-        ends: what its setting calls them.
+        end: "receiver" or "device".
     """
 
     repeatable = True
     forms: ClassVar[tuple[str, ...]]
-    ends: ClassVar[str]
+    end: ClassVar[str]
 
-    def __init__(self, steps_only: bool = False):
+    def __init__(self, steps_only: bool = False) -> None:
         self._forms = ("step",) if steps_only else self.forms
 
-    def index(self, records) -> np.ndarray:
-        """(n,) the end of each link."""
-        raise NotImplementedError
+    def index(self, links: LinkData) -> np.ndarray:
+        """Return the index (n,) of the receiver or device of each link."""
+        return getattr(links, self.end)
 
-    def _names(self, records) -> list[str]:
-        raise NotImplementedError
+    def drifts(self, params: _DriftParams) -> dict[int, Drift]:
+        """Return the drifts by index of the receiver or device."""
+        return getattr(params, f"{self.end}s")
 
-    def _members(self, records) -> list[int]:
-        """Ends that may drift."""
-        return measured(self.index(records)[np.isfinite(records.time_s)], LEAST_LINKS)
+    def _members(self, links: LinkData) -> list[int]:
+        """Return the receivers or devices that may drift."""
+        return frequent_labels(self.index(links)[np.isfinite(links.time_s)], MIN_LINKS)
 
-    def lacks(self, records) -> str | None:
-        if np.isfinite(records.time_s).sum() < LEAST_LINKS:
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if np.isfinite(links.time_s).sum() < MIN_LINKS:
             return "there is no time_s"
         return None
 
-    def propose(self, view: View) -> list[dict]:
-        known = {int(end) for kept in view.done(self.name, self.ends) for end in kept}
-        return self._best(view, sorted(set(self._members(view.records)) - known))
+    @override
+    def propose(self, view: ResidualView) -> list[Any]:
+        known = {member for drifts in view.found_params(self.name, f"{self.end}s")
+                 for member in drifts}
+        return self._best(view, sorted(set(self._members(view.links)) - known))
 
-    def propose_like(self, view: View, setting: dict) -> list[dict]:
-        # Whether this end drifts is the question, and not whether any does.
-        return self._best(view, [int(end) for end in setting[self.ends]])
+    @override
+    def propose_like(self, view: ResidualView, params: _DriftParams) -> list[Any]:
+        # Whether this member drifts is the question, and not whether any does.
+        return self._best(view, list(self.drifts(params)))
 
-    def _best(self, view: View, ends: list[int]) -> list[dict]:
-        records, found = view.records, []
-        for end in ends:
-            rows = np.flatnonzero((self.index(records) == end) & np.isfinite(records.time_s))
+    def _best(self, view: ResidualView, members: list[int]) -> list[Any]:
+        links, found = view.links, []
+        for member in members:
+            rows = np.flatnonzero((self.index(links) == member) & np.isfinite(links.time_s))
             if not len(rows):  # a fold may have none of its links
                 continue
-            candidates = _forms(
-                (records.time_s - records.first_s)[rows], records.time_s[rows], records.time_in_flight_s[rows],
-                records.flight[rows], view.residual_db[rows], view.weight[rows])
-            nats, form, number = max(each for each in candidates if each[1] in self._forms)
-            if nats > LEAST_NATS:
-                setting: Setting = {self.ends: {str(end): [form, float(number)]}}
-                if form == "ageing" or not self.of_receiver:
-                    # It is told from first to last, and other links are not to change these.
-                    setting["span_s"] = [records.first_s, records.last_s]
-                found.append((nats, setting))
-        return [setting for _, setting in sorted(found, key=lambda each: -each[0])[:MOST_TRIED]]
+            nats, form, number = max(
+                each for each in _candidates(links.select(rows), view.residual_db[rows],
+                                             view.weight[rows]) if each[1] in self._forms)
+            if nats > MIN_NATS:
+                # Other links must not change these times.
+                keep = form == "ageing" or not self.of_receiver
+                span_s = (links.first_s, links.last_s) if keep else None
+                found.append((nats, self.Params.model_validate(
+                    {f"{self.end}s": {member: (form, float(number))}, "span_s": span_s})))
+        return [params for _, params in sorted(found, key=lambda each: -each[0])[:MAX_PROPOSALS]]
 
-    def term(self, records, setting, at) -> Term:
-        columns, names = [], []
-        index, ends, time_s = self.index(records), self._names(records), records.time_s
-        if not self.of_receiver:  # is part of a map, too, which is of what things came to
-            time_s = np.where(np.isnan(time_s), setting["span_s"][1], time_s)
-        for end, (form, number) in setting[self.ends].items():
-            mine = (index == int(end)) & np.isfinite(time_s)
-            columns.append(np.where(mine, _shape(form, number, time_s - records.first_s, time_s,
-                                                 records.time_in_flight_s, setting.get("span_s")), 0.0))
-            # An offset of its own, or the drift would have to stand for a constant error, too.
+    @override
+    def term(self, links: LinkData, params: _DriftParams, level_at: LevelAt) -> Term:
+        columns, time_s = [], links.time_s
+        if not self.of_receiver and params.span_s:  # a map has no time: it is of the latest state
+            time_s = np.where(np.isnan(time_s), params.span_s[1], time_s)
+        for member, drift in self.drifts(params).items():
+            mine = (self.index(links) == member) & np.isfinite(time_s)
+            columns.append(np.where(mine, _shape(drift, links, time_s, params.span_s), 0.0))
+            # An offset of its own, or the drift would have to model a constant error, too.
             columns.append(mine.astype(float))
-            names += [form, f"offset[{ends[int(end)]}]"]
-        return Term.of_columns(np.column_stack(columns), SPREAD_DB, names)
+        return Term.of_columns(np.column_stack(columns), PRIOR_SD_DB)
 
-    def vary(self, setting) -> Variation | None:
-        warming = [end for end, (form, _) in setting[self.ends].items() if form in WARMING]
+    @override
+    def variation(self, params: _DriftParams) -> Variation | None:
+        drifts = self.drifts(params)
+        warming = [member for member, drift in drifts.items() if drift.form in WARM_UPS]
         if not warming:
             return None
-        values = np.log([setting[self.ends][end][1] for end in warming])
+        values, n = np.log([drifts[member].number for member in warming]), len(warming)
 
-        def again(numbers: np.ndarray) -> dict:
-            changed = {end: [setting[self.ends][end][0], float(np.exp(number))]
-                       for end, number in zip(warming, numbers)}
-            return setting | {self.ends: setting[self.ends] | changed}
-        return Variation(values, np.full(len(values), 0.3), np.full(len(values), 0.0), np.full(len(values), 9.0), again)
+        def changed(numbers: np.ndarray) -> _DriftParams:
+            new = {member: drifts[member]._replace(number=float(np.exp(number)))
+                   for member, number in zip(warming, numbers)}
+            return params.model_copy(update={f"{self.end}s": drifts | new})
 
-    def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        result, warming = {}, 0
-        for number, (end, (form, value)) in enumerate(setting[self.ends].items()):
-            name = self._names(records)[int(end)]
-            size, deviation = found.coefficients[2 * number], found.deviations[2 * number]
-            result[f"{form}_db[{name}]"] = Parameter.normal(size, deviation, "dB")
-            if form in WARMING:
-                spread = found.setting_deviations[warming]
-                warming += 1
-                low, high = value * np.exp([-1.645 * spread, 1.645 * spread])
-                result[f"time_constant_s[{name}]"] = Parameter(value, float(low), float(high), "s")
+        return Variation(values, np.full(n, 0.3), np.full(n, 0.0), np.full(n, 9.0), changed)
+
+    @override
+    def parameters(self, links: LinkData, params: _DriftParams,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        result, names = {}, getattr(links, f"{self.end}_names")
+        log_sd = iter(estimate.params_sd)
+        for number, (member, (form, value)) in enumerate(self.drifts(params).items()):
+            name = names[member]
+            result[f"{form}_db[{name}]"] = Parameter.normal(
+                estimate.coefficients[2 * number], estimate.coefficients_sd[2 * number], "dB")
+            if form in WARM_UPS:
+                result[f"time_constant_s[{name}]"] = Parameter.log_normal(value, next(log_sd), "s")
             elif form == "step":
                 result[f"step_time_s[{name}]"] = Parameter(value, value, value, "s")
         return result
 
 
-class ReceiverDrift(_Drift):
+class ReceiverDrift(_GainDrift):
     """A receiver that warms up, once or on each flight, ages, or has changed."""
 
     name = "receiver_drift"
     of_receiver = True
     confused_with = ("receiver_gain_offset", "interference")
     forms = ("warm_up", "warm_up_each_flight", "ageing", "step")
-    ends = "receivers"
+    end = "receiver"
 
-    def index(self, records) -> np.ndarray:
-        return records.receiver
+    class Params(_DriftParams):
+        """Drifts of receivers."""
 
-    def _names(self, records) -> list[str]:
-        return records.receiver_names
+        receivers: dict[int, Drift] = Field(description="Drift of each receiver, by index.")
 
 
-class DeviceDrift(_Drift):
-    """A device whose battery sinks or that has changed. Within a flight a change of time is one of place, so it must
-    have been heard on some."""
+class DeviceDrift(_GainDrift):
+    """A device whose battery discharges or that has changed."""
 
     name = "device_drift"
     confused_with = ("device_gain_offset", "device_position_error")
     forms = ("ageing", "step")
-    ends = "devices"
+    end = "device"
 
-    def index(self, records) -> np.ndarray:
-        return records.device
+    class Params(_DriftParams):
+        """Drifts of devices."""
 
-    def _names(self, records) -> list[str]:
-        return records.device_names
+        devices: dict[int, Drift] = Field(description="Drift of each device, by index.")
 
-    def _members(self, records) -> list[int]:
-        flights = np.unique(np.column_stack([records.device, records.flight]), axis=0)[:, 0]
-        return sorted(set(super()._members(records)) & set(measured(flights, LEAST_FLIGHTS)))
+    @override
+    def _members(self, links: LinkData) -> list[int]:
+        flights = np.unique(np.column_stack([links.device, links.flight]), axis=0)[:, 0]
+        return sorted(set(super()._members(links)) & set(frequent_labels(flights, MIN_FLIGHTS)))
 
-    def lacks(self, records) -> str | None:
-        members = self._members(records)
-        if len(members) > MOST_DEVICES:
-            return f"{len(members)} devices are too many to ask each; at most {MOST_DEVICES}"
-        no_device = None if members else f"no device has {LEAST_LINKS} links on {LEAST_FLIGHTS} flights"
-        return super().lacks(records) or no_device
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        members = self._members(links)
+        if len(members) > MAX_DEVICES:
+            return f"{len(members)} devices are too many to examine each; at most {MAX_DEVICES}"
+        return super().unavailable(links) or (
+            None if members else f"no device has {MIN_LINKS} links on {MIN_FLIGHTS} flights")
 
 
-def _shape(form: str, number: float, since_first_s: np.ndarray, time_s: np.ndarray,
-           time_in_flight_s: np.ndarray, span_s: list[float] | None = None) -> np.ndarray:
+def _shape(drift: Drift, links: LinkData, time_s: np.ndarray,
+           span_s: tuple[float, float] | None) -> np.ndarray:
+    """Return the change (n,) at times (n,), with an amplitude of 1."""
+    form, number = drift
     if form == "warm_up":
-        return np.exp(-since_first_s / number)
+        return np.exp(-(time_s - links.first_s) / number)
     if form == "warm_up_each_flight":
-        return np.exp(-time_in_flight_s / number)
+        return np.exp(-links.time_in_flight_s / number)
     if form == "step":
         return (time_s >= number).astype(float)
-    low, high = span_s or (np.nanmin(time_s), np.nanmax(time_s))  # twins of version 0.1 do not tell
+    low, high = span_s or (np.nanmin(time_s), np.nanmax(time_s))  # twins of version 0.1 have none
     return (time_s - number) / max(high - low, 1.0)
 
 
-def _forms(since_first_s, time_s, time_in_flight_s, flight, residual_db, weight):
-    """(nats, form, number) of each form that the times allow."""
+def _candidates(links: LinkData, residual_db: np.ndarray,
+                weight: np.ndarray) -> Iterator[tuple[float, str, float]]:
+    """Yield (nats, form, number) of each form that the times of one member's links allow."""
+    time_s = links.time_s
     yield 0.0, "step", float(time_s.mean())
 
-    def nats(shape):
+    def nats(shape: np.ndarray) -> float:
         centred = shape - weight @ shape / weight.sum()
         power = weight @ centred**2
-        return 0.0 if power < 1e-9 else 0.5 * (weight @ (centred * residual_db)) ** 2 / (power + 1 / SPREAD_DB**2)
+        if power < 1e-9:
+            return 0.0
+        return 0.5 * (weight @ (centred * residual_db)) ** 2 / (power + 1 / PRIOR_SD_DB**2)
 
     if np.ptp(time_s) > 0:
         yield nats((time_s - time_s.mean()) / np.ptp(time_s)), "ageing", float(time_s.mean())
-    for constant in TIME_CONSTANTS_S:
-        for form, since_s in (("warm_up", since_first_s), ("warm_up_each_flight", time_in_flight_s)):
-            if constant < np.ptp(since_s):
-                yield nats(np.exp(-since_s / constant)), form, constant
+    for constant_s in TIME_CONSTANTS_S:
+        for form, since_s in zip(WARM_UPS, (time_s - links.first_s, links.time_in_flight_s)):
+            if constant_s < np.ptp(since_s):
+                yield nats(np.exp(-since_s / constant_s)), form, constant_s
     order = np.argsort(time_s, kind="stable")
     sums = np.cumsum(weight[order]), np.cumsum((weight * residual_db)[order])
-    places = np.flatnonzero(np.diff(time_s[order]) > 0)
-    places = places[(places >= LEAST_SIDE) & (places < len(order) - LEAST_SIDE)]
-    if len(places):
+    gaps = np.flatnonzero(np.diff(time_s[order]) > 0)
+    gaps = gaps[(gaps >= MIN_SIDE) & (gaps < len(order) - MIN_SIDE)]
+    if len(gaps):
         total, moment = sums[0][-1], sums[1][-1]
-        before, moment_before = sums[0][places], sums[1][places]
-        gap = moment_before / before - (moment - moment_before) / (total - before)
-        value = 0.5 * gap**2 * before * (total - before) / total - STEP_PENALTY * np.log(len(places))
+        before, moment_before = sums[0][gaps], sums[1][gaps]
+        step_db = moment_before / before - (moment - moment_before) / (total - before)
+        # The logarithm pays for the choice among the gaps.
+        value = 0.5 * step_db**2 * before * (total - before) / total - np.log(len(gaps))
         best = int(value.argmax())
-        when = 0.5 * (time_s[order][places[best]] + time_s[order][places[best] + 1])
-        if abs(gap[best]) > CLEARLY * _spread_of_flights_db(time_s >= when, flight, residual_db, weight):
-            yield float(value[best]), "step", float(when)
+        when_s = 0.5 * (time_s[order][gaps[best]] + time_s[order][gaps[best] + 1])
+        sd_db = _step_sd_db(time_s >= when_s, links.flight, residual_db, weight)
+        if abs(step_db[best]) > MIN_GAP_SD * sd_db:
+            yield float(value[best]), "step", float(when_s)
 
 
-def _spread_of_flights_db(after, flight, residual_db, weight) -> float:
-    """Standard deviation of the gap between two means [dB], from how much flights on one side of the step differ."""
-    side = np.unique(np.column_stack([flight, after]), axis=0, return_inverse=True)[1].ravel()
-    mass = np.bincount(side, weights=weight)
-    mean = np.bincount(side, weights=weight * residual_db) / mass
-    later = np.bincount(side, weights=weight * after) > 0.5 * mass
+def _step_sd_db(after: np.ndarray, flight: np.ndarray, residual_db: np.ndarray,
+                weight: np.ndarray) -> float:
+    """Return the standard deviation of a step [dB], from how flights on one side of it differ."""
+    cell = np.unique(np.column_stack([flight, after]), axis=0, return_inverse=True)[1].ravel()
+    mass = np.bincount(cell, weights=weight)
+    mean = np.bincount(cell, weights=weight * residual_db) / mass
+    later = np.bincount(cell, weights=weight * after) > 0.5 * mass
     counts = [max((later == which).sum(), 1) for which in (False, True)]
     rest = mean - np.where(later, mean[later].mean(), mean[~later].mean())
     freedom = max(len(mean) - 2, 1)

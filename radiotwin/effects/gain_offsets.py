@@ -1,93 +1,108 @@
-"""Constant errors of gain: a device that radiates, or a receiver that reads, more or less than is declared.
+"""Constant gain errors: a device radiates, or a receiver reads, more or less than declared.
 
-Cable and connector loss, antenna efficiency, transmit power and calibration add to the link budget as constants
-(ITU-R P.341, 'The concept of transmission loss for radio links').
+Cable and connector loss, antenna efficiency, transmit power and calibration add constants to the
+link budget (ITU-R P.341, 'The concept of transmission loss for radio links').
 """
 
 from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
+from pydantic import AliasChoices, Field
+from typing_extensions import override
 
-from radiotwin.effects.base import Effect, Parameter, Term, View, measured, one_hot
+from radiotwin.effects.arrays import frequent_labels, one_hot
+from radiotwin.effects.base import GainEffect, Term
+from radiotwin.effects.params import EffectParams, Estimate, Parameter
+from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.links import LinkData
 
-SPREAD_DB = 10.0
-LEAST_LINKS = 30
-MOST_MEMBERS = 200
-LEAST_OFFSET_DB = 0.5
+PRIOR_SD_DB = 10.0  # wide: an error of a cable, a connector or a declared power
+MIN_LINKS = 30  # of a member; fewer do not outweigh shadowing
+MAX_MEMBERS = 200  # bounds the number of coefficients
+MIN_OFFSET_DB = 0.5  # accuracy of good power meters
 
 
-class _GainOffset(Effect):
-    """An offset for each member of an index."""
+class _GainOffset(GainEffect):
+    """An offset for each member of a kind of end."""
 
-    def _index(self, records) -> np.ndarray:
-        raise NotImplementedError
+    figure = "intervals"
+    end: ClassVar[str]  # "device" or "receiver"
 
-    def _names(self, records) -> list[str]:
-        raise NotImplementedError
+    class Params(EffectParams):
+        """Who has an offset."""
 
-    def lacks(self, records) -> str | None:
-        members = measured(self._index(records), LEAST_LINKS)
-        kind = self.name.split("_")[0]
+        members: list[int] = Field(description="Indices of those with an offset.")
+        offsets_sd_db: float = Field(validation_alias=AliasChoices("offsets_sd_db", "spread_db"),
+                                     description="Standard deviation of the offsets [dB].")
+
+    def _names(self, links: LinkData) -> list[str]:
+        return getattr(links, f"{self.end}_names")
+
+    def _index(self, links: LinkData) -> np.ndarray:
+        return getattr(links, self.end)
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        members = frequent_labels(self._index(links), MIN_LINKS)
         if len(members) < 2:
-            return f"needs two {kind}s with {LEAST_LINKS} links each, to tell one from the other"
-        if len(members) > MOST_MEMBERS:
-            return f"{len(members)} {kind}s are too many to give each an offset; at most {MOST_MEMBERS}"
+            return f"needs two {self.end}s with {MIN_LINKS} links each, to compare them"
+        if len(members) > MAX_MEMBERS:
+            return (f"{len(members)} {self.end}s are too many to give each an offset; at most "
+                    f"{MAX_MEMBERS}")
         return None
 
-    def propose(self, view: View) -> list[dict]:
-        index = self._index(view.records)
-        members = measured(index, LEAST_LINKS)
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        index = self._index(view.links)
+        members = frequent_labels(index, MIN_LINKS)
         if len(members) < 2:  # a fold may have fewer than all links
             return []
-        offsets_db = [np.average(view.residual_db[index == member], weights=view.weight[index == member])
-                      for member in members]
-        return [{"members": members, "spread_db": float(np.std(offsets_db))}]
+        offsets_db = [np.average(view.residual_db[index == member],
+                                 weights=view.weight[index == member]) for member in members]
+        return [self.Params(members=members, offsets_sd_db=float(np.std(offsets_db)))]
 
-    def term(self, records, setting, at) -> Term:
-        names, index = self._names(records), self._index(records)
-        term = Term.of_columns(one_hot(index, setting["members"]), SPREAD_DB,
-                               [names[member] for member in setting["members"]])
-        return replace(term, unsure_db=np.where(np.isin(index, setting["members"]), 0.0, setting["spread_db"]))
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        index = self._index(links)
+        unknown = ~np.isin(index, params.members)
+        return replace(Term.of_columns(one_hot(index, params.members), PRIOR_SD_DB),
+                       random_effect_sd_db=np.where(unknown, params.offsets_sd_db, 0.0))
 
-    def unphysical(self, setting, coefficients) -> str | None:
-        most_db = np.abs(coefficients - np.median(coefficients)).max()
-        if most_db < LEAST_OFFSET_DB:
-            return f"none of them is off by more than {most_db:.1f} dB, which is within any instrument's tolerance"
+    @override
+    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+        largest_db = np.abs(coefficients - np.median(coefficients)).max()
+        if largest_db < MIN_OFFSET_DB:
+            return (f"none of them is off by more than {largest_db:.1f} dB, which is within any "
+                    "instrument's tolerance")
         return None
 
-    def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        names = self._names(records)
-        # Against the median member: a common offset is the channel's intercept.
-        order = np.argsort(found.coefficients)
-        middle = order[len(order) // 2]
-        contrast = np.eye(len(order)) - np.eye(len(order))[middle]
-        deviations = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", contrast, found.covariance, contrast), 0))
-        return {f"offset_db[{names[member]}]": Parameter.normal(value, deviation, "dB") for member, value, deviation in
-                zip(setting["members"], contrast @ found.coefficients, deviations)}
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        # Relative to the median member: a common offset is the channel's intercept.
+        order = np.argsort(estimate.coefficients)
+        median = order[len(order) // 2]
+        contrast = np.eye(len(order)) - np.eye(len(order))[median]
+        variance = np.einsum("ij,jk,ik->i", contrast, estimate.covariance, contrast)
+        sd_db, names = np.sqrt(np.maximum(variance, 0)), self._names(links)
+        return {f"offset_db[{names[member]}]": Parameter.normal(value_db, each_sd_db, "dB")
+                for member, value_db, each_sd_db in zip(
+                    params.members, contrast @ estimate.coefficients, sd_db)}
 
 
 class DeviceGainOffset(_GainOffset):
-    """A device radiates more or less than the others do."""
+    """Devices that radiate more or less than the others do."""
 
     name = "device_gain_offset"
+    end = "device"
     confused_with = ("antenna_pattern", "device_position_error")
-
-    def _index(self, records):
-        return records.device
-
-    def _names(self, records):
-        return records.device_names
 
 
 class ReceiverGainOffset(_GainOffset):
-    """A receiver reads more or less than the others do."""
+    """Receivers that read more or less than the others do."""
 
     name = "receiver_gain_offset"
+    end = "receiver"
     of_receiver = True
     confused_with = ("receiver_drift", "antenna_pattern")
-
-    def _index(self, records):
-        return records.receiver
-
-    def _names(self, records):
-        return records.receiver_names

@@ -1,118 +1,161 @@
-"""An unknown emitter somewhere adds its power to whatever receivers read: the more, the closer they are to it.
+"""An unknown emitter adds its power to all readings: the more, the closer the receiver is.
 
-Powers of signal and interference add (ITU-R SM.1753), and that of the emitter falls by the free-space law, 20 log10 d
-(ITU-R P.525). It depends on the place of the receiver only. The emitter is taken to stand on the ground.
+Powers of signal and interference add (ITU-R SM.1753), and that of the emitter falls by the
+free-space law, 20 log10 d (ITU-R P.525). It depends on the receiver's position only. The emitter is
+assumed to be near the ground.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
+from pydantic import Field
+from typing_extensions import override
 
-from radiotwin.effects.base import NEPERS, Effect, Parameter, Term, Variation, View, some
-from radiotwin.effects.noise_floor import with_power
+from radiotwin.effects.arrays import subsample
+from radiotwin.effects.base import ReceiverEffect
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.power import NEPERS, add_power
+from radiotwin.effects.residual_view import ResidualView
+from radiotwin.links import LinkData
 
-LEAST_PLACES = 20
-PLACE_M = 10.0  # places closer together count as one
-HEIGHT_M = 1.5
-REFERENCE_M = 100.0
-AROUND_M = 100.0  # farther from all receivers it would be the same for each of them: a noise floor
-EDGE_M = 10.0
-CELLS = 300
-FINEST_M = 20.0
-QUANTILES = (0.05, 0.2, 0.4, 0.6, 0.8)  # of the levels, for the emitter's
-ENOUGH_LINKS = 2000
-STARTS = 2
-APART_M = 60.0
-LEAST_NATS = 4.0
+HEIGHT_M = 1.5  # of the emitter
+REFERENCE_M = 100.0  # distance of its level
+MIN_POSITIONS, SAME_POSITION_M = 20, 10.0  # of receivers, and what counts as one
+AROUND_M = 100.0  # searched beyond the receivers; farther away it would be a noise floor
+EDGE_M = 10.0  # of the searched area, where an estimate means "outside"
+MAX_CELLS, MIN_CELL_M = 300, 20.0  # of the search
+QUANTILES = (0.05, 0.2, 0.4, 0.6, 0.8)  # of the readings, tried as the emitter's level
+MAX_LINKS = 2000  # that the search looks at
+MAX_PROPOSALS, APART_M = 2, 60.0  # and their distance from each other
+MIN_NATS = 4.0  # that an emitter must gain to be proposed
 
 
-class Interference(Effect):
+class Interference(ReceiverEffect):
     """One emitter that all receivers hear."""
 
     name = "interference"
-    of_receiver = True
-    stage = "receiver"
+    figure = "links"
     confused_with = ("noise_floor_censoring", "receiver_drift")
 
-    def lacks(self, records) -> str | None:
-        places = np.unique((records.receiver_m[:, :2] / PLACE_M).round(), axis=0)
-        if len(places) < LEAST_PLACES:
-            return f"receivers were in {len(places)} places; {LEAST_PLACES} are needed to see where an emitter stands"
+    class Params(EffectParams):
+        """Position and level of the emitter."""
+
+        place_m: tuple[float, float] = Field(description="x and y of the emitter [m].")
+        level_db: float = Field(description="Its level at a distance of 100 m [dB].")
+        within_m: tuple[float, float, float, float] = Field(
+            description="Least x and y, and greatest x and y, of the searched area [m].")
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        positions = np.unique((links.receiver_m[:, :2] / SAME_POSITION_M).round(), axis=0)
+        if len(positions) < MIN_POSITIONS:
+            return (f"receivers were at {len(positions)} positions; {MIN_POSITIONS} are needed to "
+                    "locate an emitter")
         return None
 
-    def propose(self, view: View) -> list[dict]:
-        records = view.records
-        low, high = records.receiver_m[:, :2].min(axis=0) - AROUND_M, records.receiver_m[:, :2].max(axis=0) + AROUND_M
-        step_m = max(FINEST_M, float(np.sqrt(np.prod(high - low) / CELLS)))
-        places = np.stack(np.meshgrid(*(np.arange(a, b, step_m) for a, b in zip(low, high))), axis=-1).reshape(-1, 2)
-        levels_db = np.nanquantile(records.level_db, QUANTILES)
-        rows = some(np.arange(len(records)), ENOUGH_LINKS)
-        nats = _gain_of_places(view, rows, places, levels_db) * len(records) / len(rows)
-        found: list[dict] = []
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links = view.links
+        low = links.receiver_m[:, :2].min(axis=0) - AROUND_M
+        high = links.receiver_m[:, :2].max(axis=0) + AROUND_M
+        step_m = max(MIN_CELL_M, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
+        axes = (np.arange(a, b, step_m) for a, b in zip(low, high))
+        positions_m = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+        levels_db = np.nanquantile(links.level_db, QUANTILES)
+        rows = subsample(np.arange(len(links)), MAX_LINKS)
+        nats = _gains(view, rows, positions_m, levels_db) * len(links) / len(rows)
+        found: list[Interference.Params] = []
         for number in np.argsort(-nats.max(axis=1)):
-            if nats[number].max() < LEAST_NATS or len(found) == STARTS:
+            if nats[number].max() < MIN_NATS or len(found) == MAX_PROPOSALS:
                 break
-            if all(np.hypot(*(places[number] - other["place_m"])) > APART_M for other in found):
-                found.append({"place_m": [float(v) for v in places[number]],
-                              "level_db": float(levels_db[nats[number].argmax()]),
-                              "within_m": [float(v) for v in (*low, *high)]})
+            position_m = positions_m[number]
+            if all(np.hypot(*(position_m - other.place_m)) > APART_M for other in found):
+                found.append(self.Params(place_m=tuple(position_m.tolist()),
+                                         level_db=float(levels_db[nats[number].argmax()]),
+                                         within_m=(*low.tolist(), *high.tolist())))
         return found
 
-    def term(self, records, setting, at) -> Term:
-        nothing = Term.of_offset(np.zeros(len(records)))
-        power_db = interference_db(records.receiver_m, setting["place_m"], setting["level_db"])
-        return replace(nothing, extra=np.exp(power_db * NEPERS))
+    @override
+    def inputs(self, links: LinkData, params: Params) -> np.ndarray:
+        return np.exp(interference_db(links.receiver_m, params.place_m, params.level_db) * NEPERS)
 
-    def bend(self, level_db, setting, extra):
-        return with_power(level_db, extra)
+    @override
+    def response(self, level_db: np.ndarray, params: Params,
+                 inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return add_power(level_db, inputs)
 
-    def vary(self, setting) -> Variation:
-        level_db, within_m = setting["level_db"], np.array(setting["within_m"])
+    @override
+    def variation(self, params: Params) -> Variation:
+        level_db = params.level_db
         return Variation(
-            np.array([*setting["place_m"], level_db]), np.array([20.0, 20.0, 3.0]),
-            np.array([*within_m[:2], level_db - 40]), np.array([*within_m[2:], level_db + 40]),
-            lambda numbers: setting | {"place_m": [float(v) for v in numbers[:2]], "level_db": float(numbers[2])})
+            np.array([*params.place_m, level_db]), np.array([20.0, 20.0, 3.0]),
+            np.array([*params.within_m[:2], level_db - 40]),
+            np.array([*params.within_m[2:], level_db + 40]),
+            lambda numbers: params.model_copy(update={"place_m": tuple(numbers[:2].tolist()),
+                                                      "level_db": float(numbers[2])}))
 
-    def unphysical(self, setting, coefficients) -> str | None:
-        low, high = np.reshape(setting["within_m"], (2, 2))
-        if (np.minimum(setting["place_m"] - low, high - setting["place_m"]) < EDGE_M).any():
-            return "the emitter would stand at the edge of what is searched, or beyond: its place is not told"
+    @override
+    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+        low, high = np.reshape(params.within_m, (2, 2))
+        if (np.minimum(params.place_m - low, high - params.place_m) < EDGE_M).any():
+            return ("the emitter would be at the edge of the searched area or beyond: its position "
+                    "is unknown")
         return None
 
-    def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        values = zip(("x_m", "y_m", f"level_at_{REFERENCE_M:.0f}_m"), (*setting["place_m"], setting["level_db"]),
-                     found.setting_deviations, ("m", "m", "dB" if records.is_gain else "dBm"))
-        return {name: Parameter.normal(value, spread, unit) for name, value, spread, unit in values}
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        names = "x_m", "y_m", f"level_at_{REFERENCE_M:.0f}_m"
+        units = "m", "m", "dB" if links.is_gain else "dBm"
+        values = *params.place_m, params.level_db
+        return {name: Parameter.normal(value, sd, unit)
+                for name, value, sd, unit in zip(names, values, estimate.params_sd, units)}
 
 
-def interference_db(receiver_m: np.ndarray, place_m: Sequence[float], level_db: float) -> np.ndarray:
-    """(n,) level of an emitter at receivers.
+def interference_db(receiver_m: np.ndarray, position_m: Sequence[float] | np.ndarray,
+                    level_db: float) -> np.ndarray:
+    """Return the level of an emitter at receivers.
 
     Args:
         receiver_m: (n, 3) [m].
-        place_m: x and y of the emitter [m].
-        level_db: at `REFERENCE_M`.
+        position_m: x and y of the emitter [m].
+        level_db: at `REFERENCE_M` [dB].
+
+    Returns:
+        (n,) [dB].
     """
-    distance_m = np.linalg.norm(receiver_m - [*place_m, HEIGHT_M], axis=1)
+    distance_m = np.linalg.norm(receiver_m - [*position_m, HEIGHT_M], axis=1)
     return level_db - 20 * np.log10(np.maximum(distance_m, 1.0) / REFERENCE_M)
 
 
-def _gain_of_places(view: View, rows: np.ndarray, places: np.ndarray, levels_db: np.ndarray) -> np.ndarray:
-    """(places, levels) half of the drop of the weighted squares of some links [nats], after a level and a slope for
-    each class of line of sight are fitted: the base's have taken up part of the interference."""
-    part = view.records.select(rows)
+def _gains(view: ResidualView, rows: np.ndarray, positions_m: np.ndarray,
+           levels_db: np.ndarray) -> np.ndarray:
+    """Return half of the drop of the weighted squares of some links by an emitter [nats].
+
+    A level and a slope for each class of line of sight are fitted beside it, because the channel's
+    have taken up part of the interference.
+
+    Args:
+        view: residuals.
+        rows: (r,) links.
+        positions_m: (p, 2) x and y of emitters [m].
+        levels_db: (l,) their levels [dB].
+
+    Returns:
+        (p, l).
+    """
+    part = view.links.select(rows)
     root = np.sqrt(view.weight[rows])
     decades = np.log10(part.distance_m)
-    columns = np.column_stack([part.los, part.los * decades, ~part.los, ~part.los * decades]) * root[:, None]
-    basis, size, _ = np.linalg.svd(columns, full_matrices=False)
+    columns = np.column_stack([part.los, part.los * decades, ~part.los, ~part.los * decades])
+    basis, size, _ = np.linalg.svd(columns * root[:, None], full_matrices=False)
     basis = basis[:, size > 1e-9 * size[0]]
     target = root * view.residual_db[rows]
     target = target - basis @ (basis.T @ target)
-    nats = np.empty((len(places), len(levels_db)))
-    for number, place_m in enumerate(places):
-        power_db = interference_db(part.receiver_m, place_m, 0.0) + levels_db[:, None]
-        rise = root * 10 * np.log10(1 + 10 ** ((power_db - view.mean_db[rows]) / 10))
-        rise = rise - (rise @ basis) @ basis.T
-        nats[number] = rise @ target - 0.5 * (rise**2).sum(axis=1)
+    nats = np.empty((len(positions_m), len(levels_db)))
+    for number, position_m in enumerate(positions_m):
+        power_db = interference_db(part.receiver_m, position_m, 0.0) + levels_db[:, None]
+        rise_db = root * 10 * np.log10(1 + 10 ** ((power_db - view.mean_db[rows]) / 10))
+        rise_db = rise_db - (rise_db @ basis) @ basis.T
+        nats[number] = rise_db @ target - 0.5 * (rise_db**2).sum(axis=1)
     return nats

@@ -1,106 +1,120 @@
-"""A receiver that now and then loses lock: a link is blank although its level is well above the limit.
+"""A receiver that loses lock now and then: a link is blank although its level is above the limit.
 
-A blank is then either too weak or lost, P(blank) = p + (1 - p) F (the p-tobit of Deaton and Irish 1984, 'Statistical
-models for zero expenditures in household budgets', Journal of Public Economics 23), with a p for each receiver. Losses
-in stretches have the same p as losses at random; that links close to each other are lost together widens the interval.
+A blank is then either too weak or lost, P(blank) = p + (1 - p) F (the p-tobit of Deaton and Irish
+1984, 'Statistical models for zero expenditures in household budgets', Journal of Public Economics
+23), with a p for each receiver. Losses in sequences have the same p as losses at random; that
+neighbouring links are lost together widens the interval.
 """
 
 import numpy as np
+from pydantic import Field
 from scipy.special import expit, logit, stdtr
+from typing_extensions import override
 
-from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured
+from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.base import DetectionEffect
+from radiotwin.effects.params import QUANTILE_90, EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.residual_view import ResidualView
+from radiotwin.links import LinkData
 
-LEAST_LINKS = 60
-LEAST_NATS = 5.0
-LEAST_ALIKE = 20  # links of a device that tell whether it is lost as others are
-ALIKE = 0.6  # share of the devices that must want it
-STRONG = 0.25  # share of the links, the strongest, that must want it
-DOF = 4.0
-SHARES = np.geomspace(0.002, 0.9, 60)
-LEAST_CHANCE = 1e-9
-MOST_VARIED = 8
-STEP = 0.3  # of the log-odds
-FARTHEST = 1.0
+MIN_LINKS = 60  # of a receiver, with line of sight
+MIN_NATS = 5.0  # that dropouts must gain to be proposed for a receiver
+STRONGEST = 0.25  # share of the links, which must gain, too
+MIN_DEVICE_LINKS = 20  # of a device, to be asked whether it gains
+MIN_DEVICES = 0.6  # share of those devices that must gain
+DOF = 4.0  # of the errors: heavy tails
+PROBABILITIES = np.geomspace(0.002, 0.9, 60)  # tried
+MIN_PROBABILITY = 1e-9  # of a level below the limit; bounds the weight of one link
+MAX_VARIED = 8  # receivers whose probabilities are refined; more take too long
+STEP, MAX_CHANGE = 0.3, 1.0  # of the log-odds
 
 
-class LockLoss(Effect):
-    """A share of lost links for each receiver that it helps."""
+class LockLoss(DetectionEffect):
+    """A dropout probability for each receiver whose links become likelier by it."""
 
     name = "lock_loss"
-    of_receiver = True
-    stage = "detection"
     confused_with = ("missing_obstacle", "noise_floor_censoring")
 
-    def lacks(self, records) -> str | None:
-        if records.limit_db is None:
-            return "the limit of detection is not known, so that a blank tells nothing"
-        return None if np.isnan(records.level_db).any() else "no link is blank"
+    class Params(EffectParams):
+        """Dropout probabilities of receivers."""
 
-    def propose(self, view: View) -> list[dict]:
-        records, found = view.records, {}
-        # Where buildings stand between, links are blank for want of a path, too.
-        clear = records.los if records.los.any() else np.ones(len(records), dtype=bool)
-        for receiver in measured(records.receiver[clear], LEAST_LINKS):
-            rows = np.flatnonzero(clear & (records.receiver == receiver))
-            margin = (records.limit_db - view.mean_db[rows]) / view.scale_db[rows]
-            share, nats = _likeliest_share(stdtr(DOF, margin), np.isnan(records.level_db[rows]))
-            # A receiver that is deafer than declared misses no strong links, and an obstacle hides some devices' only.
-            strong = margin <= np.quantile(margin, STRONG)
-            if (nats.sum() > LEAST_NATS * view.design_effect and nats[strong].sum() > 0
-                    and _alike(records.device[rows], nats)):
-                found[str(receiver)] = share
-        return [{"receivers": found}] if found else []
+        receivers: dict[int, float] = Field(
+            description="Dropout probability of each receiver, by index.")
 
-    def term(self, records, setting, at) -> Term:
-        return Term.of_offset(np.zeros(len(records)))
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if links.limit_db is None:
+            return "the limit of detection is not known, so that a blank has no meaning"
+        return None if np.isnan(links.level_db).any() else "no link is blank"
 
-    def loses(self, records, setting) -> np.ndarray:
-        share = np.zeros(len(records.receiver_names))
-        for receiver, value in setting["receivers"].items():
-            share[int(receiver)] = value
-        return share[records.receiver]
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links, found = view.links, {}
+        assert links.limit_db is not None  # else it is unavailable
+        # Behind buildings, links are blank for want of a path, too.
+        clear = links.los if links.los.any() else np.ones(len(links), dtype=bool)
+        for receiver in frequent_labels(links.receiver[clear], MIN_LINKS):
+            rows = np.flatnonzero(clear & (links.receiver == receiver))
+            margin = (links.limit_db - view.mean_db[rows]) / view.scale_db[rows]
+            probability, nats = _likeliest(stdtr(DOF, margin), np.isnan(links.level_db[rows]))
+            # A receiver less sensitive than declared misses no strong links, and an obstacle
+            # affects some devices only.
+            strong = margin <= np.quantile(margin, STRONGEST)
+            if (nats.sum() > MIN_NATS * view.design_effect and nats[strong].sum() > 0
+                    and _most_devices_gain(links.device[rows], nats)):
+                found[receiver] = probability
+        return [self.Params(receivers=found)] if found else []
 
-    def vary(self, setting) -> Variation | None:
-        receivers = list(setting["receivers"])
-        if len(receivers) > MOST_VARIED:
+    @override
+    def dropout_probability(self, links: LinkData, params: Params) -> np.ndarray:
+        by_receiver = np.zeros(len(links.receiver_names))
+        by_receiver[list(params.receivers)] = list(params.receivers.values())
+        return by_receiver[links.receiver]
+
+    @override
+    def variation(self, params: Params) -> Variation | None:
+        if len(params.receivers) > MAX_VARIED:
             return None
-        odds = logit(np.array(list(setting["receivers"].values())))
+        log_odds = logit(np.array(list(params.receivers.values())))
+        return Variation(
+            log_odds, np.full(len(log_odds), STEP), log_odds - MAX_CHANGE, log_odds + MAX_CHANGE,
+            lambda numbers: self.Params(
+                receivers=dict(zip(params.receivers, expit(numbers).tolist()))))
 
-        def again(numbers: np.ndarray) -> dict:
-            return {"receivers": dict(zip(receivers, map(float, expit(numbers))))}
-        return Variation(odds, np.full(len(odds), STEP), odds - FARTHEST, odds + FARTHEST, again)
-
-    def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        spreads = found.setting_deviations
-        if not len(spreads):  # too many to be varied
-            spreads = np.full(len(setting["receivers"]), np.nan)
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        log_odds_sd = estimate.params_sd
+        if not len(log_odds_sd):  # too many to be varied
+            log_odds_sd = np.full(len(params.receivers), np.nan)
         result = {}
-        for (receiver, share), spread in zip(setting["receivers"].items(), spreads):
-            low, high = expit(logit(share) + 1.645 * spread * np.array([-1, 1]))
-            result[f"lost_share[{records.receiver_names[int(receiver)]}]"] = Parameter(
-                share, float(low), float(high), "of its links")
+        for (receiver, probability), sd in zip(params.receivers.items(), log_odds_sd):
+            low, high = expit(logit(probability) + QUANTILE_90 * sd * np.array([-1, 1]))
+            result[f"lost_share[{links.receiver_names[receiver]}]"] = Parameter(
+                probability, float(low), float(high), "of its links")
         return result
 
 
-def _likeliest_share(below: np.ndarray, blank: np.ndarray) -> tuple[float, np.ndarray]:
-    """The likeliest share of lost links, and what each link gains by it (n,) [nats].
+def _likeliest(below: np.ndarray, blank: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return the likeliest dropout probability, and the gain of each link by it (n,) [nats].
 
     Args:
-        below: (n,) chance of a level below the limit.
+        below: (n,) probability of a level below the limit.
         blank: (n,) bool.
     """
-    below = np.maximum(below, LEAST_CHANCE)
+    below = np.maximum(below, MIN_PROBABILITY)
 
-    def nats(share, below):
-        return np.log((share + (1 - share) * below) / below)
+    def nats(probability: float | np.ndarray, below: np.ndarray) -> np.ndarray:
+        return np.log((probability + (1 - probability) * below) / below)
 
-    total = nats(SHARES[:, None], below[blank]).sum(axis=1) + (~blank).sum() * np.log1p(-SHARES)
-    share = float(SHARES[total.argmax()])
-    return share, np.where(blank, nats(share, below), np.log1p(-share))
+    total = (nats(PROBABILITIES[:, None], below[blank]).sum(axis=1)
+             + (~blank).sum() * np.log1p(-PROBABILITIES))
+    best = float(PROBABILITIES[total.argmax()])
+    return best, np.where(blank, nats(best, below), np.log1p(-best))
 
 
-def _alike(device: np.ndarray, nats: np.ndarray) -> bool:
-    """Whether most devices want it; those with few links do not count."""
+def _most_devices_gain(device: np.ndarray, nats: np.ndarray) -> bool:
+    """Return whether most devices with enough links gain."""
     counts, sums = np.bincount(device), np.bincount(device, weights=nats)
-    large = counts >= LEAST_ALIKE
-    return not large.any() or float((sums[large] > 0).mean()) > ALIKE
+    enough = counts >= MIN_DEVICE_LINKS
+    return not enough.any() or float((sums[enough] > 0).mean()) > MIN_DEVICES

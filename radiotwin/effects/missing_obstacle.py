@@ -1,124 +1,162 @@
-"""A building that no map shows.
+"""A building that the map does not show.
 
-Found by back-projecting the loss along the links' rays; then a box is fitted. Loss behind it: what comes over the two
-edges of the roof and round both sides (knife edges of ITU-R P.526), and what reaches any shadow by reflections (the
-base's own level without line of sight, give or take what is fitted), added as powers; or, exactly, the base's level
-over the map with the box in it.
+It is located by back-projecting the loss along the links; then a box is fitted. Behind the box
+these powers add: what passes over the two edges of its roof and around both sides (knife edges of
+ITU-R P.526), and what reaches any shadow by reflections (the channel's own level without line of
+sight, plus a fitted offset). Exactly: the channel's level over the map with the box in it.
 """
 
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import trimesh
+from pydantic import Field
 from scipy.constants import speed_of_light
+from typing_extensions import override
 
-from radiotwin.effects.base import QUANTILE_90, Effect, Parameter, Term, Variation, View
+from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.boxes import (
     CELL_M,
     HEIGHTS_M,
     Box,
+    Crossing,
     back_project,
     best_cells,
     cross,
     knife_edge_db,
-    lacks_nats,
     near_box,
+    obstruction_nats,
     two_edges_db,
 )
+from radiotwin.effects.params import QUANTILE_90, EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.links import LinkData
 from radiotwin.scene.citymap import CityMap
 
-LEAST_NATS = 6.0
-NEAR_M = 25.0  # links that pass farther from it are not worked out anew
-LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)
-STARTS = 4
-NAMES = ("x_m", "y_m", "length_m", "width_m", "height_m", "turn_deg", "scattered_db")
-UNITS = {"turn_deg": "deg", "scattered_db": "dB"}
-MOST_BLANK_DB = 25.0
-TYPICAL_HEIGHT_M = 20.0  # dense urban: Table 1 there
+MIN_NATS = 6.0  # that a cell must gain to be proposed
+MAX_PROPOSALS = 4
+NEAR_M = 25.0  # links whose ground tracks stay farther away keep their level, also exactly
+LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)  # of an obstructed link, equally likely
+MAX_LOSS_DB = 50.0  # that a box causes
+HEIGHT_SCALE_M = 20.0  # of Rayleigh distributed heights: dense urban, ITU-R P.1410-6, Table 1
 
 
-class MissingObstacle(Effect):
-    """A box; one step finds one."""
+class MissingObstacle(GainEffect):
+    """A box that obstructs links; one step finds one."""
 
     name = "missing_obstacle"
+    figure = "map"
     repeatable = True
     confused_with = ("foliage", "antenna_pattern", "device_position_error")
 
-    def lacks(self, records) -> str | None:
-        if not np.isfinite(records.frequency_hz):
+    class Params(EffectParams):
+        """A box, and what reaches its shadow."""
+
+        box: Box = Field(description="In place of the building.")
+        scattered_db: float = Field(
+            0.0, description="Power in the shadow, relative to the channel without line of sight.")
+        exact: bool = Field(False, description="Whether paths are followed over a map with it.")
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if not np.isfinite(links.frequency_hz):
             return "the frequency is not known; give frequency_hz in devices.csv"
         return None
 
-    def propose(self, view: View) -> list[dict]:
-        records = view.records
-        rows = np.flatnonzero(records.los)
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links = view.links
+        rows = np.flatnonzero(links.los)
         if not len(rows):
             return []
-        nats = lacks_nats(view.residual_db[rows], view.scale_db[rows], LOSSES_DB) / view.design_effect
-        centres_m, total = back_project(records.device_m[records.device[rows]], records.receiver_m[rows], nats)
-        boxes = [[*map(float, centre_m), 1.5 * CELL_M, 1.5 * CELL_M, HEIGHTS_M[height], 0.0]
-                 for centre_m, height, nats in best_cells(centres_m, total, STARTS) if nats > LEAST_NATS]
-        return [{"box": box, "scattered_db": 0.0} for box in boxes]
+        nats = obstruction_nats(view.residual_db[rows], view.scale_db[rows],
+                                LOSSES_DB) / view.design_effect
+        centres_m, total = back_project(links.device_m[links.device[rows]], links.receiver_m[rows],
+                                        nats)
+        side_m = 1.5 * CELL_M
+        return [self.Params(box=Box(*centre_m.tolist(), side_m, side_m, HEIGHTS_M[height], 0.0))
+                for centre_m, height, gain in best_cells(centres_m, total, MAX_PROPOSALS)
+                if gain > MIN_NATS]
 
-    def term(self, records, setting, at) -> Term:
-        box = Box(*setting["box"])
-        offset_db = np.zeros(len(records))
-        if setting.get("exact", False):
-            rows = np.flatnonzero(near_box(box, records.device_m[records.device], records.receiver_m, NEAR_M))
-            mine = records.select(rows)
-            offset_db[rows] = at(replace(mine, city=_with_box(records.city, box)), True) - at(mine, True)
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        offset_db = np.zeros(len(links))
+        if params.exact:
+            assert links.city is not None  # paths are followed over a map
+            rows = np.flatnonzero(near_box(params.box, links.device_m[links.device],
+                                           links.receiver_m, NEAR_M))
+            mine = links.select(rows)
+            with_box = mine.with_city(_with_box(links.city, params.box))
+            offset_db[rows] = level_at(with_box, True) - level_at(mine, True)
             return Term.of_offset(offset_db)
-        rows = np.flatnonzero(records.los)
-        crossing = cross(box, records.device_m[records.device[rows]], records.receiver_m[rows])
-        hit = np.isfinite(crossing.left_m)
-        if not hit.any():
-            return Term.of_offset(offset_db)
-        rows = rows[hit]
-        enter_over_m, leave_over_m, left_m, right_m, before_m, between_m, behind_m = (
-            value[hit] for value in crossing[1:])
-        over_m, first_m, second_m = np.maximum(enter_over_m, leave_over_m), before_m + between_m / 2, \
-            behind_m + between_m / 2
-        wavelength_m = speed_of_light / records.frequency_hz
-        mine = records.select(rows)
-        scattered_db = at(mine.with_los(np.zeros(len(rows), bool))) - at(mine)
-        power = 10 ** (np.minimum(scattered_db + setting["scattered_db"], 0) / 10) if records.city is not None else 0.0
-        over_db = two_edges_db(enter_over_m, leave_over_m, before_m, between_m, behind_m, wavelength_m)
-        for side_m in (left_m, right_m):
-            power = power + 10 ** (-knife_edge_db(side_m, first_m, second_m, wavelength_m) / 10)
-        # A link that passes above the roof has its own strength, and what comes round the sides does not add to it.
-        power = np.where(over_m > 0, power, 0.0) + 10 ** (-over_db / 10)
-        offset_db[rows] = np.maximum(10 * np.log10(np.minimum(power, 1.0)), -2 * MOST_BLANK_DB)
+        rows = np.flatnonzero(links.los)
+        crossing = cross(params.box, links.device_m[links.device[rows]], links.receiver_m[rows])
+        crosses = np.isfinite(crossing.left_m)
+        if crosses.any():
+            rows = rows[crosses]
+            mine = links.select(rows)
+            scattered: np.ndarray | float = 0.0
+            shadow_db = level_at(mine.with_los(np.zeros(len(rows), bool))) - level_at(mine)
+            if links.city is not None:
+                scattered = 10 ** (np.minimum(shadow_db + params.scattered_db, 0) / 10)
+            offset_db[rows] = _gain_db(Crossing(*(value[crosses] for value in crossing)), scattered,
+                                       speed_of_light / links.frequency_hz)
         return Term.of_offset(offset_db)
 
-    def exact(self, setting) -> dict:
-        return setting | {"exact": True}
+    @override
+    def exact(self, params: Params) -> Params:
+        return params.model_copy(update={"exact": True})
 
-    def vary(self, setting) -> Variation:
-        x_m, y_m = setting["box"][:2]
-        return Variation(np.array([*setting["box"], setting["scattered_db"]]),
-                         np.array([6.0, 6.0, 8.0, 8.0, 8.0, 20.0, 4.0]),
-                         np.array([x_m - 60, y_m - 60, 4.0, 4.0, 3.0, -90.0, -20.0]),
-                         np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0, 10.0]),
-                         lambda numbers: {"box": [float(v) for v in numbers[:-1]], "scattered_db": float(numbers[-1])})
+    @override
+    def variation(self, params: Params) -> Variation:
+        x_m, y_m = params.box[:2]
+        return Variation(
+            np.array([*params.box, params.scattered_db]),
+            np.array([6.0, 6.0, 8.0, 8.0, 8.0, 20.0, 4.0]),
+            np.array([x_m - 60, y_m - 60, 4.0, 4.0, 3.0, -90.0, -20.0]),
+            np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0, 10.0]),
+            lambda numbers: self.Params(box=Box(*numbers[:-1].tolist()),
+                                        scattered_db=float(numbers[-1])))
 
-    def improbable(self, setting) -> float:
-        # Links that pass below the roof only tell "at least". Buildings' heights are Rayleigh distributed (P.1410-6).
-        return 0.5 * (setting["box"][4] / TYPICAL_HEIGHT_M) ** 2
+    @override
+    def neg_log_prior(self, params: Params) -> float:
+        # Links that all pass below the roof only bound its height from below.
+        return 0.5 * (params.box.height_m / HEIGHT_SCALE_M) ** 2
 
-    def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        variation = self.vary(setting)
-        reach = QUANTILE_90 * found.setting_sides
-        low = np.maximum(variation.values - reach[0], variation.low)
-        high = np.minimum(variation.values + reach[1], variation.high)
-        return {name: Parameter(float(value), float(least), float(most), UNITS.get(name, "m"))
-                for name, value, least, most in zip(NAMES, variation.values, low, high)}
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        variation = self.variation(params)
+        below, above = QUANTILE_90 * estimate.profile_widths
+        low = np.maximum(variation.values - below, variation.low)
+        high = np.minimum(variation.values + above, variation.high)
+        units = {"turn_deg": "deg", "scattered_db": "dB"}
+        return {name: Parameter(*map(float, interval), units.get(name, "m"))
+                for name, *interval in zip((*Box._fields, "scattered_db"), variation.values, low,
+                                           high, strict=True)}
+
+
+def _gain_db(crossing: Crossing, scattered: np.ndarray | float,
+             wavelength_m: float) -> np.ndarray:
+    """Return what a box adds to links (n,) that cross it; `scattered` power is relative to them."""
+    over_db = two_edges_db(crossing.enter_over_m, crossing.leave_over_m, crossing.before_m,
+                           crossing.between_m, crossing.behind_m, wavelength_m)
+    first_m = crossing.before_m + crossing.between_m / 2
+    second_m = crossing.behind_m + crossing.between_m / 2
+    power = scattered
+    for side_m in (crossing.left_m, crossing.right_m):
+        power = power + 10 ** (-knife_edge_db(side_m, first_m, second_m, wavelength_m) / 10)
+    # A link above the roof has its own level: what comes around the sides does not add to it.
+    below_roof = np.maximum(crossing.enter_over_m, crossing.leave_over_m) > 0
+    power = np.where(below_roof, power, 0.0) + 10 ** (-over_db / 10)
+    return np.maximum(10 * np.log10(np.minimum(power, 1.0)), -MAX_LOSS_DB)
 
 
 @lru_cache(maxsize=32)
 def _with_box(city: CityMap, box: Box) -> CityMap:
-    """A map with a box on its ground."""
-    turned = trimesh.transformations.rotation_matrix(np.radians(box.turn_deg), (0, 0, 1))
-    turned[:3, 3] = box.x_m, box.y_m, 0.5 * box.height_m
-    mesh = trimesh.creation.box((box.length_m, box.width_m, box.height_m), turned)
-    return CityMap(np.vstack([city.vertices, mesh.vertices]), np.vstack([city.faces, mesh.faces + len(city.vertices)]))
+    """Return a map with a box on its ground."""
+    pose = trimesh.transformations.rotation_matrix(np.radians(box.turn_deg), (0, 0, 1))
+    pose[:3, 3] = box.x_m, box.y_m, 0.5 * box.height_m
+    mesh = trimesh.creation.box((box.length_m, box.width_m, box.height_m), pose)
+    return CityMap(np.vstack([city.vertices, mesh.vertices]),
+                   np.vstack([city.faces, mesh.faces + len(city.vertices)]))

@@ -1,80 +1,88 @@
-"""Readings that hold the receiver's own noise, too: near the floor they stop falling with distance.
+"""Readings that contain the receiver's own noise: near the floor they stop falling with distance.
 
-Powers of signal and noise add: reading = 10 log10(10^(signal / 10) + 10^(floor / 10)). Readings such as RSSI hold both;
-those of a known reference signal do not (ITU-R SM.1753, 'Methods for measurements of radio noise').
+Powers of signal and noise add: reading = 10 log10(10^(signal / 10) + 10^(floor / 10)). Readings
+such as RSSI contain both; those of a known reference signal do not (ITU-R SM.1753, 'Methods for
+measurements of radio noise').
 """
 
-from dataclasses import replace
-
 import numpy as np
+from pydantic import Field
+from typing_extensions import override
 
-from radiotwin.effects.base import LEAST_POWER, NEPERS, Effect, Parameter, Term, Variation, View, measured
+from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.base import ReceiverEffect
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.power import NEPERS, add_power
+from radiotwin.effects.residual_view import ResidualView
+from radiotwin.links import LinkData
 
-LEAST_LINKS = 40
-LEAST_RECEIVERS = 3  # of which something is known, to tell what is usual
-COMMON_QUANTILES = (0.03, 0.15)
-QUANTILES = (0.01, 0.05, 0.1, 0.2, 0.35, 0.5)
+MIN_LINKS = 40  # of a receiver, to estimate its floor
+MIN_RECEIVERS = 3  # with a floor, so that their median is the usual one
+QUANTILES = (0.01, 0.05, 0.1, 0.2, 0.35, 0.5)  # of a receiver's readings, tried as its floor
+COMMON_QUANTILES = (0.03, 0.15)  # the same for all receivers
 
 
-class NoiseFloor(Effect):
+class NoiseFloor(ReceiverEffect):
     """A floor for each receiver."""
 
     name = "noise_floor_censoring"
-    of_receiver = True
-    stage = "receiver"
     confused_with = ("interference", "excess_attenuation")
 
-    def propose(self, view: View) -> list[dict]:
-        records, found = view.records, {}
-        seen = np.isfinite(records.level_db)
-        for receiver in measured(records.receiver[seen], LEAST_LINKS):
-            rows = seen & (records.receiver == receiver)
-            mean, residual, weight = view.mean_db[rows], view.residual_db[rows], view.weight[rows]
-            found[str(receiver)] = max(
-                (-float(weight @ (residual + mean - floored(mean, floor)[0]) ** 2), float(floor))
-                for floor in np.quantile(records.level_db[rows], QUANTILES))[1]
+    class Params(EffectParams):
+        """Floors of receivers."""
+
+        receivers: dict[int, float] = Field(description="Floor of each receiver, by index [dB].")
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links, found = view.links, {}
+        seen = np.isfinite(links.level_db)
+        for receiver in frequent_labels(links.receiver[seen], MIN_LINKS):
+            rows = seen & (links.receiver == receiver)
+            mean_db, weight = view.mean_db[rows], view.weight[rows]
+            residual_db = view.residual_db[rows]
+            found[receiver] = max(
+                (-float(weight @ (residual_db + mean_db - floored(mean_db, floor_db)[0]) ** 2),
+                 float(floor_db)) for floor_db in np.quantile(links.level_db[rows], QUANTILES))[1]
         if not found:
             return []
-        # A law that was fitted without a floor is too flat, and asks for none: where it lies may have to be tried.
-        tried = [{receiver: float(np.nanquantile(records.level_db[records.receiver == int(receiver)], share))
+        # A law that was fitted without a floor is too flat and hides it, so usual ones are tried.
+        tried = [{receiver: float(np.nanquantile(links.level_db[links.receiver == receiver], share))
                   for receiver in found} for share in COMMON_QUANTILES]
-        return [{"receivers": floors} for floors in (found, *tried)]
+        return [self.Params(receivers=floors_db) for floors_db in (found, *tried)]
 
-    def term(self, records, setting, at) -> Term:
-        floors = list(setting["receivers"].values())
-        # A receiver of which nothing is known has the usual one.
-        usual = np.median(floors) if len(floors) >= LEAST_RECEIVERS else -np.inf
-        floor = np.full(len(records.receiver_names), usual)
-        for receiver, floor_db in setting["receivers"].items():
-            floor[int(receiver)] = floor_db
-        return replace(Term.of_offset(np.zeros(len(records))), extra=np.exp(floor * NEPERS)[records.receiver])
+    @override
+    def inputs(self, links: LinkData, params: Params) -> np.ndarray:
+        floors_db = list(params.receivers.values())
+        # A receiver without an estimate has the usual floor.
+        usual_db = np.median(floors_db) if len(floors_db) >= MIN_RECEIVERS else -np.inf
+        by_receiver_db = np.full(len(links.receiver_names), usual_db)
+        by_receiver_db[list(params.receivers)] = floors_db
+        return np.exp(by_receiver_db * NEPERS)[links.receiver]
 
-    def bend(self, level_db, setting, extra):
-        return with_power(level_db, extra)
+    @override
+    def response(self, level_db: np.ndarray, params: Params,
+                 inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return add_power(level_db, inputs)
 
-    def vary(self, setting) -> Variation:
-        receivers = list(setting["receivers"])
+    @override
+    def variation(self, params: Params) -> Variation:
+        n = len(params.receivers)
+        return Variation(
+            np.array(list(params.receivers.values())), np.full(n, 2.0), np.full(n, -250.0),
+            np.full(n, 50.0),
+            lambda numbers: self.Params(receivers=dict(zip(params.receivers, numbers.tolist()))),
+            list(np.arange(n)[:, None]))
 
-        def again(numbers: np.ndarray) -> dict:
-            return {"receivers": dict(zip(receivers, map(float, numbers)))}
-        times = len(receivers)
-        return Variation(np.array(list(setting["receivers"].values())), np.full(times, 2.0), np.full(times, -250.0),
-                         np.full(times, 50.0), again, list(np.arange(times)[:, None]))
-
-    def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        spreads = found.setting_deviations
-        return {f"floor[{records.receiver_names[int(receiver)]}]": Parameter.normal(floor, spread,
-                                                                                    "dB" if records.is_gain else "dBm")
-                for (receiver, floor), spread in zip(setting["receivers"].items(), spreads)}
-
-
-def floored(level_db, floor_db):
-    """What is read, and the slope of it."""
-    return with_power(level_db, np.exp(floor_db * NEPERS))
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        unit = "dB" if links.is_gain else "dBm"
+        return {f"floor[{links.receiver_names[receiver]}]": Parameter.normal(floor_db, sd_db, unit)
+                for (receiver, floor_db), sd_db in zip(params.receivers.items(),
+                                                       estimate.params_sd)}
 
 
-def with_power(level_db: np.ndarray, floor_power: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same for a floor's power, in units of that of 0 dB."""
-    power = np.maximum(np.exp(level_db * NEPERS), LEAST_POWER)
-    total = power + floor_power
-    return np.log(total) / NEPERS, power / total
+def floored(level_db: np.ndarray, floor_db: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the reading (n,) of levels (n,) with a noise floor [dB], and its slope (n,)."""
+    return add_power(level_db, np.exp(floor_db * NEPERS))

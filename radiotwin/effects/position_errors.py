@@ -1,141 +1,184 @@
-"""Ends of links that are not where they are declared to be: an anchor, or a receiver.
+"""Ends of links that are not at their declared positions: an anchor, or a receiver.
 
-No law of its own: the base model is asked again with the end elsewhere, lines of sight included.
+No law of its own: the channel predicts again with the end elsewhere, lines of sight included.
 """
 
 from typing import Any
 
 import numpy as np
+from pydantic import Field
+from typing_extensions import override
 
-from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured, some
+from radiotwin.effects.arrays import frequent_labels, subsample
+from radiotwin.effects.base import GainEffect, Term
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.links import LinkData, site_of
 
-LEAST_LINKS = 60
-LEAST_NATS = 6.0
+MIN_LINKS = 60  # of an end that is moved about
+MAX_ENDS = 60  # that are moved about, or it takes too long
+MIN_NATS = 6.0  # that a move must gain to be proposed
+MAX_PROPOSE_LINKS = 600  # of an end, on which moves are tried
+# Moves that are tried: of devices on circles, of receivers along axes.
 RADII_M = (8.0, 15.0, 25.0, 40.0, 60.0, 85.0)
 DIRECTIONS = 12
-FARTHEST_M = 120.0
-MOST_DEVICES = 60
-RECEIVER_OFFSETS_M = (5.0, 10.0, 20.0)
-ENOUGH_LINKS = 600  # of a device, for a first look
-SAME_SITE_M = 1.0  # devices this close together are on one mast, and move together
+RECEIVER_MOVES_M = (5.0, 10.0, 20.0)
+RECEIVER_AXES = ((1, 0, 0), (0, 1, 0), (0.7, 0.7, 0), (0.7, -0.7, 0), (0, 0, 1))
+MAX_MOVE_M = 120.0  # east and north, of a device
 
 
-class DevicePositionError(Effect):
-    """An anchor stands elsewhere, and all that share its mast; one step finds one, the worst."""
+class DevicePositionError(GainEffect):
+    """A wrong position of an anchor and of all on its mast; one step finds one, the worst."""
 
     name = "device_position_error"
+    figure = "map"
     repeatable = True
-    quickly_exact = True
-    confused_with = ("removed_obstacle", "missing_obstacle", "antenna_pattern", "device_gain_offset")
+    always_exact = True
+    confused_with = ("removed_obstacle", "missing_obstacle", "antenna_pattern",
+                     "device_gain_offset")
 
-    def lacks(self, records) -> str | None:
-        devices = _anchors(records)
+    class Params(EffectParams):
+        """An anchor and its move."""
+
+        device: int = Field(description="Index of the anchor, or of one of those on its mast.")
+        move_m: tuple[float, float] = Field(
+            description="True minus declared position, east and north [m].")
+        exact: bool = Field(False, description="Whether paths are followed to the new position.")
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        devices = _movable_anchors(links)
         if not devices:
-            return f"no anchor has {LEAST_LINKS} links"
-        if len(devices) > MOST_DEVICES:
-            return f"{len(devices)} devices are too many to move each about; at most {MOST_DEVICES}"
+            return f"no anchor has {MIN_LINKS} links"
+        if len(devices) > MAX_ENDS:
+            return f"{len(devices)} devices are too many to move each about; at most {MAX_ENDS}"
         return None
 
-    def propose(self, view: View) -> list[dict]:
-        records = view.records
-        best: tuple[float, Any] = LEAST_NATS, None
-        moves = [(radius * np.sin(angle), radius * np.cos(angle)) for radius in RADII_M
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links = view.links
+        best: tuple[float, Any] = MIN_NATS, None
+        moves = [(float(radius * np.sin(angle)), float(radius * np.cos(angle)))
+                 for radius in RADII_M
                  for angle in np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS]
-        known = {other for device in view.done(self.name, "device") for other in site_of(records, device)}
-        for device in sorted({min(site_of(records, device)) for device in _anchors(records)} - known):
-            every = np.flatnonzero(np.isin(records.device, site_of(records, device)))
-            rows = some(every, ENOUGH_LINKS)
-            mine, share = records.select(rows), len(every) / len(rows)
-            before_db = view.at(mine)
-            for east, north in moves:
-                moved_db = view.at(_with_moved(mine, device, (east, north))) - before_db
-                nats = share * view.nats(rows, moved_db).sum()
+        known = {other for device in view.found_params(self.name, "device")
+                 for other in site_of(links, device)}
+        masts = {min(site_of(links, device)) for device in _movable_anchors(links)}
+        for device in sorted(masts - known):
+            every = np.flatnonzero(np.isin(links.device, site_of(links, device)))
+            rows = subsample(every, MAX_PROPOSE_LINKS)
+            mine, share = links.select(rows), len(every) / len(rows)
+            before_db = view.level_at(mine)
+            for move_m in moves:
+                change_db = view.level_at(_with_moved(mine, device, move_m)) - before_db
+                nats = share * view.gain_nats(rows, change_db).sum()
                 if nats > best[0]:
-                    best = nats, {"device": device, "move_m": [float(east), float(north)]}
+                    best = nats, self.Params(device=device, move_m=move_m)
         return [best[1]] if best[1] else []
 
-    def term(self, records, setting, at) -> Term:
-        offset_db = np.zeros(len(records))
-        rows = np.flatnonzero(np.isin(records.device, site_of(records, setting["device"])))
-        mine = records.select(rows)
-        exact = setting.get("exact", False)
-        offset_db[rows] = at(_with_moved(mine, setting["device"], setting["move_m"]), exact) - at(mine, exact)
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        offset_db = np.zeros(len(links))
+        rows = np.flatnonzero(np.isin(links.device, site_of(links, params.device)))
+        mine = links.select(rows)
+        moved = _with_moved(mine, params.device, params.move_m)
+        offset_db[rows] = level_at(moved, params.exact) - level_at(mine, params.exact)
         return Term.of_offset(offset_db)
 
-    def exact(self, setting) -> dict:
-        return setting | {"exact": True}
+    @override
+    def exact(self, params: Params) -> Params:
+        return params.model_copy(update={"exact": True})
 
-    def vary(self, setting) -> Variation:
-        return Variation(np.array(setting["move_m"]), np.full(2, 6.0), np.full(2, -FARTHEST_M), np.full(2, FARTHEST_M),
-                         lambda numbers: {"device": setting["device"], "move_m": [float(v) for v in numbers]})
+    @override
+    def variation(self, params: Params) -> Variation:
+        return Variation(
+            np.array(params.move_m), np.full(2, 6.0), np.full(2, -MAX_MOVE_M),
+            np.full(2, MAX_MOVE_M),
+            lambda move_m: self.Params(device=params.device, move_m=tuple(move_m.tolist())))
 
-    def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        declared_m = records.device_m[setting["device"], :2]
-        return {f"{axis}_m[{records.device_names[device]}]": Parameter.normal(declared + move, spread, "m")
-                for device in site_of(records, setting["device"]) for axis, declared, move, spread in
-                zip("xy", declared_m, setting["move_m"], found.setting_deviations)}
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        declared_m = links.device_m[params.device, :2]
+        return {f"{axis}_m[{links.device_names[device]}]": Parameter.normal(old_m + move_m, sd, "m")
+                for device in site_of(links, params.device)
+                for axis, old_m, move_m, sd in zip("xy", declared_m, params.move_m,
+                                                   estimate.params_sd, strict=True)}
 
 
-class ReceiverPositionError(Effect):
-    """All positions of a receiver are off by a constant; one step finds one receiver, the worst."""
+class ReceiverPositionError(GainEffect):
+    """A constant error of all positions of a receiver; one step finds one receiver, the worst."""
 
     name = "receiver_position_error"
+    figure = "map"
     of_receiver = True
     repeatable = True
     confused_with = ("receiver_gain_offset",)
 
-    def lacks(self, records) -> str | None:
-        receivers = measured(records.receiver, LEAST_LINKS)
-        if len(receivers) > MOST_DEVICES:
-            return f"{len(receivers)} receivers are too many to move each about; at most {MOST_DEVICES}"
-        return None if receivers else f"no receiver has {LEAST_LINKS} links"
+    class Params(EffectParams):
+        """A receiver and its move."""
 
-    def propose(self, view: View) -> list[dict]:
-        records = view.records
-        best: tuple[float, Any] = LEAST_NATS, None
-        axes = [(1, 0, 0), (0, 1, 0), (0.7, 0.7, 0), (0.7, -0.7, 0), (0, 0, 1)]
-        moves = [sign * size * np.array(axis) for axis in axes for size in RECEIVER_OFFSETS_M for sign in (-1, 1)]
-        for receiver in sorted(set(measured(records.receiver, LEAST_LINKS)) - set(view.done(self.name, "receiver"))):
-            rows = some(np.flatnonzero(records.receiver == receiver), ENOUGH_LINKS)
-            mine, share = records.select(rows), (records.receiver == receiver).sum() / len(rows)
-            before_db = view.at(mine)
-            for move in moves:
-                moved_db = view.at(mine.with_receivers(mine.receiver_m + move)) - before_db
-                nats = share * view.nats(rows, moved_db).sum()
+        receiver: int = Field(description="Index of the receiver.")
+        move_m: tuple[float, float, float] = Field(
+            description="True minus given position, east, north and up [m].")
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        receivers = frequent_labels(links.receiver, MIN_LINKS)
+        if len(receivers) > MAX_ENDS:
+            return f"{len(receivers)} receivers are too many to move each about; at most {MAX_ENDS}"
+        return None if receivers else f"no receiver has {MIN_LINKS} links"
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links = view.links
+        best: tuple[float, Any] = MIN_NATS, None
+        moves = [sign * size_m * np.array(axis) for axis in RECEIVER_AXES
+                 for size_m in RECEIVER_MOVES_M for sign in (-1, 1)]
+        known = set(view.found_params(self.name, "receiver"))
+        for receiver in sorted(set(frequent_labels(links.receiver, MIN_LINKS)) - known):
+            every = np.flatnonzero(links.receiver == receiver)
+            rows = subsample(every, MAX_PROPOSE_LINKS)
+            mine, share = links.select(rows), len(every) / len(rows)
+            before_db = view.level_at(mine)
+            for move_m in moves:
+                moved = mine.with_receivers(mine.receiver_m + move_m)
+                nats = share * view.gain_nats(rows, view.level_at(moved) - before_db).sum()
                 if nats > best[0]:
-                    best = nats, {"receiver": receiver, "move_m": [float(v) for v in move]}
+                    best = nats, self.Params(receiver=receiver, move_m=tuple(move_m.tolist()))
         return [best[1]] if best[1] else []
 
-    def term(self, records, setting, at) -> Term:
-        offset_db = np.zeros(len(records))
-        rows = np.flatnonzero(records.receiver == setting["receiver"])
-        mine = records.select(rows)
-        offset_db[rows] = at(mine.with_receivers(mine.receiver_m + np.array(setting["move_m"]))) - at(mine)
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        offset_db = np.zeros(len(links))
+        rows = np.flatnonzero(links.receiver == params.receiver)
+        mine = links.select(rows)
+        moved = mine.with_receivers(mine.receiver_m + np.array(params.move_m))
+        offset_db[rows] = level_at(moved) - level_at(mine)
         return Term.of_offset(offset_db)
 
-    def vary(self, setting) -> Variation:
-        return Variation(np.array(setting["move_m"]), np.full(3, 3.0), np.full(3, -60.0), np.full(3, 60.0),
-                         lambda numbers: setting | {"move_m": [float(v) for v in numbers]})
+    @override
+    def variation(self, params: Params) -> Variation:
+        return Variation(
+            np.array(params.move_m), np.full(3, 3.0), np.full(3, -60.0), np.full(3, 60.0),
+            lambda move_m: params.model_copy(update={"move_m": tuple(move_m.tolist())}))
 
-    def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        name = records.receiver_names[setting["receiver"]]
-        return {f"true_minus_given_{axis}_m[{name}]": Parameter.normal(move, spread, "m")
-                for axis, move, spread in zip("xyz", setting["move_m"], found.setting_deviations)}
-
-
-def _anchors(records) -> list[int]:
-    """Devices with enough links; those that were located from these very measurements stand where they fit best."""
-    return [device for device in measured(records.device, LEAST_LINKS) if device in records.anchors]
-
-
-def site_of(records, device: int) -> list[int]:
-    """The device, and the anchors that share its mast."""
-    apart_m = np.linalg.norm(records.device_m - records.device_m[device], axis=1)
-    return [int(other) for other in np.flatnonzero(apart_m <= SAME_SITE_M)
-            if other == device or other in records.anchors]
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        name = links.receiver_names[params.receiver]
+        return {f"true_minus_given_{axis}_m[{name}]": Parameter.normal(move_m, sd, "m")
+                for axis, move_m, sd in zip("xyz", params.move_m, estimate.params_sd, strict=True)}
 
 
-def _with_moved(records, device: int, move_m):
-    device_m = records.device_m.copy()
-    device_m[site_of(records, device), :2] += move_m
-    return records.with_devices(device_m)
+def _movable_anchors(links: LinkData) -> list[int]:
+    """Return anchors with enough links; other devices were located where these links fit best."""
+    return [device for device in frequent_labels(links.device, MIN_LINKS)
+            if device in links.anchors]
+
+
+def _with_moved(links: LinkData, device: int, move_m: tuple[float, float]) -> LinkData:
+    """Return the links with a device and all on its mast moved east and north."""
+    device_m = links.device_m.copy()
+    device_m[site_of(links, device), :2] += move_m
+    return links.with_devices(device_m)

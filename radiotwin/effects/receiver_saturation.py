@@ -1,87 +1,124 @@
 """A receiver that compresses strong signals.
 
-Rapp's model of a solid-state amplifier (Rapp 1991, 'Effects of HPA-nonlinearity on a 4-DPSK/OFDM signal'): output =
-input / (1 + (input / saturation)^(2p))^(1 / 2p), in amplitudes; here in decibels.
+Rapp's model of a solid-state amplifier (Rapp 1991, 'Effects of HPA-nonlinearity on a 4-DPSK/OFDM
+signal'): output = input / (1 + (input / saturation)^(2p))^(1 / 2p), in amplitudes; here in
+decibels.
 """
 
-from dataclasses import replace
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
+from pydantic import Field
+from typing_extensions import override
 
-from radiotwin.effects.base import Effect, Parameter, Term, Variation, View, measured
+from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.base import ReceiverEffect
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.residual_view import ResidualView
+from radiotwin.links import LinkData
 
-LEAST_STRONG = 20
-SMOOTHNESS = (1.0, 3.0)
-QUANTILES = (0.6, 0.7, 0.8, 0.88, 0.94, 0.98)
+MIN_STRONG = 20  # links above the saturation level
+MIN_LINKS = 5 * MIN_STRONG  # of a receiver
+MIN_NATS = 3.0  # that compression must gain to be proposed for a receiver
+SMOOTHNESS = (1.0, 3.0)  # tried
+QUANTILES = (0.6, 0.7, 0.8, 0.88, 0.94, 0.98)  # of the predicted levels, tried as saturation level
 
 
-class ReceiverSaturation(Effect):
-    """Receivers that read less than they receive at the strong end; those that are helped share one curve each."""
+class Compression(NamedTuple):
+    """Rapp's model.
+
+    Attributes:
+        level_db: saturation level [dB].
+        smoothness: p; the higher, the sharper the knee.
+    """
+
+    level_db: float
+    smoothness: float
+
+
+class ReceiverSaturation(ReceiverEffect):
+    """Receivers that read less than they receive where it is strong."""
 
     name = "receiver_saturation"
-    of_receiver = True
-    stage = "receiver"
     confused_with = ("antenna_pattern", "excess_attenuation")
 
-    def propose(self, view: View) -> list[dict]:
-        records, found = view.records, dict[str, Any]()
-        seen = np.isfinite(records.level_db)
-        members = measured(records.receiver[seen], 5 * LEAST_STRONG)
-        for receiver in members:
-            rows = seen & (records.receiver == receiver)
-            mean, residual, weight = view.mean_db[rows], view.residual_db[rows], view.weight[rows]
-            best: tuple[float, Any] = 0.0, None
+    class Params(EffectParams):
+        """Compression of receivers."""
+
+        receivers: dict[int, Compression] = Field(description="Of each receiver, by index.")
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links, found = view.links, {}
+        seen = np.isfinite(links.level_db)
+        for receiver in frequent_labels(links.receiver[seen], MIN_LINKS):
+            rows = seen & (links.receiver == receiver)
+            mean_db, weight = view.mean_db[rows], view.weight[rows]
+            residual_db = view.residual_db[rows]
+            best_nats, best = 0.0, None
             for quantile in QUANTILES:
-                level = float(np.quantile(mean, quantile))
-                if (mean > level).sum() < LEAST_STRONG:
+                level_db = float(np.quantile(mean_db, quantile))
+                if (mean_db > level_db).sum() < MIN_STRONG:
                     continue
                 for smoothness in SMOOTHNESS:
-                    drop = _compress(mean, level, smoothness)[0] - mean
-                    rest = residual - drop
-                    nats = 0.5 * (weight @ (residual - weight @ residual / weight.sum()) ** 2
-                                  - weight @ (rest - weight @ rest / weight.sum()) ** 2)
-                    if nats > best[0]:
-                        best = nats, [level, smoothness]
-            if best[0] > 3.0:
-                found[str(receiver)] = best[1]
-        return [{"receivers": found}] if found else []
+                    rest_db = residual_db - (_compress(mean_db, level_db, smoothness)[0] - mean_db)
+                    nats = 0.5 * (_squares(residual_db, weight) - _squares(rest_db, weight))
+                    if nats > best_nats:
+                        best_nats, best = nats, Compression(level_db, smoothness)
+            if best and best_nats > MIN_NATS:
+                found[receiver] = best
+        return [self.Params(receivers=found)] if found else []
 
-    def term(self, records, setting, at) -> Term:
-        by_receiver = np.full((len(records.receiver_names), 2), np.inf)
-        for receiver, numbers in setting["receivers"].items():
-            by_receiver[int(receiver)] = numbers
-        return replace(Term.of_offset(np.zeros(len(records))), extra=by_receiver[records.receiver])
+    @override
+    def inputs(self, links: LinkData, params: Params) -> np.ndarray:
+        by_receiver = np.full((len(links.receiver_names), 2), np.inf)
+        for receiver, compression in params.receivers.items():
+            by_receiver[receiver] = compression
+        return by_receiver[links.receiver]
 
-    def bend(self, level_db, setting, extra):
-        bent, slope = level_db.copy(), np.ones_like(level_db)
-        mine = np.isfinite(extra[:, 0])
-        bent[mine], slope[mine] = _compress(level_db[mine], *extra[mine].T)
-        return bent, slope
+    @override
+    def response(self, level_db: np.ndarray, params: Params,
+                 inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        reading_db, slope = level_db.copy(), np.ones_like(level_db)
+        mine = np.isfinite(inputs[:, 0])
+        reading_db[mine], slope[mine] = _compress(level_db[mine], *inputs[mine].T)
+        return reading_db, slope
 
-    def vary(self, setting) -> Variation:
-        receivers = list(setting["receivers"])
-        values = np.concatenate([[level, np.log(smooth)] for level, smooth in setting["receivers"].values()])
+    @override
+    def variation(self, params: Params) -> Variation:
+        n = len(params.receivers)
+        values = np.concatenate([[level_db, np.log(smoothness)]
+                                 for level_db, smoothness in params.receivers.values()])
 
-        def again(numbers: np.ndarray) -> dict:
-            return {"receivers": {receiver: [float(level), float(np.exp(smooth))]
-                                  for receiver, (level, smooth) in zip(receivers, np.reshape(numbers, (-1, 2)))}}
-        times = len(receivers)
-        return Variation(values, np.tile([3.0, 0.4], times), np.tile([-250.0, np.log(0.4)], times),
-                         np.tile([50.0, np.log(8.0)], times), again,
-                         list(np.arange(len(values)).reshape(times, -1)))
+        def changed(numbers: np.ndarray) -> ReceiverSaturation.Params:
+            return self.Params(receivers={
+                receiver: Compression(float(level_db), float(np.exp(log_smoothness)))
+                for receiver, (level_db, log_smoothness) in zip(params.receivers,
+                                                                numbers.reshape(-1, 2))})
 
-    def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        result = {}
-        spreads = np.reshape(found.setting_deviations, (-1, 2))
-        for (receiver, (level, _)), spread in zip(setting["receivers"].items(), spreads):
-            result[f"saturation_level[{records.receiver_names[int(receiver)]}]"] = Parameter.normal(
-                level, spread[0], "dB" if records.is_gain else "dBm")
-        return result
+        return Variation(values, np.tile([3.0, 0.4], n), np.tile([-250.0, np.log(0.4)], n),
+                         np.tile([50.0, np.log(8.0)], n), changed,
+                         list(np.arange(2 * n).reshape(n, 2)))
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        unit = "dB" if links.is_gain else "dBm"
+        return {f"saturation_level[{links.receiver_names[receiver]}]":
+                Parameter.normal(compression.level_db, sd_db, unit)
+                for (receiver, compression), sd_db in zip(params.receivers.items(),
+                                                          estimate.params_sd[::2])}
 
 
-def _compress(level_db: np.ndarray, saturation_db: float, smoothness: float) -> tuple[np.ndarray, np.ndarray]:
-    """What is read, and the slope of it."""
+def _squares(residual_db: np.ndarray, weight: np.ndarray) -> float:
+    """Return the weighted squares about the weighted mean."""
+    return weight @ (residual_db - weight @ residual_db / weight.sum()) ** 2
+
+
+def _compress(level_db: np.ndarray, saturation_db: float | np.ndarray,
+              smoothness: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the reading (n,) and its slope (n,)."""
     over = (level_db - saturation_db) * smoothness * np.log(10) / 10
+    reading_db = level_db - np.logaddexp(0, over) / smoothness * 10 / np.log(10)
     # A slope of e^-60 is none, but can be divided by.
-    return level_db - np.logaddexp(0, over) / smoothness * 10 / np.log(10), 1 / (1 + np.exp(np.minimum(over, 60)))
+    return reading_db, 1 / (1 + np.exp(np.minimum(over, 60)))

@@ -1,114 +1,145 @@
-"""A mapped building that is not there any more.
+"""A building of the map that does not exist any more.
 
-No law of its own: links that only this building blocks have the base's level with line of sight; or, exactly, links
-near it have the base's level over the map without it.
+No law of its own: links that only this building blocks have the channel's level with line of sight.
+Exactly: links near it have the channel's level over the map without it.
 """
 
-from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
+from pydantic import Field
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from typing_extensions import override
 
-from radiotwin.effects.base import Effect, Parameter, Term, View
+from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.boxes import Box, near_box
+from radiotwin.effects.params import EffectParams, Estimate, Parameter
+from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.links import LinkData
 from radiotwin.scene.citymap import CityMap
 
-LEAST_NATS = 6.0
-LEAST_LINKS = 8
-WELD_M = 0.05
-NEAR_M = 25.0  # links that pass farther from it are not worked out anew
+MIN_NATS = 6.0  # that the removal of a building must gain to be proposed
+MIN_LINKS = 8  # that only this building blocks
+WELD_M = 0.05  # vertices closer together belong to one building
+NEAR_M = 25.0  # links whose ground tracks stay farther away keep their level, also exactly
 
 
-class RemovedObstacle(Effect):
+class RemovedObstacle(GainEffect):
     """One building of the map; one step finds one."""
 
     name = "removed_obstacle"
+    figure = "map"
     nlos_only = True
     repeatable = True
     confused_with = ("device_position_error",)
 
-    def __init__(self):
-        self._cache = None
-        self._others: dict[int, tuple[CityMap, CityMap]] = {}  # of each building the map, and the map without it
+    class Params(EffectParams):
+        """A building of the map."""
 
-    def lacks(self, records) -> str | None:
-        return "there is no 3D map" if records.city is None else None
+        building: int = Field(description="Index, as `buildings` numbers them.")
+        centre_m: tuple[float, float, float] = Field(description="Centre x, y, and height [m].")
+        exact: bool = Field(False, description="Whether paths are followed over a map without it.")
 
-    def propose(self, view: View) -> list[dict]:
-        records = view.records
-        blocker = self._only_blocker(records)
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        return "there is no 3D map" if links.city is None else None
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links = view.links
+        assert links.city is not None
+        blocker = only_blocker(links)
         rows = np.flatnonzero(blocker >= 0)
         if not len(rows):
             return []
-        mine = records.select(rows)
-        rise_db = view.at(mine.with_los(np.ones(len(rows), bool))) - view.at(mine)
-        total = np.bincount(blocker[rows], weights=view.nats(rows, rise_db))
+        mine = links.select(rows)
+        rise_db = view.level_at(mine.with_los(np.ones(len(rows), bool))) - view.level_at(mine)
+        total = np.bincount(blocker[rows], weights=view.gain_nats(rows, rise_db))
         counts = np.bincount(blocker[rows])
-        best = int(np.where(counts >= LEAST_LINKS, total, -np.inf).argmax())
-        if total[best] < LEAST_NATS or counts[best] < LEAST_LINKS:
+        best = int(np.where(counts >= MIN_LINKS, total, -np.inf).argmax())
+        if total[best] < MIN_NATS or counts[best] < MIN_LINKS:
             return []
-        return [{"building": best, "centre_m": [float(v) for v in self._centres[best]]}]
+        centre_m = buildings(links.city)[1][best]
+        return [self.Params(building=best, centre_m=tuple(centre_m.tolist()))]
 
-    def term(self, records, setting, at) -> Term:
-        offset_db = np.zeros(len(records))
-        if setting.get("exact", False):
-            city, box = self._without(records.city, setting["building"])
-            rows = np.flatnonzero(near_box(box, records.device_m[records.device], records.receiver_m, NEAR_M))
-            mine = records.select(rows)
-            offset_db[rows] = at(replace(mine, city=city), True) - at(mine, True)
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        assert links.city is not None
+        offset_db = np.zeros(len(links))
+        if params.exact:
+            city, box = _without(links.city, params.building)
+            rows = np.flatnonzero(near_box(box, links.device_m[links.device], links.receiver_m,
+                                           NEAR_M))
+            mine = links.select(rows)
+            offset_db[rows] = level_at(mine.with_city(city), True) - level_at(mine, True)
             return Term.of_offset(offset_db)
-        rows = np.flatnonzero(self._only_blocker(records) == setting["building"])
+        rows = np.flatnonzero(only_blocker(links) == params.building)
         if len(rows):
-            mine = records.select(rows)
-            offset_db[rows] = at(mine.with_los(np.ones(len(rows), bool))) - at(mine)
+            mine = links.select(rows)
+            with_los = mine.with_los(np.ones(len(rows), bool))
+            offset_db[rows] = level_at(with_los) - level_at(mine)
         return Term.of_offset(offset_db)
 
-    def exact(self, setting) -> dict:
-        return setting | {"exact": True}
+    @override
+    def exact(self, params: Params) -> Params:
+        return params.model_copy(update={"exact": True})
 
-    def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        return {name: Parameter(value, value, value, "m") for name, value in zip(("x_m", "y_m", "height_m"),
-                                                                                setting["centre_m"])}
-
-    def _without(self, city: CityMap, building: int) -> tuple[CityMap, Box]:
-        """The map without a building, and a box around that."""
-        label = buildings(city)[0]
-        corners_m = city.vertices[city.faces[label == building]].reshape(-1, 3)
-        low_m, high_m = corners_m.min(axis=0), corners_m.max(axis=0)
-        if self._others.get(building, (None,))[0] is not city:
-            self._others[building] = city, CityMap(city.vertices, city.faces[label != building])
-        (x_m, y_m, _), (length_m, width_m, _) = (low_m + high_m) / 2, high_m - low_m
-        return self._others[building][1], Box(x_m, y_m, length_m, width_m, high_m[2], 0.0)
-
-    def _only_blocker(self, records) -> np.ndarray:
-        """(n,) building that alone stands between the ends of each link; -1 where there is none or more than one."""
-        if self._cache is None or self._cache[0] is not records.city:
-            label, self._centres = buildings(records.city)
-            self._cache = records.city, label
-        label = self._cache[1]
-        alone = np.full(len(records), -1)
-        rows = np.flatnonzero(~records.los)
-        a_m, b_m = records.device_m[records.device[rows]], records.receiver_m[rows]
-        near, far = records.city.first_face(a_m, b_m), records.city.first_face(b_m, a_m)
-        same = (near >= 0) & (far >= 0) & (label[near] == label[far])
-        alone[rows[same]] = label[near[same]]
-        return alone
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        return {name: Parameter(value, value, value, "m")
+                for name, value in zip(("x_m", "y_m", "height_m"), params.centre_m, strict=True)}
 
 
-def buildings(city) -> tuple[np.ndarray, np.ndarray]:
-    """Faces that hang together.
+def only_blocker(links: LinkData) -> np.ndarray:
+    """Return (n,) the building that alone blocks each link; -1 where none or more than one does."""
+    assert links.city is not None
+    label = buildings(links.city)[0]
+    alone = np.full(len(links), -1)
+    rows = np.flatnonzero(~links.los)
+    a_m, b_m = links.device_m[links.device[rows]], links.receiver_m[rows]
+    near, far = links.city.first_face(a_m, b_m), links.city.first_face(b_m, a_m)
+    same = (near >= 0) & (far >= 0) & (label[near] == label[far])
+    alone[rows[same]] = label[near[same]]
+    return alone
+
+
+@lru_cache(maxsize=4)
+def buildings(city: CityMap) -> tuple[np.ndarray, np.ndarray]:
+    """Group faces that are connected.
+
+    Args:
+        city: a map with f faces.
 
     Returns:
-        (f,) index of each face's building, and (buildings, 3) centre x, y and height of each [m]
+        (f,) index of each face's building, and (buildings, 3) centre x, y and height of each [m];
+        read-only, as they are kept for the next call.
     """
-    place = np.unique(np.round(city.vertices / WELD_M).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
-    faces = place[city.faces]
+    welded = np.round(city.vertices / WELD_M).astype(np.int64)
+    vertex = np.unique(welded, axis=0, return_inverse=True)[1].ravel()
+    faces = vertex[city.faces]
     ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(place.max() + 1,) * 2)
-    label = np.unique(connected_components(graph, directed=False)[1][faces[:, 0]], return_inverse=True)[1]
-    corners = city.vertices[city.faces]
-    low, high = np.full((label.max() + 1, 3), np.inf), np.full((label.max() + 1, 3), -np.inf)
-    np.minimum.at(low, label, corners.min(axis=1))
-    np.maximum.at(high, label, corners.max(axis=1))
-    return label, np.column_stack([0.5 * (low + high)[:, :2], high[:, 2]])
+    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])),
+                       shape=(vertex.max() + 1,) * 2)
+    component = connected_components(graph, directed=False)[1]
+    label = np.unique(component[faces[:, 0]], return_inverse=True)[1]
+    corners_m = city.vertices[city.faces]
+    low_m = np.full((label.max() + 1, 3), np.inf)
+    high_m = -low_m
+    np.minimum.at(low_m, label, corners_m.min(axis=1))
+    np.maximum.at(high_m, label, corners_m.max(axis=1))
+    centre_m = np.column_stack([0.5 * (low_m + high_m)[:, :2], high_m[:, 2]])
+    label.flags.writeable = centre_m.flags.writeable = False
+    return label, centre_m
+
+
+@lru_cache(maxsize=32)
+def _without(city: CityMap, building: int) -> tuple[CityMap, Box]:
+    """Return a map without a building, and the box around that building."""
+    mine = buildings(city)[0] == building
+    corners_m = city.vertices[city.faces[mine]].reshape(-1, 3)
+    low_m, high_m = corners_m.min(axis=0), corners_m.max(axis=0)
+    (x_m, y_m, _), (length_m, width_m, _) = (low_m + high_m) / 2, high_m - low_m
+    return (CityMap(city.vertices, city.faces[~mine]),
+            Box(x_m, y_m, length_m, width_m, high_m[2], 0.0))

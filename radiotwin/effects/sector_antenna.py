@@ -1,138 +1,161 @@
 """A device with a sector antenna: gain depends on the direction in which a link leaves the device.
 
-Pattern of 3GPP TR 38.901 V17, Table 7.3-1: horizontally −min(12 (φ / φ_3dB)², A_max), vertically −min(12 ((θ − tilt) /
-θ_3dB)², A_max), together no less than −A_max. The maximum gain is the device's level and is fitted with it. With a 3D
-map each path has the gain of the direction in which it leaves the device; what is on ways that are not followed, whose
-power is fitted too, has the mean of the pattern.
+Pattern of 3GPP TR 38.901 V17, Table 7.3-1: horizontally −min(12 (φ / φ_3dB)², A_max), vertically
+−min(12 ((θ − tilt) / θ_3dB)², A_max), together no less than −A_max. The maximum gain is the
+device's level and is fitted with it. With a 3D map each path has the gain of the direction in which
+it leaves the device. Power on paths that are not followed, which is fitted too, has the mean of the
+pattern.
 """
 
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from pydantic import Field
+from typing_extensions import override
 
-from radiotwin.closeloop.paths import free_space, rays_of, through_antenna_db
-from radiotwin.closeloop.records import Records
-from radiotwin.effects.base import Effect, Parameter, Remembered, Term, Variation, View, measured, one_hot, some
-from radiotwin.effects.position_errors import site_of
+from radiotwin.channel.followed_paths import free_space, rays_of, through_antenna_db
+from radiotwin.effects.antenna_params import AntennaParams, report_pattern, vary_patterns
+from radiotwin.effects.arrays import LinkCache, frequent_labels, one_hot, subsample
+from radiotwin.effects.base import GainEffect, Term
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation, quantity
+from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.links import LinkData, site_of
 
-LEAST_LINKS = 100
-LEAST_NATS = 4.0
-LEVEL_SPREAD_DB = 15.0
-AZIMUTHS_DEG = np.arange(0.0, 360.0, 15.0)
+MIN_LINKS = 100  # of a device whose antenna is looked for
+MIN_NATS = 4.0  # that a pattern must gain to be proposed
+MAX_PROPOSE_LINKS = 300  # of a device, from which its pattern is proposed
+LEVEL_SD_DB = 15.0  # prior standard deviation of the maximum gain, beside the channel's
+# Grid of patterns that are tried first: flat ones, then the best of those with (tilt, beamwidth).
+AZIMUTHS_DEG = np.arange(0.0, 360.0, 15.0).tolist()
 BEAMWIDTHS_DEG = (65.0, 110.0)
-ATTENUATIONS_DB = (12.0, 25.0)
-ENOUGH_LINKS = 300  # of a device, for a first look
-NO_VERTICAL = (0.0, 360.0)  # tilt and vertical beamwidth of an antenna that is flat in elevation
-VERTICALS = (NO_VERTICAL, (0.0, 15.0), (-6.0, 15.0), (-12.0, 15.0), (0.0, 40.0), (-10.0, 40.0), (15.0, 40.0),
-             (40.0, 65.0))
-FIELDS = ("azimuth_deg", "beamwidth_deg", "front_to_back_db", "tilt_deg", "vertical_beamwidth_deg",
-          "scattered_db")
-UNITS = ("deg", "deg", "dB", "deg", "deg", "dB under free space")
-STEPS = np.array([8.0, 10.0, 3.0, 4.0, 5.0, 6.0])
-LOW, HIGH = np.array([-720.0, 20.0, 8.0, -60.0, 6.0, -80.0]), np.array([1080.0, 150.0, 45.0, 80.0, 360.0, -15.0])
-SCATTERED_DB = -35.0
-AROUND_DEG = np.arange(0.0, 360.0, 5.0)
+FRONT_TO_BACK_DB = (12.0, 25.0)
+VERTICALS_DEG = ((0.0, 360.0), (0.0, 15.0), (-6.0, 15.0), (-12.0, 15.0), (0.0, 40.0),
+                 (-10.0, 40.0), (15.0, 40.0), (40.0, 65.0))
+AROUND_DEG = np.arange(0.0, 360.0, 5.0)  # azimuths over which a pattern is averaged
 
 
-def sector_pattern_db(azimuth_deg: np.ndarray, elevation_deg: np.ndarray, pattern: np.ndarray) -> np.ndarray:
-    """Gain below the maximum [dB].
+class SectorPattern(AntennaParams):
+    """Pattern of one sector antenna; by default flat in elevation."""
+
+    azimuth_deg: float = quantity(
+        0.0, unit="deg", low=-720.0, high=1080.0, step=8.0,
+        description="Direction of the maximum, clockwise from north.")
+    beamwidth_deg: float = quantity(
+        65.0, unit="deg", low=20.0, high=150.0, step=10.0,
+        description="Horizontal width between the points 3 dB below the maximum.")
+    front_to_back_db: float = quantity(
+        25.0, unit="dB", low=8.0, high=45.0, step=3.0, description="Greatest attenuation.")
+    tilt_deg: float = quantity(
+        0.0, unit="deg", low=-60.0, high=80.0, step=4.0,
+        description="Elevation of the maximum, up is positive.")
+    vertical_beamwidth_deg: float = quantity(
+        360.0, unit="deg", low=6.0, high=360.0, step=5.0,
+        description="Vertical width between the points 3 dB below the maximum.")
+    scattered_db: float = quantity(
+        -35.0, unit="dB under free space", low=-80.0, high=-15.0, step=6.0,
+        description="Power on paths that are not followed.")
+
+
+def sector_pattern_db(azimuth_deg: np.ndarray, elevation_deg: np.ndarray,
+                      pattern: SectorPattern) -> np.ndarray:
+    """Return the gain relative to the maximum [dB].
 
     Args:
-        azimuth_deg, elevation_deg: (n,) direction, clockwise from north, and up.
-        pattern: (5,) as in `FIELDS`; a tilt above zero looks up.
+        azimuth_deg: (…,) direction, clockwise from north [deg].
+        elevation_deg: (…,) direction, up [deg].
+        pattern: of the antenna.
     """
-    azimuth, beamwidth, most_db, tilt, vertical = pattern
-    off = (azimuth_deg - azimuth + 180) % 360 - 180
-    horizontal_db = np.minimum(12 * (off / beamwidth) ** 2, most_db)
-    vertical_db = np.minimum(12 * ((elevation_deg - tilt) / vertical) ** 2, most_db)
-    return -np.minimum(horizontal_db + vertical_db, most_db)
+    max_db = pattern.front_to_back_db
+    # Rays come in single precision.
+    off = (np.asarray(azimuth_deg, dtype=float) - pattern.azimuth_deg + 180) % 360 - 180
+    above = np.asarray(elevation_deg, dtype=float) - pattern.tilt_deg
+    horizontal_db = np.minimum(12 * (off / pattern.beamwidth_deg) ** 2, max_db)
+    vertical_db = np.minimum(12 * (above / pattern.vertical_beamwidth_deg) ** 2, max_db)
+    return -np.minimum(horizontal_db + vertical_db, max_db)
 
 
-class SectorAntenna(Effect):
-    """A device's sector antenna that nobody declared; one step finds one device's, or all of a mast's."""
+class SectorAntenna(GainEffect):
+    """An undeclared sector antenna; one step finds one device's, or all those of a mast."""
 
     name = "antenna_pattern"
     variant = "sector antenna of a device"
+    figure = "sector_pattern"
     repeatable = True
     confused_with = ("device_gain_offset", "device_position_error", "missing_obstacle", "foliage")
 
-    def __init__(self):
-        self._rays = Remembered()
+    class Params(EffectParams):
+        """Antennas of devices."""
 
-    def lacks(self, records) -> str | None:
-        return None if _placed(records) else f"no device of known position has {LEAST_LINKS} links"
+        devices: dict[int, SectorPattern] = Field(description="Pattern of each device, by index.")
 
-    def propose(self, view: View) -> list[dict]:
-        known = {int(device) for devices in view.done(self.name, "devices") for device in devices}
-        found = self._patterns(view, sorted(set(_placed(view.records)) - known))
+    def __init__(self) -> None:
+        self._rays = LinkCache()
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if not _eligible_devices(links):
+            return f"no device of known position has {MIN_LINKS} links"
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        known = {device for devices in view.found_params(self.name, "devices")
+                 for device in devices}
+        found = _best_patterns(view, sorted(set(_eligible_devices(view.links)) - known))
         if not found:
             return []
         best = max(found, key=lambda device: found[device][1])
-        # Sectors of one mast have the evidence of all of them.
-        others = set(site_of(view.records, best)) & set(found)
-        return [{"devices": {str(device): found[device][0] for device in sorted(mast)}}
-                for mast in ([others, {best}] if len(others) > 1 else [{best}])]
+        # Sectors of one mast are supported by the evidence of all of them.
+        mast = set(site_of(view.links, best)) & set(found)
+        return [self.Params(devices={device: found[device][0] for device in sorted(chosen)})
+                for chosen in ([mast, {best}] if len(mast) > 1 else [{best}])]
 
-    def _patterns(self, view: View, devices: list[int]) -> dict[int, tuple[list[float], float]]:
-        """Device -> its best pattern, and what it gains [nats], where that is enough."""
-        found = {}
-        for device in devices:
-            every = np.flatnonzero(view.records.device == device)
-            rows = some(every, ENOUGH_LINKS)
-            if not len(rows):
-                continue
-            pattern, nats = _best_pattern(_Rays.of(view.records.select(rows)), view, rows)
-            if nats * len(every) / len(rows) > LEAST_NATS:
-                found[device] = pattern, nats * len(every) / len(rows)
-        return found
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        offset_db = np.zeros(len(links))
+        for device, pattern in params.devices.items():
+            rows = np.flatnonzero(links.device == device)
+            if len(rows):
+                rays = self._rays.get(links, device,
+                                      lambda rows=rows: _Rays.of(links.select(rows)))
+                offset_db[rows] = rays.offset_db(pattern)
+        return Term(offset_db, one_hot(links.device, list(params.devices)),
+                    np.full(len(params.devices), LEVEL_SD_DB))
 
-    def term(self, records, setting, at) -> Term:
-        offset_db = np.zeros(len(records))
-        for device, pattern in setting["devices"].items():
-            mine = np.flatnonzero(records.device == int(device))
-            if len(mine):
-                rays = self._rays.of(records, device, lambda: _Rays.of(records.select(mine)))
-                offset_db[mine] = rays.offset_db(np.array(pattern))
-        members = [int(device) for device in setting["devices"]]
-        names = [f"gain_db[{records.device_names[member]}]" for member in members]
-        return Term(offset_db, one_hot(records.device, members), np.full(len(members), LEVEL_SPREAD_DB), names)
+    @override
+    def variation(self, params: Params) -> Variation:
+        return vary_patterns(params.devices, lambda devices: self.Params(devices=devices))
 
-    def vary(self, setting) -> Variation:
-        devices = list(setting["devices"])
-        values = np.concatenate([setting["devices"][device] for device in devices])
-
-        def again(numbers: np.ndarray) -> dict:
-            return {"devices": {device: [float(v) for v in part]
-                                for device, part in zip(devices, np.reshape(numbers, (-1, len(FIELDS))))}}
-        times = len(devices)
-        return Variation(values, np.tile(STEPS, times), np.tile(LOW, times), np.tile(HIGH, times), again,
-                         list(np.arange(len(values)).reshape(times, -1)))
-
-    def parameters(self, records, setting, found) -> dict[str, Parameter]:
-        result = {}
-        spreads = np.reshape(found.setting_deviations, (-1, len(FIELDS)))
-        for number, (device, pattern) in enumerate(setting["devices"].items()):
-            name = records.device_names[int(device)]
-            known = len(FIELDS) - (records.city is None)
-            for field, unit, value, spread in list(zip(FIELDS, UNITS, pattern, spreads[number]))[:known]:
-                value = value % 360 if field == "azimuth_deg" else value
-                result[f"{field}[{name}]"] = Parameter.normal(value, spread, unit)
-            result[f"gain_db[{name}]"] = Parameter.normal(found.coefficients[number], found.deviations[number], "dB")
-        return result
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        reported = {}
+        patterns_sd = np.reshape(estimate.params_sd, (len(params.devices), -1))
+        for number, (device, pattern) in enumerate(params.devices.items()):
+            name = links.device_names[device]
+            reported |= report_pattern(pattern, patterns_sd[number], name, links.city is not None)
+            reported[f"gain_db[{name}]"] = Parameter.normal(
+                estimate.coefficients[number], estimate.coefficients_sd[number], "dB")
+        return reported
 
 
-def _placed(records: Records) -> list[int]:
-    """Devices with enough links whose positions are declared: one that was located from these very measurements, at a
-    wrong place, may look as if it had an antenna."""
-    return [device for device in measured(records.device, LEAST_LINKS) if device in records.anchors]
+def _eligible_devices(links: LinkData) -> list[int]:
+    """Return devices with enough links and a declared position.
+
+    One that was located wrongly from these very measurements may look as if it had an antenna.
+    """
+    return [device for device in frequent_labels(links.device, MIN_LINKS)
+            if device in links.anchors]
 
 
 class _Rays(NamedTuple):
-    """How links leave their device.
+    """Directions in which links leave their device.
 
     Attributes:
-        power, azimuth_deg, elevation_deg: (n, sectors) what leaves in each sector, and where to.
-        free: (n,) power in free space; 0 where there is no map, and the straight line is all.
+        power: (n, sectors) power gain of what leaves into each sector.
+        azimuth_deg, elevation_deg: (n, sectors) its direction.
+        free: (n,) power gain in free space; 0 without a map, where the straight line is all.
     """
 
     power: np.ndarray
@@ -141,39 +164,60 @@ class _Rays(NamedTuple):
     free: np.ndarray
 
     @classmethod
-    def of(cls, records: Records) -> "_Rays":
-        if records.city is None:
-            return cls(np.ones((len(records), 1)), records.azimuth_deg[:, None], records.elevation_deg[:, None],
-                       free_space(records))
-        ray = rays_of(records, "departures")
+    def of(cls, links: LinkData) -> "_Rays":
+        """Return those of n links, which are followed over the map."""
+        if links.city is None:
+            return cls(np.ones((len(links), 1)), links.azimuth_deg[:, None],
+                       links.elevation_deg[:, None], free_space(links))
+        ray = rays_of(links, "departures")
         power = np.linalg.norm(ray, axis=2)
         sine = ray[..., 2] / np.maximum(power, 1e-30)
         return cls(power, np.degrees(np.arctan2(ray[..., 0], ray[..., 1])),
-                   np.degrees(np.arcsin(np.clip(sine, -1, 1))), free_space(records))
+                   np.degrees(np.arcsin(np.clip(sine, -1, 1))), free_space(links))
 
-    def offset_db(self, pattern: np.ndarray) -> np.ndarray:
-        """(n,) what a pattern (6,), as in `FIELDS`, takes from each link [dB]."""
-        gain = 10 ** (sector_pattern_db(self.azimuth_deg, self.elevation_deg, pattern[:5]) / 10)
-        mean = np.mean(10 ** (sector_pattern_db(AROUND_DEG, np.full(len(AROUND_DEG), pattern[3]), pattern[:5]) / 10))
-        return through_antenna_db(self.power, gain, self.free * 10 ** (pattern[5] / 10), float(mean))
+    def offset_db(self, pattern: SectorPattern) -> np.ndarray:
+        """Return (n,) what a pattern adds to each link [dB]."""
+        gain = 10 ** (sector_pattern_db(self.azimuth_deg, self.elevation_deg, pattern) / 10)
+        at_tilt = np.full(len(AROUND_DEG), pattern.tilt_deg)
+        mean_gain = np.mean(10 ** (sector_pattern_db(AROUND_DEG, at_tilt, pattern) / 10))
+        return through_antenna_db(self.power, gain, self.free * 10 ** (pattern.scattered_db / 10),
+                                  float(mean_gain))
 
 
-def _best_pattern(rays: _Rays, view: View, rows: np.ndarray) -> tuple[list[float], float]:
-    """The pattern of a grid that explains the links best, and how many nats it gains over a level alone."""
-    residual_db, weight = view.residual_db[rows], view.weight[rows] * np.isfinite(view.records.level_db[rows])
+def _best_patterns(view: ResidualView,
+                   devices: list[int]) -> dict[int, tuple[SectorPattern, float]]:
+    """Return device -> best pattern and its gain [nats], of those that gain enough."""
+    found = {}
+    for device in devices:
+        every = np.flatnonzero(view.links.device == device)
+        rows = subsample(every, MAX_PROPOSE_LINKS)
+        if not len(rows):
+            continue
+        pattern, nats = _best_pattern(_Rays.of(view.links.select(rows)), view, rows)
+        if nats * len(every) / len(rows) > MIN_NATS:
+            found[device] = pattern, nats * len(every) / len(rows)
+    return found
+
+
+def _best_pattern(rays: _Rays, view: ResidualView,
+                  rows: np.ndarray) -> tuple[SectorPattern, float]:
+    """Return the pattern of a grid that fits links best, and its gain over a level alone [nats]."""
+    residual_db = view.residual_db[rows]
+    weight = view.weight[rows] * np.isfinite(view.links.level_db[rows])
 
     def nats(offset_db: np.ndarray) -> float:
         level_db = weight @ (residual_db - offset_db) / max(weight.sum(), 1e-12)
-        return float(view.nats(rows, offset_db + level_db).sum())
+        return float(view.gain_nats(rows, offset_db + level_db).sum())
 
-    before = nats(np.zeros(len(rows)))
-    best: tuple[float, list[float]] = -np.inf, []
-    for azimuth in AZIMUTHS_DEG:
-        for beamwidth in BEAMWIDTHS_DEG:
-            for most_db in ATTENUATIONS_DB:
-                pattern = [azimuth, beamwidth, most_db, *NO_VERTICAL, SCATTERED_DB]
-                best = max(best, (nats(rays.offset_db(np.array(pattern))), pattern))
-    for vertical in VERTICALS:
-        pattern = [*best[1][:3], *vertical, SCATTERED_DB]
-        best = max(best, (nats(rays.offset_db(np.array(pattern))), pattern))
-    return [float(v) for v in best[1]], best[0] - before
+    def tried(azimuth: float, width: float, back_db: float, tilt: float = 0.0,
+              height: float = 360.0) -> tuple[float, SectorPattern]:
+        pattern = SectorPattern(azimuth_deg=azimuth, beamwidth_deg=width, front_to_back_db=back_db,
+                                tilt_deg=tilt, vertical_beamwidth_deg=height)
+        return nats(rays.offset_db(pattern)), pattern
+
+    # Of equal ones the last in the order of the numbers.
+    flat = max((tried(*numbers)[0], numbers)
+               for numbers in product(AZIMUTHS_DEG, BEAMWIDTHS_DEG, FRONT_TO_BACK_DB))[1]
+    vertical = max((tried(*flat, *numbers)[0], numbers) for numbers in VERTICALS_DEG)[1]
+    best, pattern = tried(*flat, *vertical)
+    return pattern, best - nats(np.zeros(len(rows)))

@@ -26,6 +26,35 @@ class LocalizeSettings:
 
 
 @dataclass(frozen=True)
+class TwinDevice:
+    """A device as a twin knows it.
+
+    Attributes:
+        device: its name.
+        x_m, y_m, z_m: declared position of an anchor, estimate of an unknown device [m]; NaN where
+            nothing is known of it.
+        role: `anchor` or `unknown`.
+        located: whether the position may be relied on; always so for anchors.
+        credible_radius_m: holds 90 % of the posterior [m]; 0 for anchors.
+        second_mode: (x_m, y_m, weight) of another position that explains the data, too.
+    """
+
+    device: str
+    x_m: float
+    y_m: float
+    z_m: float
+    role: str
+    located: bool
+    credible_radius_m: float
+    second_mode: tuple[float, float, float] | None
+
+    @classmethod
+    def anchor(cls, device: str, x_m: float, y_m: float, z_m: float) -> "TwinDevice":
+        """Return a device of declared position [m]."""
+        return cls(device, float(x_m), float(y_m), float(z_m), "anchor", True, 0.0, None)
+
+
+@dataclass(frozen=True)
 class DeviceEstimate:
     """Where a device is.
 
@@ -34,7 +63,7 @@ class DeviceEstimate:
     away with at least 5 % of the posterior, or None. n_detected of n_links measurements were detected.
     design_effect: how many links count as one (1 = independent). located: False where the data do not say where
     the device is: it was never detected, or 90 % of the posterior cover half the map or more. Position and radius
-    are then the best that the links which were *not* detected tell, or NaN and infinity without any.
+    are then the best that the links which were *not* detected on_progress, or NaN and infinity without any.
     """
 
     device: int

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from radiotwin.channel.links import Links
+from radiotwin.links.geometry import LinkGeometry
 
 MAX_LEVELS = 256
 NODES = 1024
@@ -21,7 +21,7 @@ PREDICT_CHUNK = 200_000
 class Channel(Protocol):
     """Any channel: a fitted `radiotwin.channel.ChannelModel`, or a fixed one."""
 
-    def predict(self, links: Links) -> tuple[np.ndarray, np.ndarray]:
+    def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Mean [dB] and standard deviation [dB] of n links, (n,) each."""
         ...
 
@@ -50,7 +50,7 @@ class LinkTable:
         level, los, rho = (a.ravel() for a in np.meshgrid(levels * step, [False, True], rho, indexing="ij"))
         ends = np.column_stack([rho, np.zeros_like(rho), level + z_m])
         device_m = np.broadcast_to([0.0, 0.0, z_m], ends.shape)
-        links = Links(device_m, ends, los, np.zeros(len(ends), np.int64))
+        links = LinkGeometry(device_m, ends, los, np.zeros(len(ends), np.int64))
         mean, sigma = predict_in_chunks(channel, links)
         self._mean, self._sigma = mean.astype(np.float32), sigma.astype(np.float32)
 
@@ -126,14 +126,14 @@ def tabulate(
     return table if exact else DirectChannel(channel, receiver_m, z_m, by_device)
 
 
-def link_grid(xy_m: np.ndarray, z_m: float, receiver_m: np.ndarray, los: np.ndarray, device: int) -> Links:
-    """Links from every one of p device positions (p, 2) to every one of c receivers (c, 3), p slowest."""
+def link_grid(xy_m: np.ndarray, z_m: float, receiver_m: np.ndarray, los: np.ndarray, device: int) -> LinkGeometry:
+    """LinkGeometry from every one of p device positions (p, 2) to every one of c receivers (c, 3), p slowest."""
     p, c = los.shape
     device_m = np.repeat(np.column_stack([xy_m, np.full(p, z_m)]), c, axis=0)
-    return Links(device_m, np.tile(receiver_m, (p, 1)), los.ravel(), np.full(p * c, device))
+    return LinkGeometry(device_m, np.tile(receiver_m, (p, 1)), los.ravel(), np.full(p * c, device))
 
 
-def predict_in_chunks(channel: Channel, links: Links) -> tuple[np.ndarray, np.ndarray]:
+def predict_in_chunks(channel: Channel, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
     """`channel.predict` with bounded memory; sigma at least MIN_SIGMA_DB, since the likelihood divides by it."""
     if not len(links):
         return np.zeros(0), np.zeros(0)

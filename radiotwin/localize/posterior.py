@@ -92,14 +92,14 @@ def refine(
     value: np.ndarray,
     width_m: float,
     peaks_m: np.ndarray,
-    temper: float,
+    likelihood_power: float,
 ) -> Posterior:
     """Splits the cells of a scan that matter until they are below FINEST_M, and weighs all.
 
     log_likelihood: of positions (p, 2), -inf where a device may not be; centre_m: (c, 2) centres of the scan's cells
     of width_m, point_m: (c, 2) and value: (c,) where in each the log-likelihood was evaluated and what it is there;
     peaks_m: (s, 2) positions whose cells are split whatever their value, because a peak may be narrower than a cell;
-    temper: power of the likelihood, at most 1.
+    likelihood_power: power of the likelihood, at most 1.
     """
     cell_m = centre_m
     done = []
@@ -126,5 +126,5 @@ def refine(
             value[allowed],
         )
     xy_m, cell_m, widths_m, value = (np.concatenate(each) for each in zip(*done, strict=True))
-    mass = widths_m**2 * np.exp(temper * (value - value.max()))
+    mass = widths_m**2 * np.exp(likelihood_power * (value - value.max()))
     return Posterior(xy_m, cell_m, widths_m, value, mass / mass.sum())

@@ -1,4 +1,4 @@
-"""The map as the place of the search: where devices may be, and how well each place explains the data."""
+"""The map as the place of the search: where devices may be, and how well each place is_cause the data."""
 
 from __future__ import annotations
 

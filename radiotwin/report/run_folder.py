@@ -121,8 +121,7 @@ def _read_maps(run: Run, truth: str | None) -> None:
         except BadInput as error:
             run.notes.append(f"{run.scene.folder / 'truth.nc'} is not shown: {error}.")
     if run.twin is not None and run.scene is not None:
-        corrected = run.twin.effects.get("parts") or "shadowing" in run.twin.effects
-        run.maps["twin, corrected" if corrected else "twin"] = run.twin.radio_map(run.scene)
+        run.maps["twin, corrected" if run.twin.is_corrected else "twin"] = run.twin.radio_map(run.scene)
     looked_at = run.scene and (run.scene.folder / "truth.nc").resolve()
     for path in sorted(run.folder.glob("*.nc")):
         if path.stem in run.maps or path.resolve() == looked_at:

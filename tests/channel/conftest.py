@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from radiotwin.channel.links import Links
+from radiotwin.links.geometry import LinkGeometry
 
 ANCHOR_M = np.array([[60.0, 320.0, 1.5], [320.0, 120.0, 1.5], [580.0, 520.0, 1.5]])
 LAW = {True: (-30.0, -2.5, 2.0**0.5), False: (-35.0, -3.04, 5.0**0.5)}
@@ -15,7 +15,7 @@ LAW = {True: (-30.0, -2.5, 2.0**0.5), False: (-35.0, -3.04, 5.0**0.5)}
 class World:
     """n links with the mean and the level [dB] that they truly have; NaN = not detected."""
 
-    links: Links
+    links: LinkGeometry
     mean_db: np.ndarray
     level_db: np.ndarray
 
@@ -53,7 +53,7 @@ def world():
         level_db = mean_db + sigma_db * rng.standard_normal(n)
         if limit_db is not None:
             level_db[level_db < limit_db] = np.nan
-        return World(Links(device_m[device], receiver_m, los, device), mean_db, level_db)
+        return World(LinkGeometry(device_m[device], receiver_m, los, device), mean_db, level_db)
 
     return make
 

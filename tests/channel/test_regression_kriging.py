@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from radiotwin.channel import residual_field
-from radiotwin.channel.links import Links
+from radiotwin.links.geometry import LinkGeometry
 from radiotwin.channel.regression_kriging import RegressionKriging
 
 
@@ -24,7 +24,7 @@ def test_interpolates_a_smooth_field(world):
 
 
 def test_nine_in_ten_fall_within_their_interval(world):
-    """Shadowing drawn from the exponential model, 6 dB and 80 m, on top of the law's own noise."""
+    """CorrelatedShadowing drawn from the exponential model, 6 dB and 80 m, on top of the law's own noise."""
     data = world(2, 2400)
     rng = np.random.default_rng(3)
     level_db = data.level_db.copy()
@@ -46,8 +46,8 @@ def test_far_away_and_for_an_unmeasured_device_it_is_the_law(world):
     train = world(4, 900)
     model = RegressionKriging().fit(train.links, train.level_db + shadowing(train.links), None, seed=0)
     near, n = train.links.select(slice(0, 50)), 50
-    far = Links(near.device_m, near.receiver_m + [1e5, 0.0, 0.0], near.los, near.device)
-    other = Links(near.device_m, near.receiver_m, near.los, np.full(n, 9))
+    far = LinkGeometry(near.device_m, near.receiver_m + [1e5, 0.0, 0.0], near.los, near.device)
+    other = LinkGeometry(near.device_m, near.receiver_m, near.los, np.full(n, 9))
     for links in (far, other):
         assert np.allclose(model.predict(links), model.law.predict(links), atol=1e-6)
     assert (model.predict(near)[1] < model.law.predict(near)[1]).all()
@@ -111,6 +111,6 @@ def test_repeated_visits_become_one_point(world):
 
 def test_one_position_only(world):
     data = world(12, 40)
-    still = Links(data.links.device_m, np.full((40, 3), 50.0), np.arange(40) % 2 == 0, data.links.device)
+    still = LinkGeometry(data.links.device_m, np.full((40, 3), 50.0), np.arange(40) % 2 == 0, data.links.device)
     model = RegressionKriging().fit(still, data.level_db, None, seed=0)
     assert np.isfinite(model.predict(data.links)).all()

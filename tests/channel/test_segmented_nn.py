@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from radiotwin.channel.ensemble import forward
-from radiotwin.channel.links import Links
+from radiotwin.links.geometry import LinkGeometry
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.channel.segmented_nn import SegmentedNN
 
@@ -21,7 +21,7 @@ def rmse(model, data, mask):
 def test_held_out_error_is_within_8_percent_of_the_noise(world, laws, seed):
     """Rationale: on the published law nothing is left to learn, so whatever lies above the noise is overfitting.
 
-    Expected behaviour: 900 links of 3 anchors (as many as five flights give), 20,000 held-out links to three other
+    Linearisation behaviour: 900 links of 3 anchors (as many as five flights give), 20,000 held-out links to three other
     devices, so that the figure itself is uncertain by 1 % only; in every seed, LoS and NLoS.
     """
     others_m = np.array([[20.0, 200, 1.5], [460.0, 200, 1.5], [320.0, 760, 1.5]])
@@ -89,7 +89,7 @@ def test_beyond_the_data_it_falls_as_the_law_does(fitted_nn, los):
     model, data = fitted_nn
     ground_m = np.geomspace(data.links.distance_m.max() + 1.0, 20_000.0, 300)
     receiver_m = np.column_stack([ground_m, np.zeros(300), np.full(300, 60.0)])
-    links = Links(np.zeros((300, 3)), receiver_m, np.full(300, los), np.zeros(300, int))
+    links = LinkGeometry(np.zeros((300, 3)), receiver_m, np.full(300, los), np.zeros(300, int))
     bend_db = model.predict(links)[0] - model.law.predict(links)[0]
     assert (np.diff(model.predict(links)[0]) < 0.0).all()
     assert np.ptp(bend_db) < 1.0
@@ -109,7 +109,7 @@ def test_class_without_data_keeps_the_borrowed_line(world):
 
 def test_one_receiver_position_gives_no_nonsense(world):
     data = world(60, 40)
-    still = Links(data.links.device_m, np.full((40, 3), 50.0), np.arange(40) % 2 == 0, data.links.device)
+    still = LinkGeometry(data.links.device_m, np.full((40, 3), 50.0), np.arange(40) % 2 == 0, data.links.device)
     model = SegmentedNN().fit(still, data.level_db, None, seed=0)
     mean_db, sigma_db = model.predict(data.links)
     assert np.isfinite(mean_db).all()

@@ -22,10 +22,10 @@ BOX = [130.0, 45.0, 24.0, 14.0, 70.0, 30.0]  # on a street of the small scene
 
 
 def loop_of(scene, *found):
-    """What `write_corrected_scene` looks at of a loop that found these: (effect, setting)."""
-    records = SimpleNamespace(device_names=[d.device for d in scene.config.devices], device_m=scene.device_m)
-    parts = [SimpleNamespace(effect=effect(), setting=setting) for effect, setting in found]
-    return SimpleNamespace(after=SimpleNamespace(whole=SimpleNamespace(parts=parts, records=records)))
+    """What `write_corrected_scene` looks at of a loop that found these: (effect, params)."""
+    links = SimpleNamespace(device_names=[d.device for d in scene.config.devices], device_m=scene.device_m)
+    parts = [SimpleNamespace(effect=effect(), params=params) for effect, params in found]
+    return SimpleNamespace(after=SimpleNamespace(whole=SimpleNamespace(parts=parts, links=links)))
 
 
 def ends(x_m, y_m, turn_deg, reach_m, z_m):
@@ -148,7 +148,7 @@ def test_folders_that_cannot_be_written_are_refused_before_the_work(small_scene,
 def test_sionna_rt_traces_it(small_scene, tmp_path):
     """Rationale: the map that Sionna RT loads is `city.xml`, not ours.
 
-    Expected: a link loses more than 6 dB where the box is put in its way, and gains more than 6 dB where the building
+    Linearisation: a link dropout_probability more than 6 dB where the box is put in its way, and gains more than 6 dB where the building
     that blocked it is taken out.
     """
     building, x_m, y_m, height_m = tallest(small_scene)

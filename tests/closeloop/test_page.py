@@ -11,7 +11,7 @@ from radiotwin.closeloop.map_figures import Ground, draw_residual_map
 from radiotwin.closeloop.page import lead, write_page
 from radiotwin.closeloop.report import make_report
 from radiotwin.closeloop.run import Loop, close_loop
-from radiotwin.closeloop.search import Model, Search
+from radiotwin.closeloop.selection import Model, Search
 from radiotwin.closeloop.words import listed, parameter, variable
 from radiotwin.effects.body_shadowing import BodyShadowing
 from radiotwin.effects.clock_offset import ReceiverClockOffset
@@ -24,7 +24,7 @@ from radiotwin.effects.interference import Interference
 from radiotwin.effects.lock_loss import LockLoss
 from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.noise_floor import NoiseFloor
-from radiotwin.effects.paths import WallReflection
+from radiotwin.effects.path_strength import WallReflection
 from radiotwin.effects.position_errors import DevicePositionError, ReceiverPositionError
 from radiotwin.effects.receiver_saturation import ReceiverSaturation
 from radiotwin.effects.removed_obstacle import RemovedObstacle
@@ -34,7 +34,7 @@ from radiotwin.measurements import Measurements
 
 SCORES = {"n": 900, "bias_db": 0.04, "std_db": 3.0, "correlation": 0.9, "rmse_db": 3.0, "mae_db": 2.2, "nll": 2.5}
 NOTHING = {"n": 0} | dict.fromkeys(["bias_db", "std_db", "correlation", "rmse_db", "mae_db", "nll"])
-DRIFT = {"name": "receiver_drift", "variant": "", "rank": 1, "setting": {}, "confused_with": ["interference"],
+DRIFT = {"name": "receiver_drift", "variant": "", "rank": 1, "params": {}, "confused_with": ["interference"],
          "indistinguishable_from": ["receiver_gain_offset"],
          "parameters": {"step_db[r<0>]": {"value": -6.0, "low": -6.5, "high": -5.5, "unit": "dB"},
                         "step_time_s[r<0>]": {"value": 500.0, "low": None, "high": None, "unit": "s"}},
@@ -61,11 +61,11 @@ def report(verdict="effect", **changes):
                       "regression_kriging": {"rmse_db": 5.5, "median_db": 1}},
         "structure_before": drivers,
         "remaining": {"structured": verdict == "unexplained", "drivers": drivers if verdict == "unexplained" else []},
-        "remarks": ["receiver <i> has 3 only"]} | changes
+        "notes": ["receiver <i> has 3 only"]} | changes
 
 
 def page(content, folder):
-    write_page(content, folder, "What the model of <x> lacks")
+    write_page(content, folder, "What the model of <x> unavailable")
     return (folder / "closeloop.html").read_text(encoding="utf-8")
 
 
@@ -74,7 +74,7 @@ def page(content, folder):
      "found: receiver drift"),
     ("none", "Nothing is missing: what the model leaves over (3.00 dB)", "nothing is missing"),
     ("unexplained",
-     "none of the effects in the catalogue explains it: the error (3.00 dB) depends on time in the flight",
+     "none of the effects in the catalogue is_cause it: the error (3.00 dB) depends on time in the flight",
      "unexplained")])
 def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
     text = page(report(verdict), tmp_path)
@@ -116,7 +116,7 @@ def test_numbers_that_are_not_known_are_dashes(tmp_path):
 def test_a_last_resort_is_not_called_an_explanation(tmp_path):
     shadowing = DRIFT | {"name": "correlated_shadowing", "rank": 2}
     filled = report("unexplained", effects=[shadowing])
-    assert "which explains nothing, brings it to 3.00 dB" in lead(filled)
+    assert "which is_cause nothing, brings it to 3.00 dB" in lead(filled)
     filled = report("effect", effects=[DRIFT, shadowing])
     filled["error"]["after"] |= {"rmse_db": 1.5}
     assert "lacked receiver drift. With it the error on held-out links falls from 3.00 to 2.00 dB" in lead(filled)
@@ -159,12 +159,12 @@ def loop():
 
 def with_model(loop, model):
     """A loop that found something else."""
-    return Loop(loop.base, loop.records, loop.folds, loop.before, Search(model), loop.drivers_before, [])
+    return Loop(loop.base, loop.links, loop.folds, loop.before, Search(model), loop.dependences_before, [])
 
 
-def with_effect(model, effect, setting):
+def with_effect(model, effect, params):
     """A model with an effect that nobody asked for."""
-    whole = model.whole.with_parts([model.whole.part(effect(), setting)])
+    whole = model.whole.with_parts([model.whole.part(effect(), params)])
     return Model(whole, model.folds, [whole.fit(), *model.fits[1:]], model.index)
 
 
@@ -182,7 +182,7 @@ def test_every_picture_is_written_without_a_map(loop, tmp_path):
 
 def test_pictures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_path):
     nothing = with_model(loop, loop.before)
-    nothing.drivers_before = []
+    nothing.dependences_before = []
     content = make_report(nothing)
     assert content["verdict"] == "none" and not content["effects"]
     draw_figures(nothing, None, content, tmp_path)
@@ -190,7 +190,7 @@ def test_pictures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_
     assert text.count("data:image/png;base64,") == 4 and "No structure" in text
 
 
-@pytest.mark.parametrize("effect, setting", [
+@pytest.mark.parametrize("effect, params", [
     (DeviceGainOffset, {"members": [0, 1, 2], "spread_db": 4.0}), (ExcessAttenuation, {"scale_height_m": 100.0}),
     (BodyShadowing, {"members": [0, 1]}),
     (ReceiverDrift, {"receivers": {"0": ["warm_up_each_flight", 8.0], "1": ["step", 150.0]}}),
@@ -207,9 +207,9 @@ def test_pictures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_
     (DetectionLimit, {"receivers": {"0": -95.0}}),
     (LockLoss, {"receivers": {"0": 0.1, "1": 0.02}}),
     (Foliage, {"box": [250.0, 120.0, 30.0, 20.0, 20.0, 20.0], "law": [0.6, 15.0]})])
-def test_an_effect_is_drawn_in_its_own_terms(loop, tmp_path, effect, setting):
-    changed = with_model(loop, with_effect(loop.before, effect, setting))
-    draw_effects(changed, Ground(loop.records, None), tmp_path)
+def test_an_effect_is_drawn_in_its_own_terms(loop, tmp_path, effect, params):
+    changed = with_model(loop, with_effect(loop.before, effect, params))
+    draw_effects(changed, Ground(loop.links, None), tmp_path)
     assert (tmp_path / f"effect_1_{effect.name}.png").stat().st_size > 5000
 
 
@@ -222,10 +222,10 @@ def test_effects_of_the_map_are_drawn_on_it(small_scene, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("radiotwin.closeloop.run.CATALOGUE", ())
         loop = close_loop(data, small_scene, "log-distance", 0, lambda text: None)
-    ground = Ground(loop.records, small_scene)
-    for effect, setting in ((RemovedObstacle, {"building": 0, "centre_m": [0.0, 0.0, 9.0]}),
+    ground = Ground(loop.links, small_scene)
+    for effect, params in ((RemovedObstacle, {"building": 0, "centre_m": [0.0, 0.0, 9.0]}),
                             (WallReflection, {"strength_db": 0.0, "level_db": 0.0})):
-        changed = with_model(loop, with_effect(loop.before, effect, setting))
+        changed = with_model(loop, with_effect(loop.before, effect, params))
         draw_residual_map(changed, ground, tmp_path / "residual_map.png")
         draw_effects(changed, ground, tmp_path)
         assert (tmp_path / f"effect_1_{effect.name}.png").stat().st_size > 5000

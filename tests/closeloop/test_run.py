@@ -5,7 +5,7 @@ import pytest
 
 from radiotwin.closeloop.report import make_report
 from radiotwin.closeloop.run import close_loop
-from radiotwin.closeloop.significance import gain_p, sign_flip_p
+from radiotwin.inference.evidence import gain_p, sign_flip_p
 from radiotwin.errors import BadInput
 
 
@@ -182,7 +182,7 @@ def test_devices_can_be_held_out(open_ground):
     loop = close_loop(open_ground.measured(world), None, "log-distance", 0, lambda text: None, "device")
     for fold in range(loop.folds.count):  # whole devices
         mine = loop.folds.index == fold
-        assert not set(loop.records.device[mine]) & set(loop.records.device[~mine])
+        assert not set(loop.links.device[mine]) & set(loop.links.device[~mine])
     report = make_report(loop)
     assert named(report)[0] == "receiver_gain_offset" and report["heldout"]["by"] == "device"
     with pytest.raises(BadInput, match="allowed are auto, flight, block, device"):

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.corrected import corrected_twin
+from radiotwin.twin.corrected import corrected_twin
 from radiotwin.closeloop.report import make_report
 from radiotwin.closeloop.run import close_loop
 from radiotwin.measurements import Measurements

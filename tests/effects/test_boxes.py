@@ -77,8 +77,8 @@ def test_long_links_are_projected_few_at_a_time_to_the_same_sums(monkeypatch):
     turn = rng.uniform(0, 2 * np.pi, 1000)
     b_m = a_m + np.column_stack([500 * np.cos(turn), 500 * np.sin(turn), np.full(1000, 60.0)])
     gain, found = rng.normal(size=1000), []
-    for most in (boxes.MOST_POINTS, 5000):
-        monkeypatch.setattr(boxes, "MOST_POINTS", most)
+    for most in (boxes.MAX_POINTS, 5000):
+        monkeypatch.setattr(boxes, "MAX_POINTS", most)
         tracemalloc.start()
         total = back_project(a_m, b_m, gain)[1]
         found.append((total, tracemalloc.get_traced_memory()[1]))

@@ -9,59 +9,59 @@ DEVICES_M = np.array([[0.0, 0, 1.5], [150, 40, 1.5], [-80, 160, 1.5]])
 SLOTS, FLIGHTS, SPEED_M_S = 60, 2, 8.0
 
 
-def law_db(records, exact=False):
-    return -40 - 22 * np.log10(records.distance_m)
+def law_db(links, exact=False):
+    return -40 - 22 * np.log10(links.distance_m)
 
 
-def place_m(time_s, receiver, flight):
+def position_m(time_s, receiver, flight):
     """Where a receiver is: on a circle, each with its own phase, 8 m/s."""
     angle = SPEED_M_S / 120 * time_s + 2.0 * receiver + 0.7 * flight
     return np.column_stack([120 * np.sin(angle), 120 * np.cos(angle), np.full(len(angle), 40.0)])
 
 
 @pytest.fixture
-def records(links):
+def links(make_links):
     """Of two receivers on two flights."""
     time_s, flight, receiver = (each.ravel() for each in np.meshgrid(
         np.arange(SLOTS, dtype=float), np.arange(FLIGHTS), np.arange(2), indexing="ij"))
     receiver, flight, time_s = (np.repeat(each, len(DEVICES_M)) for each in (receiver, flight, time_s))
     every = slice(None, None, len(DEVICES_M))
-    return links(DEVICES_M, place_m(time_s, receiver, flight)[every], receiver=receiver, flight=flight,
+    return make_links(DEVICES_M, position_m(time_s, receiver, flight)[every], receiver=receiver, flight=flight,
                  time_s=1000.0 * flight + time_s)
 
 
-def late_db(records, offset_s):
+def late_db(links, offset_s):
     """What is measured if receiver 1 is where its track has it so much later."""
-    there_m = place_m(records.time_s - 1000.0 * records.flight + offset_s * (records.receiver == 1), records.receiver,
-                      records.flight)
-    return -40 - 22 * np.log10(np.linalg.norm(there_m - DEVICES_M[records.device], axis=1))
+    there_m = position_m(links.time_s - 1000.0 * links.flight + offset_s * (links.receiver == 1), links.receiver,
+                      links.flight)
+    return -40 - 22 * np.log10(np.linalg.norm(there_m - DEVICES_M[links.device], axis=1))
 
 
-def test_the_level_is_that_of_where_the_receiver_is_at_the_other_time(records):
-    term = ReceiverClockOffset().term(records, {"receiver": 1, "offset_s": 2.5}, law_db)
-    assert np.abs(term.offset_db[records.receiver == 0]).max() == 0
-    inside = records.time_s % 1000 < SLOTS - 3  # behind the end of its track nobody knows where it was
-    np.testing.assert_allclose(term.offset_db[inside], (late_db(records, 2.5) - law_db(records))[inside], atol=0.05)
+def test_the_level_is_that_of_where_the_receiver_is_at_the_other_time(links):
+    term = ReceiverClockOffset().term(links, ReceiverClockOffset.Params(receiver=1, offset_s=2.5, speed_m_s=SPEED_M_S), law_db)
+    assert np.abs(term.offset_db[links.receiver == 0]).max() == 0
+    inside = links.time_s % 1000 < SLOTS - 3  # behind the end of its track nobody knows where it was
+    np.testing.assert_allclose(term.offset_db[inside], (late_db(links, 2.5) - law_db(links))[inside], atol=0.05)
     assert np.abs(term.offset_db[inside]).max() > 1
-    part = records.select(np.arange(0, len(records), 7))  # gaps in what is asked for are none in the tracks
-    some = ReceiverClockOffset().term(part, {"receiver": 1, "offset_s": 2.5}, law_db)
+    part = links.select(np.arange(0, len(links), 7))  # gaps in what is asked for are none in the tracks
+    some = ReceiverClockOffset().term(part, ReceiverClockOffset.Params(receiver=1, offset_s=2.5, speed_m_s=SPEED_M_S), law_db)
     np.testing.assert_allclose(some.offset_db, term.offset_db[::7], atol=1e-9)
 
 
 @pytest.mark.parametrize("offset_s", [-5.0, 3.0])
-def test_the_receiver_and_the_sign_are_proposed(records, view, offset_s):
-    records.level_db[:] = late_db(records, offset_s) + np.random.default_rng(0).normal(0, 0.5, len(records))
-    (setting,) = ReceiverClockOffset().propose(view(records, law_db(records), 0.5, law_db))
-    assert setting["receiver"] == 1 and setting["offset_s"] == pytest.approx(offset_s, abs=1.2)
-    assert setting["speed_m_s"] == pytest.approx(SPEED_M_S, rel=0.01)
+def test_the_receiver_and_the_sign_are_proposed(links, view, offset_s):
+    links.level_db[:] = late_db(links, offset_s) + np.random.default_rng(0).normal(0, 0.5, len(links))
+    (params,) = ReceiverClockOffset().propose(view(links, law_db(links), 0.5, law_db))
+    assert params.receiver == 1 and params.offset_s == pytest.approx(offset_s, abs=1.2)
+    assert params.speed_m_s == pytest.approx(SPEED_M_S, rel=0.01)
 
 
-def test_where_clocks_agree_nothing_is_proposed(records, view):
-    records.level_db[:] = law_db(records) + np.random.default_rng(1).normal(0, 0.5, len(records))
-    assert ReceiverClockOffset().propose(view(records, law_db(records), 0.5, law_db)) == []
+def test_where_clocks_agree_nothing_is_proposed(links, view):
+    links.level_db[:] = law_db(links) + np.random.default_rng(1).normal(0, 0.5, len(links))
+    assert ReceiverClockOffset().propose(view(links, law_db(links), 0.5, law_db)) == []
 
 
-def test_without_times_or_without_a_way_it_is_not_looked_for(links):
-    assert "time_s" in ReceiverClockOffset().lacks(links(DEVICES_M, np.ones((80, 3))))
-    still = links(DEVICES_M, np.ones((80, 3)), time_s=np.repeat(np.arange(80.0), 3))
-    assert "moves" in ReceiverClockOffset().lacks(still)
+def test_without_times_or_without_a_way_it_is_not_looked_for(make_links):
+    assert "time_s" in ReceiverClockOffset().unavailable(make_links(DEVICES_M, np.ones((80, 3))))
+    still = make_links(DEVICES_M, np.ones((80, 3)), time_s=np.repeat(np.arange(80.0), 3))
+    assert "moves" in ReceiverClockOffset().unavailable(still)

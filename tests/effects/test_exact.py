@@ -1,4 +1,4 @@
-"""What a kept effect does exactly: the base is asked about another map, or another place, for the links near it."""
+"""Exact terms of kept effects: the channel predicts over another map, or for another position, the links near it."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import trimesh
 
 from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.position_errors import DevicePositionError
-from radiotwin.effects.removed_obstacle import RemovedObstacle
+from radiotwin.effects.removed_obstacle import RemovedObstacle, only_blocker
 from radiotwin.scene.citymap import CityMap
 
 FAR_M, NEAR_M = [-300.0, 300, 60], [60.0, 0, 10]
@@ -20,45 +20,46 @@ def boxes(*middles_m):
     return CityMap(mesh.vertices, mesh.faces)
 
 
-class Asked:
-    """A base whose level says how many metres of each link lie within buildings; and which links it was asked for."""
+class CountingChannel:
+    """A channel that loses 1 dB a metre within buildings, and counts the links that it predicts."""
 
     def __init__(self):
         self.links = 0
 
-    def __call__(self, records, exact=False):
+    def __call__(self, links, exact=False):
         assert exact
-        self.links += len(records)
-        return -records.metres_inside - 0.1 * records.distance_m
+        self.links += len(links)
+        return -links.metres_inside - 0.1 * links.distance_m
 
 
 @pytest.fixture
-def records(links):
-    """One link through the building at the origin, and one that passes 200 m from it, over another."""
-    return links([[-60.0, 0, 10]], [NEAR_M, FAR_M], city=boxes((0, 0), (-200, 200)))
+def links(make_links):
+    """One link through the building at the origin, and one 200 m from it over another building."""
+    return make_links([[-60.0, 0, 10]], [NEAR_M, FAR_M], city=boxes((0, 0), (-200, 200)))
 
 
-def test_a_building_that_is_gone_leaves_the_links_near_it_the_level_without_it(records):
-    base, effect = Asked(), RemovedObstacle()
-    building = int(effect._only_blocker(records)[0])
-    setting = effect.exact({"building": building, "centre_m": [0.0, 0.0, 40.0]})
-    np.testing.assert_allclose(effect.term(records, setting, base).offset_db, [20.0, 0.0], atol=0.01)
-    assert base.links == 2  # one link, before and after
+def test_links_near_a_removed_building_have_the_level_without_it(links):
+    channel, effect = CountingChannel(), RemovedObstacle()
+    building = int(only_blocker(links)[0])
+    params = effect.exact(effect.Params(building=building, centre_m=(0.0, 0.0, 40.0)))
+    np.testing.assert_allclose(effect.term(links, params, channel).offset_db, [20.0, 0.0], atol=0.01)
+    assert channel.links == 2  # one link, before and after
 
 
-def test_a_building_that_no_map_shows_stands_in_the_map_that_the_base_is_asked_about(records):
-    base, effect = Asked(), MissingObstacle()
-    setting = effect.exact({"box": [30.0, 0.0, 10.0, 30.0, 25.0, 90.0], "scattered_db": 0.0})
-    np.testing.assert_allclose(effect.term(records, setting, base).offset_db, [-30.0, 0.0], atol=0.01)
-    assert base.links == 2
-    assert "exact" not in effect.vary(setting).setting(effect.vary(setting).values)  # refined and varied quickly
+def test_a_missing_building_is_in_the_map_that_the_channel_predicts_over(links):
+    channel, effect = CountingChannel(), MissingObstacle()
+    params = effect.exact(effect.Params(box=(30.0, 0.0, 10.0, 30.0, 25.0, 90.0)))
+    np.testing.assert_allclose(effect.term(links, params, channel).offset_db, [-30.0, 0.0], atol=0.01)
+    assert channel.links == 2
+    variation = effect.variation(params)
+    assert not variation.params(variation.values).exact  # it is refined quickly
 
 
-def test_a_moved_anchor_has_the_level_of_its_true_place(records):
-    base, effect = Asked(), DevicePositionError()
-    setting = effect.exact({"device": 0, "move_m": [0.0, 80.0]})
+def test_a_moved_anchor_has_the_level_of_its_true_position(links):
+    channel, effect = CountingChannel(), DevicePositionError()
+    params = effect.exact(effect.Params(device=0, move_m=(0.0, 80.0)))
     before_m = np.linalg.norm(np.array([NEAR_M, FAR_M]) - [-60, 0, 10], axis=1)
     after_m = np.linalg.norm(np.array([NEAR_M, FAR_M]) - [-60, 80, 10], axis=1)
-    offset_db = effect.term(records, setting, base).offset_db
+    offset_db = effect.term(links, params, channel).offset_db
     assert offset_db[0] == pytest.approx(20 - 0.1 * (after_m[0] - before_m[0]), abs=0.01)
     assert abs(offset_db[1]) > 1

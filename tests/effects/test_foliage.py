@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from radiotwin.effects.foliage import Foliage
+from radiotwin.effects.foliage import Foliage, VegetationLoss
 
 
 @pytest.fixture
-def lost_db(links):
+def lost_db(make_links):
     """Loss of level links at 5 m through a grove that is `depth_m` long, 20 m wide and 12 m high."""
     def make(depth_m, law, device_m=(-200.0, 0, 5), receiver_m=(200.0, 0, 5)):
-        setting = {"box": [0.0, 0.0, depth_m, 20.0, 12.0, 0.0], "law": law}
-        return -Foliage().term(links([device_m], [receiver_m]), setting, None).offset_db[0]
+        params = Foliage.Params(box=(0.0, 0.0, depth_m, 20.0, 12.0, 0.0), law=VegetationLoss(*law))
+        return -Foliage().term(make_links([device_m], [receiver_m]), params, None).offset_db[0]
     return make
 
 

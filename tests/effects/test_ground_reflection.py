@@ -3,9 +3,13 @@
 import numpy as np
 import pytest
 
-from radiotwin.channel.censored_line import LogDistanceLine
 from radiotwin.channel.log_distance import LogDistance
+from radiotwin.effects.effect_model import EffectModel
+from radiotwin.effects.fold_model import FittedEffect
 from radiotwin.effects.ground_reflection import GroundReflection, two_ray_db
+from radiotwin.effects.interference import Interference
+from radiotwin.effects.lock_loss import LockLoss
+from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.twin import Twin, TwinDevice
 
 FREQUENCY_HZ = 2.4e9
@@ -63,15 +67,15 @@ def test_a_ground_that_lies_lower_is_a_device_that_stands_higher():
                                two_ray_db(device_m + up_m, receiver_m + up_m, FREQUENCY_HZ, 0.7, 0.01, 0.0))
 
 
-def test_links_without_line_of_sight_do_not_get_it(links):
-    records = links([[0.0, 0, 1.5]], ends(2)[1])
-    los = np.arange(len(records)) % 3 > 0
-    setting = {"strength": 1.0, "roughness_m": 0.0, "ground_m": 0.0, "wavelength_m": 0.125}
-    term = GroundReflection().term(records.with_los(los), setting, None)
+def test_links_without_line_of_sight_do_not_get_it(make_links):
+    links = make_links([[0.0, 0, 1.5]], ends(2)[1])
+    los = np.arange(len(links)) % 3 > 0
+    params = GroundReflection.Params(strength=1.0, roughness_m=0.0, ground_m=0.0, wavelength_m=0.125)
+    term = GroundReflection().term(links.with_los(los), params, None)
     assert np.abs(term.offset_db[~los]).max() == 0 and np.abs(term.offset_db[los]).max() > 1
 
 
-def test_a_bounce_that_a_building_hides_is_none(links, small_scene):
+def test_a_bounce_that_a_building_hides_is_none(make_links, small_scene):
     """Devices on a roof see receivers above, but not the street below."""
     city = small_scene.city
     top = city.vertices[city.vertices[:, 2].argmax()]
@@ -79,26 +83,27 @@ def test_a_bounce_that_a_building_hides_is_none(links, small_scene):
     roof_m = np.column_stack([x.ravel(), y.ravel(), city.height_at(x, y).ravel() + 1.5])
     roof_m = roof_m[roof_m[:, 2] > top[2] - 0.5]
     receiver_m = np.array([roof_m[:, 0].mean() + 40, roof_m[:, 1].mean(), top[2] + 120])
-    records = links(roof_m[len(roof_m) // 2], [receiver_m], city=city)
-    assert records.los.all()
-    setting = {"strength": 1.0, "roughness_m": 0.0, "ground_m": 0.0, "wavelength_m": 0.125}
-    np.testing.assert_array_equal(GroundReflection().term(records, setting, None).offset_db, 0)
+    links = make_links(roof_m[len(roof_m) // 2], [receiver_m], city=city)
+    assert links.los.all()
+    params = GroundReflection.Params(strength=1.0, roughness_m=0.0, ground_m=0.0, wavelength_m=0.125)
+    np.testing.assert_array_equal(GroundReflection().term(links, params, None).offset_db, 0)
 
 
 def test_a_map_has_it_and_does_not_have_what_belongs_to_receivers(small_scene):
-    setting = {"strength": 0.8, "roughness_m": 0.0, "ground_m": 0.0, "wavelength_m": 0.125}
-    given = [("ground_reflection", setting), ("lock_loss", {"receivers": {"0": 0.2}}),
-             ("interference", {"place_m": [50.0, 50.0], "level_db": -60.0, "within_m": [0, 0, 100, 100]})]
-    devices = [TwinDevice(device.device, *place_m, "anchor", True, 0.0, None)
-               for device, place_m in zip(small_scene.config.devices, small_scene.device_m)]
+    ground, emitter = GroundReflection(), Interference()
+    found = [(ground, ground.Params(strength=0.8, roughness_m=0.0, ground_m=0.0, wavelength_m=0.125)),
+             (LockLoss(), LockLoss.Params(receivers={0: 0.2})),
+             (emitter, emitter.Params(place_m=(50.0, 50.0), level_db=-60.0, within_m=(0, 0, 100, 100)))]
+    devices = [TwinDevice(device.device, *position_m, "anchor", True, 0.0, None)
+               for device, position_m in zip(small_scene.config.devices, small_scene.device_m)]
 
-    def mapped(parts):
-        effects = {"base": "log-distance", "coefficients": [0.0, 0.0], "dof": 5.0, "scale_db": [2.0], "parts": [
-            {"name": name, "variant": "", "setting": setting, "coefficients": []} for name, setting in parts]}
-        return Twin(LogDistance(LogDistanceLine(-40.0, 2.2, 3.0)), devices, "gain_db", None, {}, effects).radio_map(
-            small_scene)
+    def mapped(effects):
+        channel = LogDistance(LogDistanceLine(-40.0, 2.2, 3.0))
+        fitted = EffectModel(channel, tuple(FittedEffect(effect, params, np.zeros(0)) for effect, params in effects),
+                             np.zeros(2), np.array([2.0]), 5.0, small_scene.device_m, ("g0",), np.nan, 0.0)
+        return Twin(channel, devices, "gain_db", None, {}, fitted).radio_map(small_scene)
 
-    plain, corrected = mapped([]), mapped(given)
+    plain, corrected = mapped([]), mapped(found)
     added_db = (corrected.gain_db - plain.gain_db).reshape(len(devices), -1)
     receiver_m = small_scene.lattice.positions_m
     for device_m, change_db, los in zip(small_scene.device_m, added_db, plain.los.reshape(len(devices), -1)):
@@ -110,10 +115,10 @@ def test_a_map_has_it_and_does_not_have_what_belongs_to_receivers(small_scene):
     assert (added_db != 0).mean() > 0.1 and np.abs(added_db).max() > 1
 
 
-def test_without_a_frequency_it_is_not_looked_for(links):
-    records = links([[0.0, 0, 1.5]], ends(3)[1], frequency_hz=np.nan)
-    assert "frequency_hz" in GroundReflection().lacks(records)
-    assert GroundReflection().lacks(links([[0.0, 0, 1.5]], ends(3)[1])) is None
+def test_without_a_frequency_it_is_not_looked_for(make_links):
+    links = make_links([[0.0, 0, 1.5]], ends(3)[1], frequency_hz=np.nan)
+    assert "frequency_hz" in GroundReflection().unavailable(links)
+    assert GroundReflection().unavailable(make_links([[0.0, 0, 1.5]], ends(3)[1])) is None
 
 
 def test_a_world_of_two_rays_is_named(open_ground, loop):

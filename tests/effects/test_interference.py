@@ -1,4 +1,4 @@
-"""An emitter that nobody declared, against powers that are added by hand, and in worlds that have one or none."""
+"""An undeclared emitter: powers added by hand, and worlds with one or none."""
 
 import numpy as np
 import pytest
@@ -10,37 +10,37 @@ def watts(level_db):
     return 10 ** (np.asarray(level_db) / 10)
 
 
-def heard(receiver_m, place_m, level_db):
+def heard(receiver_m, emitter_m, level_db):
     """Power of an emitter, one receiver at a time: `level_db` at 100 m, less by the square of the distance."""
-    return np.array([watts(level_db) * 100.0**2 / np.sum((receiver - place_m) ** 2) for receiver in receiver_m])
+    return np.array([watts(level_db) * 100.0**2 / np.sum((receiver - emitter_m) ** 2) for receiver in receiver_m])
 
 
-def test_powers_add_and_the_slope_is_known(links):
+def test_powers_add_and_the_slope_is_known(make_links):
     rng = np.random.default_rng(0)
-    records = links([[0.0, 0, 1.5], [90, 40, 1.5]], np.column_stack([rng.uniform(0, 300, (50, 2)), np.full(50, 60.0)]))
-    setting = {"place_m": [120.0, 80.0], "level_db": -90.0, "within_m": [0, 0, 300, 300]}
-    level_db = rng.uniform(-120, -60, len(records))
-    extra = Interference().term(records, setting, None).extra
-    read_db, slope = Interference().bend(level_db, setting, extra)
-    power = heard(records.receiver_m, np.array([120.0, 80.0, 1.5]), -90.0)
+    links = make_links([[0.0, 0, 1.5], [90, 40, 1.5]], np.column_stack([rng.uniform(0, 300, (50, 2)), np.full(50, 60.0)]))
+    params = Interference.Params(place_m=(120.0, 80.0), level_db=-90.0, within_m=(0, 0, 300, 300))
+    level_db = rng.uniform(-120, -60, len(links))
+    inputs = Interference().term(links, params, None).inputs
+    read_db, slope = Interference().response(level_db, params, inputs)
+    power = heard(links.receiver_m, np.array([120.0, 80.0, 1.5]), -90.0)
     np.testing.assert_allclose(watts(read_db), watts(level_db) + power, rtol=1e-9)
-    more_db, less_db = (Interference().bend(level_db + step, setting, extra)[0] for step in (1e-4, -1e-4))
+    more_db, less_db = (Interference().response(level_db + step, params, inputs)[0] for step in (1e-4, -1e-4))
     np.testing.assert_allclose(slope, (more_db - less_db) / 2e-4, atol=1e-6)
 
 
-def test_receivers_that_stand_still_cannot_tell(links):
-    places_m = np.column_stack([np.arange(12) * 30.0, np.zeros(12), np.full(12, 20.0)])
-    assert "12 places" in Interference().lacks(links([[0.0, 0, 1.5]], np.repeat(places_m, 40, axis=0)))
-    assert Interference().lacks(links([[0.0, 0, 1.5]], np.vstack([places_m, places_m + (0, 50, 0)]))) is None
+def test_receivers_that_stay_at_few_positions_cannot_locate_an_emitter(make_links):
+    positions_m = np.column_stack([np.arange(12) * 30.0, np.zeros(12), np.full(12, 20.0)])
+    assert "12 positions" in Interference().unavailable(make_links([[0.0, 0, 1.5]], np.repeat(positions_m, 40, axis=0)))
+    assert Interference().unavailable(make_links([[0.0, 0, 1.5]], np.vstack([positions_m, positions_m + (0, 50, 0)]))) is None
 
 
-def test_an_emitter_at_the_edge_of_what_is_searched_has_no_place():
-    setting = {"place_m": [300.0, 80.0], "level_db": -90.0, "within_m": [0.0, 0.0, 300.0, 300.0]}
-    assert "edge" in Interference().unphysical(setting, np.zeros(0))
-    assert Interference().unphysical(setting | {"place_m": [250.0, 80.0]}, np.zeros(0)) is None
+def test_an_emitter_at_the_edge_of_the_searched_area_is_implausible():
+    params = Interference.Params(place_m=(300.0, 80.0), level_db=-90.0, within_m=(0, 0, 300, 300))
+    assert "edge" in Interference().implausible(params, np.zeros(0))
+    assert Interference().implausible(params.model_copy(update={"place_m": (250.0, 80.0)}), np.zeros(0)) is None
 
 
-def test_an_emitter_is_found_where_it_stands(open_ground, loop):
+def test_an_emitter_is_found_at_its_position(open_ground, loop):
     world = open_ground.fly(21)
     power = heard(world.receiver_m, np.array([330.0, 140.0, 3.0]), -99.0)
     world.gain_db = 10 * np.log10(watts(world.gain_db) + power)

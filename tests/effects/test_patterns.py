@@ -5,39 +5,60 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from pydantic import ValidationError
 
 from radiotwin.effects.noise_floor import NoiseFloor, floored
 from radiotwin.effects.receiver_saturation import ReceiverSaturation, _compress
-from radiotwin.effects.sector_antenna import NO_VERTICAL, SectorAntenna, sector_pattern_db
-from radiotwin.effects.tilted_dipole import dipole_gain
+from radiotwin.effects.sector_antenna import SectorAntenna, SectorPattern, sector_pattern_db
+from radiotwin.effects.tilted_dipole import TiltedDipole, dipole_gain
 from radiotwin.scene.citymap import CityMap
 
 
 def test_the_sector_loses_3_db_at_half_its_beamwidth_and_no_more_than_its_front_to_back_ratio():
-    pattern = np.array([40.0, 65.0, 25.0, *NO_VERTICAL])
+    pattern = SectorPattern(azimuth_deg=40.0, beamwidth_deg=65.0, front_to_back_db=25.0)
     azimuth_deg = np.array([40.0, 72.5, 7.5, 220.0, 400.0])
     np.testing.assert_allclose(sector_pattern_db(azimuth_deg, np.zeros(5), pattern), [0, -3, -3, -25, 0], atol=1e-9)
 
 
 def test_the_sector_looks_up_or_down_by_its_tilt():
-    pattern = np.array([0.0, 65.0, 30.0, -6.0, 10.0])
+    pattern = SectorPattern(front_to_back_db=30.0, tilt_deg=-6.0, vertical_beamwidth_deg=10.0)
     elevation_deg = np.array([-6.0, -1.0, -11.0, 40.0])
     np.testing.assert_allclose(sector_pattern_db(np.zeros(4), elevation_deg, pattern), [0, -3, -3, -30], atol=1e-9)
 
 
 @pytest.mark.parametrize("boresight_deg", [90.0, 30.0])
-def test_a_hidden_receiver_hears_the_antenna_in_the_direction_of_the_reflection(links, boresight_deg):
-    """A screen stands northwards between the ends, a long wall in the east: what arrives left towards the wall."""
+def test_a_hidden_receiver_hears_the_antenna_in_the_direction_of_the_reflection(make_links, boresight_deg):
+    """A screen north of the device blocks the link, and a long wall east of it reflects: all paths leave to the wall."""
     walls = [trimesh.creation.box(extents=extents) for extents in ([30, 2, 60], [2, 400, 60])]
     for wall, middle in zip(walls, ([0, 20, 30], [30, 0, 30])):
         wall.apply_translation(middle)
     mesh = trimesh.util.concatenate(walls)
-    records = links([[0.0, 0, 10]], [[0.0, 40, 10]], city=CityMap(mesh.vertices, mesh.faces))
-    pattern = [boresight_deg, 30.0, 30.0, *NO_VERTICAL, -80.0]
-    added_db = SectorAntenna().term(records, {"devices": {"0": pattern}}, None).offset_db
+    links = make_links([[0.0, 0, 10]], [[0.0, 40, 10]], city=CityMap(mesh.vertices, mesh.faces))
+    pattern = SectorPattern(azimuth_deg=boresight_deg, beamwidth_deg=30.0, front_to_back_db=30.0, scattered_db=-80.0)
+    added_db = SectorAntenna().term(links, SectorAntenna.Params(devices={0: pattern}), None).offset_db
     off_deg = abs(boresight_deg - np.degrees(np.arctan2(29, 20)))  # the wall's face is 29 m away
-    assert not records.los[0]
+    assert not links.los[0]
     assert added_db[0] == pytest.approx(-min(12 * (off_deg / 30) ** 2, 30), abs=1.5)
+
+
+def test_patterns_that_version_0_1_wrote_are_read():
+    params = SectorAntenna.Params.model_validate({"devices": {"3": [40, 65, 25, -6, 15, -35]}})
+    pattern = SectorPattern(azimuth_deg=40, beamwidth_deg=65, front_to_back_db=25, tilt_deg=-6, vertical_beamwidth_deg=15)
+    assert params == SectorAntenna.Params(devices={3: pattern})
+    assert SectorAntenna.Params.model_validate_json(params.model_dump_json()) == params
+    dipole = TiltedDipole.Params.model_validate({"receivers": {"1": [20.0, 90.0, -30.0]}}).receivers[1]
+    assert (dipole.tilt_deg, dipole.lean_azimuth_deg, dipole.scattered_db) == (20, 90, -30)
+    for wrong in ([40, 65, 25], [40, 65, 25, -6, 15, np.nan], [40, 500, 25, -6, 15, -35]):
+        with pytest.raises(ValidationError):
+            SectorAntenna.Params.model_validate({"devices": {"3": wrong}})
+
+
+def test_patterns_are_refined_each_by_itself():
+    devices = {3: SectorPattern(azimuth_deg=40), 7: SectorPattern(azimuth_deg=160)}
+    variation = SectorAntenna().variation(SectorAntenna.Params(devices=devices))
+    numbers = variation.values.copy()
+    numbers[variation.members[1][0]] += 5
+    assert variation.params(numbers).devices == {3: devices[3], 7: SectorPattern(azimuth_deg=165)}
 
 
 def towards(azimuth_deg, elevation_deg):
@@ -64,11 +85,11 @@ def test_a_dipole_that_leans_across_loses_the_polarisation_only():
     np.testing.assert_allclose(10 * np.log10(gain), 2.15 + 20 * np.log10(np.cos(np.radians(30))), atol=0.01)
 
 
-def test_the_body_turns_with_heading_pitch_and_roll(links):
+def test_the_body_turns_with_heading_pitch_and_roll(make_links):
     """Flying east, nose 10° up; flying north, right wing 20° down."""
-    records = links([[0.0, 0, 1.5]], np.ones((2, 3)), heading_deg=np.array([90.0, 0.0]))
-    records = replace(records, pitch_deg=np.array([10.0, 0.0]), roll_deg=np.array([0.0, 20.0]))
-    right, nose, top = np.moveaxis(records.receiver_axes, 1, 0)
+    links = make_links([[0.0, 0, 1.5]], np.ones((2, 3)), heading_deg=np.array([90.0, 0.0]))
+    links = replace(links, pitch_deg=np.array([10.0, 0.0]), roll_deg=np.array([0.0, 20.0]))
+    right, nose, top = np.moveaxis(links.receiver_axes, 1, 0)
     np.testing.assert_allclose(right, [towards(180, 0), towards(90, -20)], atol=1e-9)
     np.testing.assert_allclose(nose, [towards(90, 10), towards(0, 0)], atol=1e-9)
     np.testing.assert_allclose(top, [towards(270, 80), towards(90, 70)], atol=1e-9)
@@ -91,14 +112,14 @@ def test_the_floor_adds_as_power_and_knows_its_slope():
     assert read_db[0] == pytest.approx(-100, abs=0.01)
 
 
-@pytest.mark.parametrize("effect, setting, expected_db", [
-    (NoiseFloor(), {"receivers": {"1": -80.0}}, 10 * np.log10(1e-8 + 1e-8)),
-    (ReceiverSaturation(), {"receivers": {"1": [-80.0, 1.0]}}, -80 - 10 * np.log10(2)),
+@pytest.mark.parametrize("effect, params, expected_db", [
+    (NoiseFloor(), NoiseFloor.Params(receivers={1: -80.0}), 10 * np.log10(1e-8 + 1e-8)),
+    (ReceiverSaturation(), ReceiverSaturation.Params(receivers={1: (-80.0, 1.0)}), -80 - 10 * np.log10(2)),
 ])
-def test_a_receivers_fault_is_in_its_own_readings(links, effect, setting, expected_db):
+def test_a_receivers_fault_is_in_its_own_readings(make_links, effect, params, expected_db):
     """At the floor the reading is twice the power, at the level of saturation with smoothness 1 half of it."""
-    records = links([[0.0, 0, 1.5]], np.ones((4, 3)), receiver=np.array([0, 1, 0, 1]))
-    read_db, slope = effect.bend(np.full(4, -80.0), setting, effect.term(records, setting, None).extra)
+    links = make_links([[0.0, 0, 1.5]], np.ones((4, 3)), receiver=np.array([0, 1, 0, 1]))
+    read_db, slope = effect.response(np.full(4, -80.0), params, effect.inputs(links, params))
     np.testing.assert_allclose(read_db, [-80, expected_db, -80, expected_db])
     np.testing.assert_allclose(slope, [1, 0.5, 1, 0.5])
 

@@ -12,9 +12,9 @@ def everywhere(xy_m):
     return np.ones(len(xy_m), bool)
 
 
-def posterior_of(log_likelihood, peaks=((100.0, 100.0),), temper=1.0):
+def posterior_of(log_likelihood, peaks=((100.0, 100.0),), likelihood_power=1.0):
     xy_m = grid(5.0)
-    return refine(log_likelihood, xy_m, xy_m, log_likelihood(xy_m), 5.0, np.array(peaks), temper)
+    return refine(log_likelihood, xy_m, xy_m, log_likelihood(xy_m), 5.0, np.array(peaks), likelihood_power)
 
 
 def gaussian(at, sigma):

@@ -1,0 +1,55 @@
+"""The wet radome, fitted to links that were made with one; nothing needs to be installed."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import radiotwin as rt
+from radiotwin.effects import register
+
+START_S, END_S, LOSS_DB = 400.0, 800.0, 4.0
+
+
+@pytest.fixture
+def effect(monkeypatch):
+    """The effect, in the catalogue for the duration of a test."""
+    monkeypatch.setattr("radiotwin.effects.registry._registered", [])
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    from wet_radome import WetRadome
+    return register(WetRadome)
+
+
+def made(loss_db):
+    """Measurements of 2 receivers and 4 devices in 1200 s: a log-distance law, noise of 2 dB, and rain."""
+    rng = np.random.default_rng(0)
+    device_m = np.column_stack([rng.uniform(0, 400, (4, 2)), np.full(4, 1.5)])
+    slot, receiver, device = (axis.ravel() for axis in np.meshgrid(np.arange(300), [0, 1], [0, 1, 2, 3]))
+    receiver_m = np.column_stack([rng.uniform(0, 400, (300, 2, 2)).reshape(600, 2), np.full(600, 50.0)])
+    position_m, time_s = receiver_m[2 * slot + receiver], 4.0 * slot
+    gain_db = -35 - 26 * np.log10(np.linalg.norm(position_m - device_m[device], axis=1))
+    gain_db += rng.normal(0, 2, len(gain_db)) - loss_db * ((time_s >= START_S) & (time_s <= END_S))
+    table = pd.DataFrame({
+        "time_s": time_s, "flight": "f0", "receiver": [f"r{i}" for i in receiver],
+        **{f"receiver_{axis}_m": position_m[:, i] for i, axis in enumerate("xyz")},
+        "device": [f"d{i}" for i in device], "gain_db": gain_db})
+    devices = pd.DataFrame({"device": [f"d{i}" for i in range(4)], "role": "anchor",
+                            **{f"{axis}_m": device_m[:, i] for i, axis in enumerate("xyz")}})
+    return rt.Measurements(table, devices)
+
+
+def test_rain_is_found_with_its_loss(effect):
+    report = rt.make_report(rt.close_loop(made(LOSS_DB), base="log-distance"))
+    found = report["effects"][0]
+    assert found["name"] == effect.name
+    loss_db = found["parameters"]["loss_db"]
+    assert loss_db["low"] < LOSS_DB < loss_db["high"] and loss_db["high"] - loss_db["low"] < 1
+    assert found["params"]["start_s"] == pytest.approx(START_S, abs=60)
+    assert found["params"]["end_s"] == pytest.approx(END_S, abs=60)
+
+
+def test_without_rain_nothing_is_found(effect):
+    report = rt.make_report(rt.close_loop(made(0.0), base="log-distance"))
+    assert report["verdict"] == "none"
+    assert effect.name in {candidate["name"] for candidate in report["candidates"]}

@@ -1,0 +1,54 @@
+"""A wet radome: while it rains, the water on their antennas weakens what all receivers read.
+
+Wet antennas add a loss of their own to that of the rain on the path (Leijnse et al. 2008,
+'Microwave link rainfall estimation', Advances in Water Resources 31).
+"""
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from radiotwin.effects import EffectParams, Estimate, GainEffect, Parameter, Term
+from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.links import LinkData
+
+
+class WetRadome(GainEffect):
+    """A loss during one episode of rain."""
+
+    name = "wet_radome"
+    of_receiver = True  # a map is of the levels that arrive, not of readings
+    confused_with = ("receiver_drift",)
+
+    class Params(EffectParams):
+        """One episode of rain."""
+
+        start_s: float = Field(description="Beginning of the rain [s].")
+        end_s: float = Field(description="End of the rain [s].")
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        return None if np.isfinite(links.time_s).any() else "there is no time_s"
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        edges_s = np.linspace(view.links.first_s, view.links.last_s, 25).tolist()
+        episodes = [self.Params(start_s=start_s, end_s=end_s) for number, start_s in
+                    enumerate(edges_s) for end_s in edges_s[number + 1:]]
+        gains = [view.score(self.term(view.links, each, view.level_at)) for each in episodes]
+        return [episodes[int(np.argmax(gains))]]
+
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        rains = (links.time_s >= params.start_s) & (links.time_s <= params.end_s)
+        return Term.of_columns(-rains[:, None].astype(float), prior_sd_db=5.0)
+
+    @override
+    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+        return None if coefficients[0] > 0 else "rain would have to amplify"
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        return {"loss_db": Parameter.normal(estimate.coefficients[0], estimate.coefficients_sd[0],
+                                            "dB")}

@@ -1,0 +1,138 @@
+"""The channel that follows reflected and diffracted paths over the 3D map."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import numpy as np
+from scipy.optimize import minimize
+from typing_extensions import override
+
+from radiotwin.channel.base import ANY_LEVEL_SD_DB, ChannelModel
+from radiotwin.channel.followed_paths import path_gains
+from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
+from radiotwin.links import LinkGeometry
+
+MIN_NLOS = 30  # links without line of sight that the diffuse power is fitted to
+DIFFUSE_DEFAULT = (-150.0, 3.0)  # nearly nothing; the exponent then does not matter
+DIFFUSE_BOUNDS = np.array([[-150.0, 2.0], [-60.0, 6.0]])
+DIFFUSE_STARTS_DB = (-100.0, -110.0, -120.0, -130.0)
+ERROR_SCALE_DB = 4.0  # of the Cauchy loss of the fit of the diffuse power
+
+
+class ImagePaths(ChannelModel):
+    """Power of the paths over the map (`radiotwin.paths`) plus diffuse power.
+
+    The diffuse power stands for what reaches any position on ways that are not followed: more
+    bounces and edges, rough walls. It falls with distance by a law of its own. Levels, one for each
+    class of line of sight, are fitted with the effects.
+
+    Attributes:
+        law: fitted to the same links; predicts what small changes do, quickly, and the errors' size.
+        diffuse: gain of the diffuse power at 100 m [dB], and the exponent of its fall.
+    """
+
+    name = "image_paths"
+    uses_map = True
+    follows_paths = True
+
+    def __init__(self, law: ChannelModel | None = None,
+                 diffuse: tuple[float, float] = DIFFUSE_DEFAULT) -> None:
+        self.law: ChannelModel = SegmentedLogDistance() if law is None else law
+        self.diffuse = diffuse
+
+    @override
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+            seed: int = 0) -> Self:
+        self.law.fit(links, level_db, limit_db, seed)
+        return self.fit_diffuse(links, level_db, limit_db)
+
+    def fit_diffuse(self, links: LinkGeometry, level_db: np.ndarray,
+                    limit_db: float | None) -> Self:
+        """Fit the diffuse power to links without line of sight, beside a level of their own.
+
+        Args:
+            links: n links over a map.
+            level_db: (n,) [dB]; NaN = not detected.
+            limit_db: below which levels are not detected [dB]; None = unknown.
+        """
+        nlos = links.select(~links.los)
+        level_db = level_db[~links.los]
+        blank = np.isnan(level_db)
+        level_db = np.where(blank, -np.inf if limit_db is None else limit_db, level_db)
+        known = np.isfinite(level_db)
+        # Blanks alone say no more than that it is weak, and the least is.
+        if known.sum() < MIN_NLOS or blank[known].all():
+            self.diffuse = DIFFUSE_DEFAULT
+            return self
+        power = path_gains(nlos)
+
+        def loss(numbers: np.ndarray) -> float:
+            inside = np.clip(numbers, *DIFFUSE_BOUNDS)
+            error_db = level_db - with_diffuse_db(power, nlos.distance_m, *inside)
+            error_db = error_db - np.median(error_db[known & ~blank])
+            error_db = np.where(blank, np.minimum(error_db, 0.0), error_db)[known]
+            misfit = np.log1p((error_db / ERROR_SCALE_DB) ** 2).sum()
+            return float(misfit + np.abs(numbers - inside).sum())
+
+        starts = [np.array([start_db, DIFFUSE_DEFAULT[1]]) for start_db in DIFFUSE_STARTS_DB]
+        found = minimize(loss, min(starts, key=loss), method="Nelder-Mead",
+                         options={"xatol": 0.1, "fatol": 0.5}).x
+        gain_db, exponent = np.clip(found, *DIFFUSE_BOUNDS)
+        self.diffuse = float(gain_db), float(exponent)
+        return self
+
+    @override
+    def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        return self.level_db(path_gains(links), links), self.law.predict(links)[1]
+
+    def level_db(self, power: np.ndarray, links: LinkGeometry) -> np.ndarray:
+        """Return the mean level (n,) [dB] of links whose paths carry these powers (n,)."""
+        return with_diffuse_db(power, links.distance_m, *self.diffuse)
+
+    @property
+    @override
+    def quick(self) -> ChannelModel:
+        return self.law
+
+    @property
+    @override
+    def trend(self) -> ChannelModel:
+        return self
+
+    @override
+    def level_columns(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        los = links.los
+        return np.column_stack([los, ~los]).astype(float), np.full(2, ANY_LEVEL_SD_DB)
+
+    @override
+    def error_group(self, links: LinkGeometry) -> np.ndarray:
+        return links.los.astype(int)
+
+    @override
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        arrays, settings = self.law.state()
+        return arrays, {"law": self.law.name, "law_settings": settings,
+                        "diffuse": list(self.diffuse)}
+
+    @classmethod
+    @override
+    def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        if settings["law"] != SegmentedLogDistance.name:
+            raise ValueError(f"law is {settings['law']!r}, not {SegmentedLogDistance.name!r}")
+        gain_db, exponent = map(float, settings["diffuse"])
+        return cls(SegmentedLogDistance.from_state(arrays, settings["law_settings"]),
+                   (gain_db, exponent))
+
+
+def with_diffuse_db(power: np.ndarray, distance_m: np.ndarray, gain_db: float,
+                    exponent: float) -> np.ndarray:
+    """Return the level (n,) [dB] of followed and diffuse power together.
+
+    Args:
+        power: (n,) of the followed paths, linear.
+        distance_m: (n,) [m].
+        gain_db: of the diffuse power at 100 m [dB].
+        exponent: of its fall with distance.
+    """
+    return 10 * np.log10(power + 10 ** (gain_db / 10) * (distance_m / 100.0) ** -exponent)

@@ -1,0 +1,67 @@
+"""Every channel model by name: the built-in ones, and what installed packages add.
+
+A package adds models under the entry-point group `radiotwin.channels`; a script adds one with
+`register`.
+"""
+
+import warnings
+from importlib.metadata import entry_points
+
+from radiotwin.channel.base import ChannelModel
+from radiotwin.channel.image_paths import ImagePaths
+from radiotwin.channel.log_distance import LogDistance
+from radiotwin.channel.regression_kriging import RegressionKriging
+from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
+from radiotwin.channel.segmented_nn import SegmentedNN
+from radiotwin.errors import BadInput
+
+ENTRY_POINTS = "radiotwin.channels"
+BUILT_IN: tuple[type[ChannelModel], ...] = (
+    LogDistance, SegmentedLogDistance, SegmentedNN, RegressionKriging, ImagePaths)
+ALIASES = {"raytrace": ImagePaths.name}  # as the command line calls it
+
+_registered: dict[str, type[ChannelModel]] = {}
+
+
+def register(model: type[ChannelModel]) -> type[ChannelModel]:
+    """Add a channel model to this process; usable as a decorator.
+
+    Raises:
+        BadInput: not a channel model, or its name is taken.
+    """
+    if not (isinstance(model, type) and issubclass(model, ChannelModel)):
+        raise BadInput(f"{model!r} is not a subclass of radiotwin.channel.ChannelModel")
+    taken = {each.name: each for each in BUILT_IN} | _registered
+    if taken.get(model.name, model) is not model:
+        raise BadInput(f"the channel model {model.name!r} of {model.__module__} is in "
+                       f"{taken[model.name].__module__} already; give it another name")
+    _registered[model.name] = model
+    return model
+
+
+def channel_models() -> dict[str, type[ChannelModel]]:
+    """Return all channel models by name: built-in, of installed packages, and registered.
+
+    Warns where a package's model cannot be loaded, and goes on without it.
+    """
+    for point in entry_points(group=ENTRY_POINTS):
+        try:
+            register(point.load())
+        except Exception as error:  # noqa: BLE001  # whatever a stranger's package raises
+            warnings.warn(f"the channel model {point.name!r} of the package {point.value!r} cannot "
+                          f"be used ({type(error).__name__}: {error})", stacklevel=2)
+    return {each.name: each for each in BUILT_IN} | _registered
+
+
+def channel_named(name: str) -> type[ChannelModel]:
+    """Return a channel model's class.
+
+    Raises:
+        BadInput: no such model is installed.
+    """
+    models = channel_models()
+    name = ALIASES.get(name, name)
+    if name not in models:
+        allowed = [*(each for each in models if each not in ALIASES.values()), *ALIASES]
+        raise BadInput(f"channel model {name!r} is unknown; allowed are {', '.join(allowed)}")
+    return models[name]

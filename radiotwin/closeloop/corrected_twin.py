@@ -1,0 +1,49 @@
+"""The twin of a loop: fitted to all its links, with all effects that are causes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+import radiotwin
+from radiotwin.closeloop.run import Loop
+from radiotwin.effects.effect_model import EffectModel
+from radiotwin.localize import calibrated_power, whole_area
+from radiotwin.scene import Scene
+from radiotwin.twin.twin import Twin
+
+
+def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
+    """Return the twin of a loop.
+
+    What belongs to a receiver (its offset, drift, antenna, …) is part of it, too; but a map is of
+    what arrives at a faultless receiver.
+
+    Args:
+        loop: what was found.
+        scene: that it was found in, if there was one.
+    """
+    model = loop.after
+    fitted = replace(EffectModel.of(model.whole, model.fits[0], causes_only=True),
+                     likelihood_power=_likelihood_power(loop),
+                     shadowing=model.shadowing[0] if model.shadowing else None)
+    provenance = {"links": len(model.links), "radiotwin_version": radiotwin.__version__}
+    if scene is not None:
+        provenance |= {"scene": scene.config.name, "scene_hash": scene.content_hash()}
+    # Devices whose position is too uncertain to be learnt from, too: a map with them is better.
+    return replace(model.twin, provenance=provenance, fitted=fitted)
+
+
+def _likelihood_power(loop: Loop) -> float:
+    """Return how much the likelihood of positions is to be believed where there is no map.
+
+    With one, `radiotwin fit` locates devices.
+    """
+    model, links = loop.after, loop.links
+    if links.city is not None:
+        return 1.0
+    models = [EffectModel.of(fold, fit)
+              for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
+    held_out = [links.select(model.index == number) for number in range(len(models))]
+    return calibrated_power(models, held_out, whole_area(models[0], links), 0)

@@ -1,0 +1,139 @@
+"""One model of all links and one of each fold's others, side by side."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from radiotwin.closeloop.bases import Base
+from radiotwin.closeloop.folds import Folds
+from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
+from radiotwin.effects.fold_model import FoldModel
+from radiotwin.inference.censored_regression import FitResult
+from radiotwin.inference.student import mean_if_detected
+from radiotwin.links import LinkData
+from radiotwin.twin.fit import best_dof
+from radiotwin.twin.twin import Twin
+
+
+@dataclass(eq=False)
+class CrossValidatedModel:
+    """A base with effects, of all links and of each fold's others.
+
+    Attributes:
+        whole: learnt from all links.
+        folds: learnt from all but one fold each.
+        fits: the whole's fit, then the folds'.
+        index: (n,) fold of each link.
+        twin: the base as it was fitted to all links.
+        shadowing: the whole's, then the folds', of what all effects leave over; empty = none.
+    """
+
+    whole: FoldModel
+    folds: list[FoldModel]
+    fits: list[FitResult]
+    index: np.ndarray
+    twin: Twin
+    shadowing: list[CorrelatedShadowing] = field(default_factory=list)
+
+    @property
+    def models(self) -> list[FoldModel]:
+        """The whole, then the folds."""
+        return [self.whole, *self.folds]
+
+    @property
+    def links(self) -> LinkData:
+        """n links, with the devices where the base has them."""
+        return self.whole.links
+
+    def extended(self, models: list[FoldModel], fits: list[FitResult]) -> CrossValidatedModel:
+        """Return the same base with other effects: the whole, then the folds."""
+        return CrossValidatedModel(models[0], models[1:], fits, self.index, self.twin)
+
+    def with_shadowing(self, shadowing: list[CorrelatedShadowing]) -> CrossValidatedModel:
+        """Return the same with interpolated shadowing: the whole's, then the folds'."""
+        return CrossValidatedModel(self.whole, self.folds, self.fits, self.index, self.twin,
+                                   shadowing)
+
+    def held_out(self, of: Callable[[FoldModel, FitResult], np.ndarray]) -> np.ndarray:
+        """Return a value (n,) of each link, from the fold that has not seen it."""
+        result = np.full(len(self.index), np.nan)
+        for number, (model, fit) in enumerate(zip(self.folds, self.fits[1:], strict=True)):
+            own = self.index == number
+            result[own] = of(model, fit)[own]
+        return result
+
+    @cached_property
+    def held_out_reading(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) predicted reading and (n,) its error scale [dB], with shadowing; NaN = none."""
+        mean_db, scale_db = np.full((2, len(self.index)), np.nan)
+        for number, (model, fit) in enumerate(zip(self.folds, self.fits[1:], strict=True)):
+            own, reading = self.index == number, model.predict(fit)
+            mean_db[own], scale_db[own] = reading.mean_db[own], reading.scale_db[own]
+        shift, left = self._held_out_shadowing()
+        return mean_db + shift * scale_db, scale_db * left
+
+    @cached_property
+    def held_out_nll(self) -> np.ndarray:
+        """(n,) negative log-likelihood [nats]; NaN where there is none."""
+        reading = self.held_out_reading
+        return self.held_out(lambda model, fit: np.where(
+            model.usable, model.regression().nll_at(*reading), np.nan))
+
+    @cached_property
+    def held_out_mean_db(self) -> np.ndarray:
+        """(n,) predicted level of a link that is detected [dB]; NaN where there is none."""
+        reading = self.held_out_reading
+        return self.held_out(lambda model, fit: np.where(
+            model.usable, mean_if_detected(*reading, model.limit_db, model.dof), np.nan))
+
+    def rmse_db(self, rows: np.ndarray | None = None) -> float:
+        """Return the held-out RMSE of the detected links of a mask (n,), or of all [dB]."""
+        error = self.links.level_db - self.held_out_mean_db
+        error = error if rows is None else error[rows]
+        return float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else np.nan
+
+    def _held_out_shadowing(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return what shadowing adds (n,) [error scales], and the share left of the scale (n,)."""
+        shift, left = np.zeros(len(self.index)), np.ones(len(self.index))
+        for number, shadowing in enumerate(self.shadowing[1:]):
+            own = np.flatnonzero(self.index == number)
+            shift[own], left[own] = shadowing.at(self.folds[number].links.select(own))
+        return shift, left
+
+
+def training_parts(links: LinkData, folds: Folds) -> list[LinkData]:
+    """Return the links outside each fold; the same objects serve every base."""
+    return [links.select(folds.index != number) for number in range(folds.count)]
+
+
+def cross_validate(links: LinkData, base: Base, folds: Folds,
+                   parts: list[LinkData]) -> CrossValidatedModel:
+    """Fit a base to all links, and to those outside each fold.
+
+    Args:
+        links: n links.
+        base: kind of model.
+        folds: of the links.
+        parts: `training_parts` of both.
+
+    Raises:
+        BadInput: links that the base cannot be fitted to.
+    """
+    twin = base.fit(links)
+    device_m = base.device_m(twin)
+    dof = best_dof(links, twin.channel, device_m)
+    whole = FoldModel.build(links, twin.channel, dof, device_m=device_m)
+    models = []
+    for number, part in enumerate(parts):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the fit to all links has warned already
+            fitted = base.fit(part)
+        models.append(FoldModel.build(links, fitted.channel, dof, device_m=base.device_m(fitted),
+                                      train=folds.index != number))
+    fits = [model.fit() for model in (whole, *models)]
+    return CrossValidatedModel(whole, models, fits, folds.index, twin)

@@ -1,0 +1,163 @@
+"""What the loop found as `closeloop.json`: everything that the page and the terminal show."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from radiotwin import __version__
+from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.closeloop.run import Loop
+from radiotwin.closeloop.selection import CandidateScore
+from radiotwin.errors import BadInput
+from radiotwin.files import atomic_path
+from radiotwin.links import LinkData
+
+SCHEMA, SCHEMA_1 = "radiotwin.closeloop/2", "radiotwin.closeloop/1"
+MAX_GROUPS = 100  # thousands of transmitter positions say nothing one by one
+
+
+def make_report(loop: Loop) -> dict[str, Any]:
+    """Return the content of `closeloop.json`; numbers that are not known are null."""
+    selection = loop.selection
+    kept = [score for score in selection.scores if score.kept]
+    effects = [{"name": score.name, "variant": each.effect.variant, "rank": rank,
+                "params": each.params.model_dump(mode="json"),
+                "parameters": {name: vars(parameter) for name, parameter in parameters.items()},
+                "confused_with": list(each.effect.confused_with), "indistinguishable_from": rivals,
+                "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value}}
+               for rank, (score, each, parameters, rivals) in enumerate(
+                   zip(kept, loop.after.whole.effects, loop.parameters, selection.rivals,
+                       strict=False), start=1)]
+    if loop.after.shadowing:
+        effects.append(_shadowing(kept[-1], loop.after, len(effects) + 1))
+    candidates = [{"name": score.name, "step": score.step + 1, "heldout_rmse_db": score.rmse_db,
+                   "heldout_nll_gain": score.nll_gain, "p_value": score.p_value, "kept": score.kept,
+                   "reason": score.reason} for score in selection.scores]
+    links = loop.after.links
+    error: dict[str, Any] = {"before": scores(loop.before), "after": scores(loop.after),
+                             "noise_floor_db": loop.noise_floor_db}
+    for name, groups in _groups(links).items():
+        error[f"by_{name}"] = {label: {"before": scores(loop.before, rows),
+                                       "after": scores(loop.after, rows)}
+                               for label, rows in groups.items()}
+    baselines = {name: errors(links.level_db, mean_db) for name, mean_db in loop.baselines.items()}
+    return _for_json({
+        "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base,
+        "verdict": loop.verdict, "effects": effects, "candidates": candidates,
+        "heldout": {"by": loop.folds.by, "folds": loop.folds.count,
+                    "n": int(np.isfinite(loop.after.held_out_nll).sum())},
+        "error": error, "baselines": baselines,
+        "dependences_before": [vars(each) for each in loop.dependences_before],
+        "remaining": {"structured": bool(loop.remaining),
+                      "drivers": [vars(each) for each in loop.remaining]},
+        "criteria": loop.criteria.to_json(), "notes": links.notes})
+
+
+def scores(model: CrossValidatedModel, rows: np.ndarray | None = None) -> dict[str, float]:
+    """Return held-out errors of the links of a mask (n,), or of all.
+
+    Returns:
+        as of `errors`, and `nll`, the mean negative log-likelihood of detected and blank links [nats].
+    """
+    level_db, mean_db, nll = model.links.level_db, model.held_out_mean_db, model.held_out_nll
+    rows = np.ones(len(level_db), dtype=bool) if rows is None else rows
+    mean_nll = float(np.nanmean(nll[rows])) if np.isfinite(nll[rows]).any() else np.nan
+    return errors(level_db[rows], mean_db[rows]) | {"nll": mean_nll}
+
+
+def errors(level_db: np.ndarray, mean_db: np.ndarray) -> dict[str, float]:
+    """Return errors of detected links.
+
+    Args:
+        level_db: (n,) measured [dB]; NaN = not detected.
+        mean_db: (n,) predicted [dB]; NaN = none.
+
+    Returns:
+        number, bias (mean of predicted minus measured), standard deviation, RMSE, MAE [dB], and the
+        correlation of the two.
+    """
+    seen = np.isfinite(level_db) & np.isfinite(mean_db)
+    if not seen.any():
+        names = ("bias_db", "std_db", "correlation", "rmse_db", "mae_db")
+        return {"n": 0} | dict.fromkeys(names, np.nan)
+    level_db, mean_db = level_db[seen], mean_db[seen]
+    error = mean_db - level_db
+    constant = np.std(level_db) == 0 or np.std(mean_db) == 0
+    correlation = np.nan if constant else float(np.corrcoef(level_db, mean_db)[0, 1])
+    return {"n": int(seen.sum()), "bias_db": float(error.mean()), "std_db": float(error.std()),
+            "correlation": correlation, "rmse_db": float(np.sqrt((error**2).mean())),
+            "mae_db": float(np.abs(error).mean())}
+
+
+def write_report(report: dict[str, Any], path: Path) -> None:
+    """Write `closeloop.json`, whole or not at all."""
+    with atomic_path(path) as temporary:
+        text = json.dumps(report, indent=1, allow_nan=False)
+        temporary.write_text(text, encoding="utf-8")
+
+
+def upgrade_report(report: dict[str, Any]) -> dict[str, Any]:
+    """Return the content of a `closeloop.json` of this version or of version 0.1 as of this one.
+
+    Raises:
+        BadInput: it is of neither.
+        KeyError, TypeError, AttributeError: it is damaged.
+    """
+    schema = report.get("schema")
+    if schema == SCHEMA:
+        return report
+    if schema != SCHEMA_1:
+        raise BadInput(f"schema is {schema!r}, this version reads {SCHEMA!r} and {SCHEMA_1!r}")
+    new_names = {"remarks": "notes", "structure_before": "dependences_before"}
+    new = {new_names.get(name, name): value for name, value in report.items()}
+    new["effects"] = [{("params" if name == "setting" else name): value
+                       for name, value in effect.items()} for effect in report["effects"]]
+    new["error"] = _with_new_bias(report["error"])
+    new["baselines"] = _with_new_bias(report["baselines"])
+    return new | {"schema": SCHEMA, "criteria": {}}
+
+
+def _with_new_bias(value: Any) -> Any:
+    """Turn the sign of every bias: version 1 had measured minus predicted."""
+    if not isinstance(value, dict):
+        return value
+    return {name: -each if name == "bias_db" and each is not None else _with_new_bias(each)
+            for name, each in value.items()}
+
+
+def _shadowing(score: CandidateScore, model: CrossValidatedModel, rank: int) -> dict[str, Any]:
+    field, relative_sd = model.shadowing[0].field, model.shadowing[0].relative_sd
+    sd_db = relative_sd * float(model.fits[0].scale_db.mean())
+    numbers = {"length_m": (field.length_m, "m"), "share": (field.share, "of the variance"),
+               "receiver_share": (field.kind_share, "of the variance"), "sigma_db": (sd_db, "dB")}
+    return {"name": score.name, "variant": "", "rank": rank, "params": {},
+            "parameters": {name: {"value": value, "low": np.nan, "high": np.nan, "unit": unit}
+                           for name, (value, unit) in numbers.items()},
+            "confused_with": [], "indistinguishable_from": [],
+            "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value}}
+
+
+def _groups(links: LinkData) -> dict[str, dict[str, np.ndarray]]:
+    groups = {"los": {"los": links.los, "nlos": ~links.los}}
+    for name, index, labels in (("device", links.device, links.device_names),
+                                ("receiver", links.receiver, links.receiver_names),
+                                ("flight", links.flight, links.flight_names)):
+        members = np.unique(index)
+        if len(members) <= MAX_GROUPS:
+            groups[name] = {labels[member]: index == member for member in members}
+    return groups
+
+
+def _for_json(value: Any) -> Any:
+    """Return NaN as null and numpy's numbers as Python's."""
+    if isinstance(value, dict):
+        return {name: _for_json(each) for name, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_for_json(each) for each in value]
+    if isinstance(value, float | np.floating):
+        return float(value) if np.isfinite(value) else None
+    return value.item() if isinstance(value, np.generic) else value

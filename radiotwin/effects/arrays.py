@@ -1,0 +1,44 @@
+"""Small helpers that many effects share."""
+
+from collections.abc import Callable, Hashable
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+
+from radiotwin.links import LinkData
+
+
+class LinkCache:
+    """Values derived from links, kept for as long as those links are in use."""
+
+    def __init__(self) -> None:
+        self._known: WeakKeyDictionary[LinkData, dict] = WeakKeyDictionary()
+
+    def get(self, links: LinkData, key: Hashable, derive: Callable[[], Any]) -> Any:
+        """Return the value of `derive`, called once for these links and this key."""
+        known = self._known.setdefault(links, {})
+        if key not in known:
+            known[key] = derive()
+        return known[key]
+
+
+def subsample(rows: np.ndarray, maximum: int) -> np.ndarray:
+    """Return at most `maximum` of the rows (n,), in order, drawn at random and always the same.
+
+    Every k-th would not do: devices, receivers and slots take turns in a file.
+    """
+    if len(rows) <= maximum:
+        return rows
+    return np.sort(np.random.default_rng(0).choice(rows, maximum, replace=False))
+
+
+def one_hot(index: np.ndarray, members: list[int]) -> np.ndarray:
+    """Return (n, len(members)): 1 where the index (n,) is the member's, else 0."""
+    return (index[:, None] == np.asarray(members)[None]).astype(float)
+
+
+def frequent_labels(index: np.ndarray, minimum: int) -> list[int]:
+    """Return the labels of (n,) that occur at least `minimum` times, in order."""
+    values, counts = np.unique(index, return_counts=True)
+    return [int(value) for value, count in zip(values, counts, strict=True) if count >= minimum]

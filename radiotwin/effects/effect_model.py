@@ -1,0 +1,122 @@
+"""A channel with refitted levels and fitted effects, for any links: what `close-loop` made a twin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from radiotwin.channel import ChannelModel
+from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
+from radiotwin.effects.fold_model import FittedEffect, FoldModel
+from radiotwin.inference.censored_regression import FitResult
+from radiotwin.inference.student import detection_probability
+from radiotwin.links import LinkData
+from radiotwin.links.prediction import Prediction
+
+MIN_LINKS = 3  # of a device whose mean residual is known
+MIN_SLOPE = 0.5  # of a receiver's response that passes a device's own level on
+MAX_Z = 4.0  # an outlier counts as this many scales
+
+
+@dataclass(frozen=True, eq=False)
+class EffectModel:
+    """What was learnt from training links, ready for links that were not among them.
+
+    Attributes:
+        channel: fitted.
+        effects: fitted; they count devices and receivers by their rows at the fit.
+        level_coefficients: (p0,) of `ChannelModel.level_columns`.
+        scale_db: (groups,) error scales [dB].
+        dof: degrees of freedom of the errors.
+        device_m: (k, 3) positions of the devices at the fit [m].
+        receivers: names of the receivers at the fit.
+        first_s: time of the first measurement that it was fitted to [s]; NaN without times.
+        device_sd_db: standard deviation of what all links of a device have in common [dB].
+        likelihood_power: power of the likelihood in localisation, see
+            `radiotwin.localize.without_map.calibrated_power`.
+        shadowing: what is interpolated over the ground; None = nothing.
+    """
+
+    channel: ChannelModel
+    effects: tuple[FittedEffect, ...]
+    level_coefficients: np.ndarray
+    scale_db: np.ndarray
+    dof: float
+    device_m: np.ndarray
+    receivers: tuple[str, ...]
+    first_s: float
+    device_sd_db: float
+    likelihood_power: float = 1.0
+    shadowing: CorrelatedShadowing | None = None
+
+    @classmethod
+    def of(cls, model: FoldModel, result: FitResult, causes_only: bool = False) -> EffectModel:
+        """Return what was learnt from the training links of a model.
+
+        Args:
+            model, result: fitted.
+            causes_only: whether to leave out what only describes the residual (`Effect.is_cause`).
+        """
+        effects = tuple(each for each in model.fitted_effects(result)
+                        if each.effect.is_cause or not causes_only)
+        return cls(model.channel, effects,
+                   result.coefficients[:model.level_columns.shape[1]], result.scale_db, model.dof,
+                   model.links.device_m, tuple(model.links.receiver_names), model.links.first_s,
+                   device_sd_db(model, result))
+
+    def on_links(self, links: LinkData) -> tuple[FoldModel, FitResult]:
+        """Return the model of any links (n,), and the fit that goes with it.
+
+        Where the links have no receivers (a map's have none) those are faultless: effects of
+        receivers are left out.
+        """
+        effects = [each for each in self.effects
+                   if links.receiver_names or not each.effect.of_receiver]
+        model = FoldModel.build(links, self.channel, self.dof)
+        model = model.with_effects([model.apply(each.effect, each.params) for each in effects])
+        coefficients = [self.level_coefficients, *(each.coefficients for each in effects)]
+        return model, FitResult(np.concatenate(coefficients), self.scale_db, np.nan)
+
+    def predict(self, links: LinkData) -> Prediction:
+        """Return the levels that are expected of links, see `Prediction`."""
+        model, result = self.on_links(links)
+        regression = model.regression()
+        reading = regression.predict(result)
+        mean_db, scale_db = reading.mean_db, reading.scale_db
+        if self.shadowing is not None and self.shadowing.receivers_move:
+            shift, left = self.shadowing.at(links)
+            mean_db = mean_db + shift * self.scale_db[model.group]
+            scale_db = scale_db * left
+        return Prediction(
+            mean_db, scale_db * np.sqrt(self.dof / (self.dof - 2)),
+            detection_probability(mean_db, scale_db, model.limit_db, self.dof,
+                                  regression.dropout_probability))
+
+    def with_power(self, likelihood_power: float) -> EffectModel:
+        """Return the same with another power of the likelihood."""
+        return replace(self, likelihood_power=likelihood_power)
+
+
+def device_sd_db(model: FoldModel, result: FitResult) -> float:
+    """Return the standard deviation of what the training links of a device have in common [dB].
+
+    Beyond what the scatter of single links makes of their mean (method of moments).
+    """
+    problem = model.training
+    reading = problem.predict(result)
+    slope = np.broadcast_to(reading.slope, problem.level_db.shape)
+    # At a receiver that passes little on a device's own level does not show.
+    seen = np.isfinite(problem.level_db) & (slope > MIN_SLOPE)
+    rest_db = (problem.residual_db(result) / slope)[seen]
+    scale_db = (reading.scale_db / slope)[seen]
+    device = model.links.device[model.train][seen]
+    rest_db = np.clip(rest_db, -MAX_Z * scale_db, MAX_Z * scale_db)
+    count = np.bincount(device)
+    enough = count >= MIN_LINKS
+    if enough.sum() < MIN_LINKS:
+        return 0.0
+    mean_db = np.bincount(device, weights=rest_db)[enough] / count[enough]
+    within = np.bincount(device, weights=rest_db**2)[enough] / count[enough] - mean_db**2
+    noise = (within / (count[enough] - 1)).mean()
+    return float(np.sqrt(max(mean_db.var() - noise, 0.0)))

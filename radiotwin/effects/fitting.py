@@ -1,0 +1,191 @@
+"""Finding the parameters of one more effect: proposals, a search, exact levels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize, minimize_scalar
+
+from radiotwin.effects.arrays import subsample
+from radiotwin.effects.base import Effect
+from radiotwin.effects.fold_model import AppliedEffect, FoldModel, response
+from radiotwin.effects.params import Variation
+from radiotwin.inference import censored_regression
+from radiotwin.inference.censored_regression import FitResult
+from radiotwin.links import LinkData
+
+EVALUATIONS = 25  # of the objective for each number, in one descent
+DESCENTS = 2  # a simplex that has collapsed too early starts anew
+MAX_LINKS, MAX_LINKS_OF_MEMBER = 5000, 1500  # that numbers are refined on
+MAX_PROPOSALS = 2  # of one effect that are fitted
+MIN_GAIN_NATS = 5.0  # that a proposal must gain to be refined
+OUTSIDE_NATS = 10.0  # penalty of a step outside the bounds
+ANY_LEVEL_SD_DB = 300.0  # prior of a level that is free
+EXTREMES_DB = (-200.0, 100.0)  # levels at which whatever a receiver does to them shows
+
+
+def add_effect(model: FoldModel, effect: Effect, result: FitResult,
+               like: Any = None) -> tuple[FoldModel, FitResult] | None:
+    """Find the best parameters of an effect on the training links, beside the effects there are.
+
+    Args:
+        model: what is learnt from.
+        effect: what is added.
+        result: the fit without it.
+        like: parameters that were found on all links, where the model is of a fold.
+
+    Returns:
+        the model with the effect, and its fit; None where nothing in the residual looks like the
+        effect.
+    """
+    view = model.view(result)
+    proposals = effect.propose(view) if like is None else effect.propose_like(view, like)
+    applied = [model.apply(effect, params) for params in proposals]
+    if effect.stage == "gain" and len(applied) > MAX_PROPOSALS:  # only gains have a score
+        applied.sort(key=lambda each: -view.score(each.term.select(model.train)))
+        applied = applied[:MAX_PROPOSALS]
+    best = None
+    for each in applied:
+        tried = model.with_effects([*model.effects, each])
+        fitted = tried.fit(result)
+        if best is None or fitted.objective < best[1].objective:
+            best = tried, fitted
+    if best is None or result.objective - best[1].objective < MIN_GAIN_NATS:
+        return best
+    refined = _refine(*best)
+    return with_exact_levels(*refined) if effect.always_exact else refined
+
+
+def with_exact_levels(model: FoldModel, result: FitResult) -> tuple[FoldModel, FitResult]:
+    """Replace quick levels by the channel's exact ones in each effect, where that is better."""
+    if not model.channel.follows_paths:
+        return model, result
+    for number, each in enumerate(model.effects):
+        params = each.effect.exact(each.params)
+        if params is None or params == each.params:
+            continue
+        effects = list(model.effects)
+        effects[number] = model.apply(each.effect, params)
+        other = model.with_effects(effects)
+        fitted = other.fit(result)
+        if fitted.objective < result.objective:
+            model, result = other, fitted
+    return model, result
+
+
+def _refine(model: FoldModel, result: FitResult) -> tuple[FoldModel, FitResult]:
+    """Vary the last effect's parameters for a better fit to the training links."""
+    last = model.effects[-1]
+    variation = last.effect.variation(last.params)
+    if variation is None or not len(variation.values):
+        return model, result
+    if variation.members is not None:
+        return _refine_members(model, result, last, variation)
+    rows = subsample(np.flatnonzero(model.train), MAX_LINKS)
+    design_effect = model.view(result).design_effect * len(rows) / max(model.train.sum(), 1)
+    small = model.restrict(rows, model.effects[:-1])
+    rest = small.regression()
+    # What has no coefficients of its own moves those of the others little: they stay meanwhile.
+    alone = last.effect.stage == "gain" and not len(last.term.prior_sd_db)
+    latest = result
+
+    def objective(numbers: np.ndarray) -> float:
+        nonlocal latest
+        inside = np.clip(numbers, variation.low, variation.high)
+        params = variation.params(inside)
+        tried = small.apply(last.effect, params)
+        if alone:
+            moved = replace(rest, gain_db=rest.gain_db + tried.term.offset_db)
+            misfit = moved.nll(result).sum()
+        else:
+            latest = small.with_effects([*small.effects, tried]).fit(latest)
+            misfit = latest.objective
+        outside = np.abs((numbers - inside) / variation.steps).sum()
+        return float(misfit + design_effect * last.effect.neg_log_prior(params)
+                     + OUTSIDE_NATS * outside)
+
+    numbers = variation.values
+    for _ in range(DESCENTS):
+        numbers = _descend(objective, numbers, variation.steps)
+    return _better(model, result, last, variation, numbers)
+
+
+def _refine_members(model: FoldModel, result: FitResult, last: AppliedEffect,
+                    variation: Variation) -> tuple[FoldModel, FitResult]:
+    """Vary the numbers of each member by themselves, on the links that they act on.
+
+    Only a level of its own is fitted beside them.
+    """
+    numbers = variation.values.copy()
+    arriving_db = model.regression().arriving(result.coefficients)[0] - last.term.offset_db
+
+    def changed(links: LinkData, numbers: np.ndarray) -> AppliedEffect:
+        params = variation.params(np.clip(numbers, variation.low, variation.high))
+        return AppliedEffect(last.effect, params, last.effect.term(links, params, model.level_at))
+
+    def acted_db(links: LinkData, numbers: np.ndarray) -> np.ndarray:
+        there = changed(links, numbers)
+        if last.effect.stage != "receiver":
+            return there.term.offset_db
+        through = response([there], "receiver", slice(None))
+        assert through is not None
+        return sum((through(np.full(len(links), level_db))[0] for level_db in EXTREMES_DB),
+                   start=np.zeros(len(links)))
+
+    every = np.flatnonzero(model.train)
+    trained = model.links.select(every)
+    for member in variation.members or ():
+        moved = numbers.copy()
+        moved[member] += variation.steps[member]
+        acts = acted_db(trained, moved) != acted_db(trained, numbers)
+        rows = subsample(every[acts], MAX_LINKS_OF_MEMBER)
+        if not len(rows):
+            continue
+        latest = None
+        links = model.links.select(rows)
+        others = [replace(each, term=each.term.select(rows)) for each in model.effects[:-1]]
+        alone = replace(model.with_effects([]).regression(rows), law_columns=np.ones((len(rows), 1)),
+                        prior_sd_db=np.full(1, ANY_LEVEL_SD_DB))
+
+        def objective(values: np.ndarray, member: np.ndarray = member, rows: np.ndarray = rows,
+                      links: LinkData = links, others: list[AppliedEffect] = others,
+                      alone: censored_regression.CensoredRegression = alone) -> float:
+            nonlocal latest
+            tried = numbers.copy()
+            tried[member] = np.clip(values, variation.low[member], variation.high[member])
+            there = changed(links, tried)
+            outside = np.abs((values - tried[member]) / variation.steps[member]).sum()
+            latest = censored_regression.fit(
+                replace(alone, law_db=arriving_db[rows] + there.term.offset_db,
+                        receiver=response([*others, there], "receiver", slice(None))), latest)
+            return latest.objective + OUTSIDE_NATS * outside
+
+        numbers[member] = _descend(objective, numbers[member], variation.steps[member])
+    return _better(model, result, last, variation, numbers)
+
+
+def _descend(objective: Callable[[np.ndarray], float], values: np.ndarray,
+             steps: np.ndarray) -> np.ndarray:
+    """Minimise by Brent's method, or that of Nelder and Mead (1965) for more than one number."""
+    if len(values) == 1:
+        around = (values[0] - steps[0], values[0] + steps[0])
+        return minimize_scalar(lambda value: objective(np.array([value])), around, method="brent",
+                               options={"xtol": 1e-3, "maxiter": EVALUATIONS}).x[None]
+    simplex = np.vstack([values, values + np.diag(steps)])
+    options = {"initial_simplex": simplex, "maxfev": EVALUATIONS * len(simplex), "xatol": 1e-2,
+               "fatol": 0.1}
+    return minimize(objective, values, method="Nelder-Mead", options=options).x
+
+
+def _better(model: FoldModel, result: FitResult, last: AppliedEffect, variation: Variation,
+            numbers: np.ndarray) -> tuple[FoldModel, FitResult]:
+    """Return the model with the last effect's numbers changed, where that is better."""
+    params = variation.params(np.clip(numbers, variation.low, variation.high))
+    better = model.with_effects([*model.effects[:-1], model.apply(last.effect, params)])
+    fitted = better.fit(result)
+    prior = last.effect.neg_log_prior(last.params) - last.effect.neg_log_prior(params)
+    gain = result.objective - fitted.objective + model.view(result).design_effect * prior
+    return (better, fitted) if gain > 0 else (model, result)

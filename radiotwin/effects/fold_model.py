@@ -1,0 +1,243 @@
+"""A channel and the effects found so far, as one regression on one set of training links.
+
+This is the one place where the level of a link is put together: the channel's mean, its refitted
+level and slope, and every stage of the effects. Selection, localisation and the twin's predictions
+all use it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from radiotwin.channel import ChannelModel
+from radiotwin.effects.base import DetectionEffect, Effect, LimitEffect, Term
+from radiotwin.effects.params import EffectParams, Estimate
+from radiotwin.effects.residual_view import ResidualView
+from radiotwin.inference import censored_regression
+from radiotwin.inference.censored_regression import (
+    CensoredRegression,
+    FitResult,
+    Linearisation,
+    Response,
+    covariance,
+)
+from radiotwin.links import LinkData
+
+MIN_RISE_NATS = 1e-3  # of a profile likelihood: a flatter one says nothing of a parameter
+
+
+@dataclass(frozen=True, eq=False)
+class AppliedEffect:
+    """An effect with its parameters, and what it adds to all links of a model."""
+
+    effect: Effect
+    params: Any
+    term: Term
+
+
+@dataclass(frozen=True, eq=False)
+class FittedEffect:
+    """An effect with its parameters (`Effect.Params`) and the coefficients (q,) of its term."""
+
+    effect: Effect
+    params: EffectParams
+    coefficients: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class FoldModel:
+    """All links, of which some are learnt from: one fold, or the whole.
+
+    Attributes:
+        links: n links, with the devices where the channel has them.
+        train: (n,) bool, links that are learnt from.
+        usable: (n,) bool, links to devices that have a position.
+        channel: fitted to the training links.
+        channel_db: (n,) its mean level [dB].
+        level_columns: (n, p0) what of the channel is fitted again, see `ChannelModel.level_columns`.
+        level_prior_sd_db: (p0,) prior standard deviations of it.
+        group: (n,) index of the error scale.
+        dof: degrees of freedom of the errors.
+        effects: found so far.
+    """
+
+    links: LinkData
+    train: np.ndarray
+    usable: np.ndarray
+    channel: ChannelModel
+    channel_db: np.ndarray
+    level_columns: np.ndarray
+    level_prior_sd_db: np.ndarray
+    group: np.ndarray
+    dof: float
+    effects: list[AppliedEffect] = field(default_factory=list)
+
+    @classmethod
+    def build(cls, links: LinkData, channel: ChannelModel, dof: float, *,
+              device_m: np.ndarray | None = None, train: np.ndarray | None = None,
+              channel_db: np.ndarray | None = None) -> FoldModel:
+        """Return a model without effects.
+
+        Args:
+            links: n links.
+            channel: fitted.
+            dof: degrees of freedom of the errors.
+            device_m: (k, 3) where the channel has the devices [m], NaN for one that it has nowhere;
+                None: where the links have them.
+            train: (n,) bool, links to learn from; None: all.
+            channel_db: (n,) the channel's mean level where it is known already [dB].
+        """
+        usable = np.ones(len(links), dtype=bool)
+        if device_m is not None:
+            usable = np.isfinite(device_m).all(axis=1)[links.device]
+            # A stand-in for devices that are nowhere, whose links are not looked at.
+            links = links.with_devices(np.where(np.isfinite(device_m), device_m, 0.0))
+        geometry = links.geometry
+        if channel_db is None:
+            channel_db = channel.predict(geometry)[0]
+        columns, prior_sd_db = channel.level_columns(geometry)
+        return cls(links, usable if train is None else train & usable, usable, channel, channel_db,
+                   columns, prior_sd_db, channel.error_group(geometry), dof)
+
+    def level_at(self, links: LinkData, exact: bool = False) -> np.ndarray:
+        """Return the channel's level (n,) [dB] of any links, quickly or exactly."""
+        channel = self.channel if exact else self.channel.quick
+        return channel.predict(links.geometry)[0]
+
+    def apply(self, effect: Effect, params: Any) -> AppliedEffect:
+        """Return an effect on these links."""
+        return AppliedEffect(effect, params, effect.term(self.links, params, self.level_at))
+
+    def with_effects(self, effects: list[AppliedEffect]) -> FoldModel:
+        """Return the same with other effects."""
+        return replace(self, effects=effects)
+
+    def restrict(self, rows: np.ndarray, effects: list[AppliedEffect]) -> FoldModel:
+        """Return the model of some links (r,), all to be learnt from, with some of its effects."""
+        everything = np.ones(len(rows), dtype=bool)
+        return replace(
+            self, links=self.links.select(rows), train=everything, usable=everything,
+            channel_db=self.channel_db[rows], level_columns=self.level_columns[rows],
+            group=self.group[rows],
+            effects=[replace(each, term=each.term.select(rows)) for each in effects])
+
+    def regression(self, rows: np.ndarray | slice = slice(None)) -> CensoredRegression:
+        """Return the regression on the links of a mask, an index array or a slice."""
+        links, terms = self.links, [each.term for each in self.effects]
+        n = len(self.channel_db[rows])
+        return CensoredRegression(
+            links.level_db[rows], self.limit_db[rows],
+            self.channel_db[rows], self.level_columns[rows], response(self.effects, "paths", rows),
+            sum((term.offset_db[rows] for term in terms), np.zeros(n)),
+            censored_regression.design([term.columns[rows] for term in terms], n),
+            np.concatenate([self.level_prior_sd_db, *(term.prior_sd_db for term in terms)]),
+            self.group[rows], response(self.effects, "receiver", rows), self.dof,
+            self._dropout_probability(rows), self._random_effect_sd_db(rows))
+
+    @cached_property
+    def training(self) -> CensoredRegression:
+        """The regression on the training links."""
+        return self.regression(self.train)
+
+    @cached_property
+    def limit_db(self) -> np.ndarray:
+        """(n,) level below which a link is blank [dB]; -inf where none is known."""
+        declared_db = -np.inf if self.links.limit_db is None else self.links.limit_db
+        limit_db = np.full(len(self.links), declared_db)
+        for each in self.effects:
+            if isinstance(each.effect, LimitEffect):
+                own_db = each.effect.limits_db(self.links, each.params)
+                limit_db = np.maximum(limit_db, own_db)
+        return limit_db
+
+    def fit(self, start: FitResult | None = None) -> FitResult:
+        """Fit to the training links."""
+        return censored_regression.fit(self.training, start)
+
+    def predict(self, result: FitResult) -> Linearisation:
+        """Return mean and scale of the readings of all links, before the limit of detection."""
+        return self.regression().predict(result)
+
+    def view(self, result: FitResult) -> ResidualView:
+        """Return the training links as an effect sees them."""
+        predicted = self.training.predict(result)
+        return ResidualView(self.links.select(self.train), self.training.residual_db(result),
+                            predicted.scale_db, predicted.mean_db, self.level_at,
+                            tuple((each.effect.name, each.params) for each in self.effects))
+
+    @property
+    def coefficient_slices(self) -> list[slice]:
+        """Of each effect: where its coefficients are among all."""
+        widths = [each.term.columns.shape[1] for each in self.effects]
+        ends = np.cumsum([self.level_columns.shape[1], *widths]).tolist()
+        return [slice(first, end) for first, end in zip(ends, ends[1:], strict=False)]
+
+    def fitted_effects(self, result: FitResult) -> tuple[FittedEffect, ...]:
+        """Return the effects with their coefficients, without their terms on these links."""
+        return tuple(FittedEffect(each.effect, each.params, result.coefficients[own])
+                     for each, own in zip(self.effects, self.coefficient_slices, strict=True))
+
+    def estimates(self, result: FitResult) -> list[Estimate]:
+        """Return the uncertainty of each effect, in view of how many links count as one."""
+        design_effect = self.view(result).design_effect
+        sd = design_effect * covariance(self.training, result)
+        return [Estimate(result.coefficients[own], sd[own, own],
+                         np.sqrt(design_effect) * self._profile_widths(number, result))
+                for number, own in enumerate(self.coefficient_slices)]
+
+    def _profile_widths(self, number: int, result: FitResult) -> np.ndarray:
+        """Return (2, r) as `Estimate.profile_widths`, for links that count one each."""
+        applied = self.effects[number]
+        variation = applied.effect.variation(applied.params)
+        if variation is None:
+            return np.zeros((2, 0))
+        widths = np.empty((2, len(variation.values)))
+
+        def objective(numbers: np.ndarray) -> float:
+            effects = list(self.effects)
+            effects[number] = self.apply(applied.effect, variation.params(numbers))
+            return self.with_effects(effects).fit(result).objective
+
+        best = objective(variation.values)
+        for i, step in enumerate(variation.steps):
+            for row, sign in enumerate((-1.0, 1.0)):
+                numbers = variation.values.copy()
+                numbers[i] = np.clip(numbers[i] + sign * step, variation.low[i], variation.high[i])
+                rise = max(objective(numbers) - best, MIN_RISE_NATS)
+                widths[row, i] = step / np.sqrt(2 * rise)
+        return widths
+
+    def _dropout_probability(self, rows: np.ndarray | slice) -> np.ndarray | float:
+        """Return (n,) the probability of a blank whatever the level; 0 without such effects."""
+        kept: np.ndarray | float = 1.0
+        for each in self.effects:
+            if isinstance(each.effect, DetectionEffect):
+                links = self.links.select(rows)
+                kept = kept * (1.0 - each.effect.dropout_probability(links, each.params))
+        return 1.0 - kept
+
+    def _random_effect_sd_db(self, rows: np.ndarray | slice) -> np.ndarray | float:
+        """Return (n,) the sd of what was learnt of other links only; 0 where there is none."""
+        variances = [each.term.random_effect_sd_db[rows] ** 2 for each in self.effects
+                     if each.term.random_effect_sd_db is not None]
+        return np.sqrt(sum(variances))
+
+
+def response(effects: list[AppliedEffect], stage: str, rows: np.ndarray | slice) -> Response | None:
+    """Return the response of all effects of a stage, one after the other; None without any."""
+    effects = [each for each in effects if each.effect.stage == stage]
+    if not effects:
+        return None
+    inputs = [None if each.term.inputs is None else each.term.inputs[rows] for each in effects]
+
+    def chained(level_db: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        slope = np.ones_like(level_db)
+        for each, own_inputs in zip(effects, inputs, strict=True):
+            level_db, own = each.effect.response(level_db, each.params, own_inputs)  # type: ignore[attr-defined]
+            slope = slope * own
+        return level_db, slope
+    return chained

@@ -1,0 +1,85 @@
+"""Every effect that is looked for: the built-in catalogue, and what installed packages add.
+
+A package adds effects under the entry-point group `radiotwin.effects`; a script adds one with
+`register`. Candidates compete by what held-out links say, so the order means nothing.
+"""
+
+import warnings
+from importlib.metadata import entry_points
+
+from radiotwin.effects.base import Effect
+from radiotwin.effects.body_shadowing import BodyShadowing
+from radiotwin.effects.clock_offset import ReceiverClockOffset
+from radiotwin.effects.detection_limit import DetectionLimit
+from radiotwin.effects.excess_attenuation import ExcessAttenuation
+from radiotwin.effects.foliage import Foliage
+from radiotwin.effects.gain_drift import DeviceDrift, ReceiverDrift
+from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
+from radiotwin.effects.ground_reflection import GroundReflection
+from radiotwin.effects.interference import Interference
+from radiotwin.effects.lock_loss import LockLoss
+from radiotwin.effects.missing_obstacle import MissingObstacle
+from radiotwin.effects.noise_floor import NoiseFloor
+from radiotwin.effects.path_strength import Diffraction, WallReflection
+from radiotwin.effects.position_errors import DevicePositionError, ReceiverPositionError
+from radiotwin.effects.receiver_saturation import ReceiverSaturation
+from radiotwin.effects.removed_obstacle import RemovedObstacle
+from radiotwin.effects.sector_antenna import SectorAntenna
+from radiotwin.effects.tilted_dipole import TiltedDipole
+from radiotwin.errors import BadInput
+
+ENTRY_POINTS = "radiotwin.effects"
+BUILT_IN: tuple[type[Effect], ...] = (
+    DeviceGainOffset, ReceiverGainOffset, DeviceDrift, ReceiverDrift, ReceiverSaturation,
+    NoiseFloor, DetectionLimit, SectorAntenna, TiltedDipole, BodyShadowing, ExcessAttenuation,
+    DevicePositionError, ReceiverPositionError, ReceiverClockOffset, MissingObstacle,
+    RemovedObstacle, Foliage, WallReflection, Diffraction, GroundReflection, Interference, LockLoss)
+
+_registered: list[type[Effect]] = []
+
+
+def register(effect: type[Effect]) -> type[Effect]:
+    """Add an effect to the catalogue of this process; usable as a decorator.
+
+    Raises:
+        BadInput: not an effect, or its name and variant are taken.
+    """
+    if not (isinstance(effect, type) and issubclass(effect, Effect)):
+        raise BadInput(f"{effect!r} is not a subclass of radiotwin.effects.Effect")
+    if effect not in _registered:
+        taken = {(each.name, each.variant): each for each in (*BUILT_IN, *_registered)}
+        if (effect.name, effect.variant) in taken:
+            other = taken[effect.name, effect.variant]
+            raise BadInput(f"the effect {effect.name!r} ({effect.variant!r}) of {effect.__module__} "
+                           f"is in {other.__module__} already; give it another name or variant")
+        _registered.append(effect)
+    return effect
+
+
+def catalogue() -> tuple[type[Effect], ...]:
+    """Return all effects: built-in, of installed packages, and registered.
+
+    Warns where a package's effect cannot be loaded, and goes on without it.
+    """
+    for point in entry_points(group=ENTRY_POINTS):
+        try:
+            register(point.load())
+        except Exception as error:  # noqa: BLE001  # whatever a stranger's package raises
+            warnings.warn(f"the effect {point.name!r} of the package {point.value!r} cannot be "
+                          f"used ({type(error).__name__}: {error})", stacklevel=2)
+    return (*BUILT_IN, *_registered)
+
+
+def effect_named(name: str, variant: str) -> Effect:
+    """Return a new instance of an effect.
+
+    Raises:
+        BadInput: no such effect is installed.
+    """
+    for effect in catalogue():
+        if (effect.name, effect.variant) == (name, variant):
+            return effect()
+    known = ", ".join(sorted({effect.name for effect in catalogue()}))
+    raise BadInput(f"the twin has the effect {name!r} ({variant}), which this version of radiotwin "
+                   f"does not know; it knows {known}; an effect of a package's own needs that "
+                   "package to be installed")

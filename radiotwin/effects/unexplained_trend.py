@@ -1,0 +1,116 @@
+"""`unexplained_trend`, a last resort: the residual as a smooth curve over one variable.
+
+It describes on which variable the residual still depends, and how; it explains nothing. It is no
+candidate among the effects, because it would fit part of whatever they model; and a map, which has
+no heading and no time, is drawn without it.
+"""
+
+import numpy as np
+from pydantic import Field
+from typing_extensions import override
+
+from radiotwin.effects.arrays import LinkCache
+from radiotwin.effects.base import GainEffect, Term
+from radiotwin.effects.params import EffectParams, Estimate, Parameter
+from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.links import LinkData, residual_variables
+
+KNOTS = 8
+PRIOR_SD_DB = 5.0  # of the value at a knot
+MAX_CURVES = 10  # receivers that may have a curve each
+MIN_KNOWN = 0.5  # share of the links with a value
+CIRCULAR = ("azimuth_deg", "body_azimuth_deg", "heading_deg")
+
+
+class UnexplainedTrend(GainEffect):
+    """A curve over one variable, the same for all receivers or one for each."""
+
+    name = "unexplained_trend"
+    nlos_only = True  # may be: its cause is unknown
+    of_receiver = True
+    is_cause = False
+
+    class Params(EffectParams):
+        """Knots and receivers of the curves."""
+
+        knots: list[float] = Field(description="Values of the variable, ascending.")
+        receivers: list[int | None] = Field(
+            description="Indices of the receivers with a curve each; [None] is one for all.")
+
+    def __init__(self, variable: str) -> None:
+        """Make the effect for a variable of `residual_variables`."""
+        self.variable = variable
+        self.variant = f"over {variable}"  # type: ignore[misc]  # one class for every variable
+        self._values = LinkCache()
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        value = self._value(view.links, view.level_at)
+        known = np.isfinite(value)
+        if known.mean() < MIN_KNOWN or np.ptp(value[known]) < 1e-9:
+            return []
+        receivers = np.unique(view.links.receiver).tolist()
+        choices = [[None], *([receivers] if 1 < len(receivers) <= MAX_CURVES else [])]
+        knots = _knots(self.variable, value[known])
+
+        def rating(params: UnexplainedTrend.Params) -> float:
+            term = self.term(view.links, params, view.level_at)
+            return view.score(term) - term.columns.shape[1]  # (Akaike 1974)
+
+        return [max((self.Params(knots=knots, receivers=members) for members in choices),
+                    key=rating)]
+
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        hats = _hats(self._value(links, level_at), np.array(params.knots),
+                     self.variable in CIRCULAR)
+        columns = [hats if member is None else hats * (links.receiver == member)[:, None]
+                   for member in params.receivers]
+        return Term.of_columns(np.hstack(columns), PRIOR_SD_DB)
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        curves = np.reshape(estimate.coefficients, (len(params.receivers), -1))
+        result = {}
+        for member, curve in zip(params.receivers, curves):
+            label = self.variable
+            if member is not None:
+                label += f", {links.receiver_names[member]}"
+            result[f"rise_and_fall_db[{label}]"] = Parameter(float(np.ptp(curve)), np.nan, np.nan,
+                                                             "dB")
+        return result
+
+    def _value(self, links: LinkData, level_at: LevelAt) -> np.ndarray:
+        """Return the variable (n,)."""
+        return self._values.get(
+            links, (level_at,), lambda: residual_variables(links, level_at(links))[self.variable])
+
+
+def _knots(name: str, value: np.ndarray) -> list[float]:
+    """Return knots round the circle, or at evenly spaced quantiles of the values."""
+    if name in CIRCULAR:
+        return (np.arange(KNOTS) * 360.0 / KNOTS).tolist()
+    return np.unique(np.quantile(value, (np.arange(KNOTS) + 0.5) / KNOTS)).tolist()
+
+
+def _hats(value: np.ndarray, knots: np.ndarray, circular: bool) -> np.ndarray:
+    """Return the piecewise linear basis (n, knots) of values (n,).
+
+    It is constant beyond the outer knots, and zero where the value is unknown.
+    """
+    known = np.isfinite(value)
+    filled = np.where(known, value, knots[0])
+    if circular:
+        position = filled % 360 / 360 * len(knots)
+        left = np.floor(position).astype(int) % len(knots)
+        right, share = (left + 1) % len(knots), position % 1
+    else:
+        position = np.interp(filled, knots, np.arange(len(knots)))
+        left = np.minimum(np.floor(position).astype(int), len(knots) - 1)
+        right, share = np.minimum(left + 1, len(knots) - 1), position - left
+    hats = np.zeros((len(value), len(knots)))
+    rows = np.arange(len(value))
+    np.add.at(hats, (rows, left), 1 - share)
+    np.add.at(hats, (rows, right), share)
+    return hats * known[:, None]

@@ -1,0 +1,1 @@
+"""Censored robust regression, folds, evidence, intervals: mathematics that knows no radio."""

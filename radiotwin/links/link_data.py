@@ -1,0 +1,238 @@
+"""Measured links as numbers: what was read, where both ends were, and all that a residual may depend on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.constants import speed_of_light
+
+from radiotwin.links.geometry import REFERENCE_DISTANCE_M, LinkGeometry
+from radiotwin.scene.citymap import CityMap
+
+ROOF_SAMPLES = 60  # points along a link at which the roofs below it are looked up
+ROOF_CHUNK = 5000  # links a time: bounds the memory of that to 10 MB
+
+Tracks = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
+"""(receiver, flight) -> times (t,) in order [s] and positions (t, 3) then [m]."""
+
+_OF_EACH_LINK = ("level_db", "receiver_m", "device", "receiver", "flight", "time_s", "heading_deg",
+                 "pitch_deg", "roll_deg", "quality", "known_los", "time_in_flight_s")
+
+
+@dataclass(frozen=True, eq=False)
+class LinkData:
+    """n links, as arrays; made by `radiotwin.links.prepare_links` from measurements.
+
+    Attributes:
+        level_db: (n,) measured gain [dB] or power [dBm]; NaN = not detected.
+        limit_db: level below which receivers do not detect [dB]; None where it is unknown.
+        receiver_m: (n, 3) positions of the receivers [m].
+        device_m: (k, 3) positions of the devices as far as they are known [m]; NaN where not.
+        device, receiver, flight: (n,) index into the names.
+        time_s: (n,) NaN where unknown.
+        heading_deg: (n,) clockwise from north; NaN where unknown.
+        device_names, receiver_names, flight_names: the names.
+        frequency_hz: of the radio [Hz]; NaN where unknown.
+        city: 3D map; None without a scene.
+        is_gain: whether the level is a gain rather than a power.
+        anchors: indices of the devices whose positions are declared.
+        notes: what the data's checks found and did about it, a sentence each.
+        pitch_deg, roll_deg: (n,) nose up, and right side down, are positive; None if unknown.
+        quality: (n,) as the receiver reports it; None if it does not.
+        known_los: (n,) bool, line of sight where it is known already; None: from the map.
+        time_in_flight_s: (n,) since the first measurement of the track [s].
+        first_s, last_s: time of the first and the last measurement [s]; NaN without times. They, and
+            `tracks`, stay those of all the data when links are selected.
+        tracks: where each receiver was in each flight; only links with a time count.
+    """
+
+    level_db: np.ndarray
+    limit_db: float | None
+    receiver_m: np.ndarray
+    device_m: np.ndarray
+    device: np.ndarray
+    receiver: np.ndarray
+    flight: np.ndarray
+    time_s: np.ndarray
+    heading_deg: np.ndarray
+    device_names: list[str]
+    receiver_names: list[str]
+    flight_names: list[str]
+    frequency_hz: float
+    city: CityMap | None
+    is_gain: bool
+    anchors: frozenset[int]
+    notes: list[str] = field(default_factory=list)
+    pitch_deg: np.ndarray | None = None
+    roll_deg: np.ndarray | None = None
+    quality: np.ndarray | None = None
+    known_los: np.ndarray | None = None
+    time_in_flight_s: np.ndarray = None  # type: ignore[assignment]  # filled in below, as the rest
+    first_s: float = None  # type: ignore[assignment]
+    last_s: float = None  # type: ignore[assignment]
+    tracks: Tracks = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        timed = np.isfinite(self.time_s).any()
+        derived: dict[str, Any] = {
+            "first_s": lambda: float(np.nanmin(self.time_s)) if timed else np.nan,
+            "last_s": lambda: float(np.nanmax(self.time_s)) if timed else np.nan,
+            "time_in_flight_s": self._time_in_flight_s, "tracks": self._tracks}
+        for name, derive in derived.items():
+            if getattr(self, name) is None:
+                object.__setattr__(self, name, derive())
+
+    def __len__(self) -> int:
+        return len(self.level_db)
+
+    @classmethod
+    def synthetic(cls, device_m: np.ndarray, device: np.ndarray, receiver_m: np.ndarray, *,
+                  device_names: Sequence[str], limit_db: float | None, frequency_hz: float,
+                  city: CityMap | None, is_gain: bool, anchors: frozenset[int]) -> LinkData:
+        """Return links that nobody measured: receiver, flight, time and heading are unset.
+
+        Args:
+            device_m: (k, 3) positions of the devices [m].
+            device: (n,) index of each link's device.
+            receiver_m: (n, 3) positions of the receivers [m].
+            device_names: k names.
+            limit_db, frequency_hz, city, is_gain, anchors: as the attributes.
+        """
+        n = len(receiver_m)
+        unset, unknown = np.full(n, -1), np.full(n, np.nan)
+        return cls(unknown, limit_db, receiver_m, device_m, device, unset, unset, unknown, unknown,
+                   list(device_names), [], [], frequency_hz, city, is_gain, anchors)
+
+    @cached_property
+    def geometry(self) -> LinkGeometry:
+        """The links as channel models see them."""
+        estimated = ~np.isin(self.device, sorted(self.anchors))
+        return LinkGeometry(self.device_m[self.device], self.receiver_m, self.los, self.device,
+                            self.city, self.frequency_hz, estimated)
+
+    @cached_property
+    def track(self) -> np.ndarray:
+        """(n,) index of the flight of a receiver that a link was measured on."""
+        key = self.flight * (self.receiver.max() + 1) + self.receiver
+        return np.unique(key, return_inverse=True)[1]
+
+    @cached_property
+    def offset_m(self) -> np.ndarray:
+        """(n, 3) from the device to the receiver [m]."""
+        return self.receiver_m - self.device_m[self.device]
+
+    @cached_property
+    def distance_m(self) -> np.ndarray:
+        """(n,) at least `REFERENCE_DISTANCE_M` [m]."""
+        return np.maximum(np.linalg.norm(self.offset_m, axis=1), REFERENCE_DISTANCE_M)
+
+    @cached_property
+    def azimuth_deg(self) -> np.ndarray:
+        """(n,) direction from the device to the receiver, clockwise from north [deg]."""
+        return np.degrees(np.arctan2(self.offset_m[:, 0], self.offset_m[:, 1])) % 360
+
+    @cached_property
+    def elevation_deg(self) -> np.ndarray:
+        """(n,) angle at the device up to the receiver [deg]."""
+        return np.degrees(np.arcsin(np.clip(self.offset_m[:, 2] / self.distance_m, -1, 1)))
+
+    @cached_property
+    def body_azimuth_deg(self) -> np.ndarray:
+        """(n,) direction from the receiver to the device, clockwise from its heading [deg]."""
+        return (self.azimuth_deg + 180 - self.heading_deg) % 360
+
+    @cached_property
+    def los(self) -> np.ndarray:
+        """(n,) bool; without a map every link has line of sight."""
+        if self.known_los is not None:
+            return self.known_los
+        if self.city is None:
+            return np.ones(len(self), dtype=bool)
+        return self.city.line_of_sight(self.device_m[self.device], self.receiver_m)
+
+    @cached_property
+    def receiver_axes(self) -> np.ndarray:
+        """(n, 3, 3) unit vectors of the receiver's right, nose and top; NaN without a heading."""
+        heading, pitch, roll = (
+            np.radians(np.zeros(len(self)) if angle is None else angle) for angle in
+            (self.heading_deg, *(angle if angle is None else np.nan_to_num(angle)
+                                 for angle in (self.pitch_deg, self.roll_deg))))
+        level, zero = np.cos(pitch), np.zeros(len(self))
+        nose = np.column_stack([np.sin(heading) * level, np.cos(heading) * level, np.sin(pitch)])
+        right = np.column_stack([np.cos(heading), -np.sin(heading), zero])
+        top = np.cross(right, nose)
+        lean, upright = np.sin(roll)[:, None], np.cos(roll)[:, None]
+        return np.stack([upright * right - lean * top, nose, upright * top + lean * right], axis=1)
+
+    @cached_property
+    def metres_inside(self) -> np.ndarray:
+        """(n,) length of the link within buildings [m]; 0 without a map."""
+        if self.city is None:
+            return np.zeros(len(self))
+        return self.city.metres_inside(self.device_m[self.device], self.receiver_m)
+
+    @cached_property
+    def diffraction_parameter(self) -> np.ndarray:
+        """(n,) the greatest ν (ITU-R P.526-15, Eq. 26) over the roofs; NaN without a map."""
+        greatest = np.full(len(self), np.nan)
+        if self.city is None or np.isnan(self.frequency_hz):
+            return greatest
+        wavelength_m = speed_of_light / self.frequency_hz
+        share = (np.arange(ROOF_SAMPLES) + 0.5)[:, None] / ROOF_SAMPLES
+        for start in range(0, len(self), ROOF_CHUNK):
+            rows = slice(start, start + ROOF_CHUNK)
+            a_m, b_m = self.device_m[self.device[rows], None], self.receiver_m[rows, None]
+            on_link_m = a_m + share * (b_m - a_m)
+            over_m = self.city.height_at(on_link_m[..., 0], on_link_m[..., 1]) - on_link_m[..., 2]
+            length_m = self.distance_m[rows, None]
+            near_m, far_m = length_m * share[:, 0], length_m * (1 - share[:, 0])
+            nu = over_m * np.sqrt(2 * length_m / (wavelength_m * near_m * far_m))
+            greatest[rows] = nu.max(axis=1)
+        return greatest
+
+    def select(self, rows: np.ndarray | slice) -> LinkData:
+        """Return the links of a mask, a slice or an index array."""
+        values = {name: getattr(self, name) for name in _OF_EACH_LINK}
+        values["known_los"] = self.los
+        return replace(self, **{name: value[rows] for name, value in values.items()
+                                if value is not None})
+
+    def with_devices(self, device_m: np.ndarray) -> LinkData:
+        """Return the same links with the devices at (k, 3) [m]."""
+        return replace(self, device_m=device_m, known_los=None)
+
+    def with_receivers(self, receiver_m: np.ndarray) -> LinkData:
+        """Return the same links with the receivers at (n, 3) [m]."""
+        return replace(self, receiver_m=receiver_m, known_los=None)
+
+    def with_los(self, los: np.ndarray) -> LinkData:
+        """Return the same links with lines of sight (n,) other than the map's."""
+        return replace(self, known_los=los)
+
+    def with_city(self, city: CityMap | None) -> LinkData:
+        """Return the same links over another map."""
+        return replace(self, city=city, known_los=None)
+
+    def _time_in_flight_s(self) -> np.ndarray:
+        if np.isnan(self.time_s).all():
+            return self.time_s
+        first = np.full(self.track.max() + 1, np.inf)
+        np.minimum.at(first, self.track, np.where(np.isnan(self.time_s), np.inf, self.time_s))
+        return self.time_s - first[self.track]
+
+    def _tracks(self) -> Tracks:
+        found: Tracks = {}
+        timed = np.flatnonzero(np.isfinite(self.time_s))
+        keys = (self.time_s[timed], self.flight[timed], self.receiver[timed])
+        order = timed[np.lexsort(keys)]
+        ends = np.column_stack([self.receiver[order], self.flight[order]])
+        starts = np.flatnonzero(np.diff(ends, axis=0).any(axis=1)) + 1
+        for rows in np.split(order, starts) if len(order) else ():
+            time_s, first = np.unique(self.time_s[rows], return_index=True)
+            key = int(self.receiver[rows[0]]), int(self.flight[rows[0]])
+            found[key] = time_s, self.receiver_m[rows[first]]
+        return found

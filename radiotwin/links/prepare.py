@@ -1,0 +1,157 @@
+"""Measurements joined with devices, 3D map and radio: checked, and without what cannot be used."""
+
+import numpy as np
+import pandas as pd
+
+from radiotwin.errors import BadInput
+from radiotwin.links.checks import (
+    MIN_LINKS,
+    check_names,
+    check_positions,
+    find_fill_value,
+    refuse_empty_levels,
+    unheard_devices,
+    useless_receivers,
+)
+from radiotwin.links.link_data import LinkData
+from radiotwin.measurements import Measurements
+from radiotwin.scene import Scene
+
+MAX_EXTENT_M = 100_000.0  # farther apart, two ends are not of one campaign and frame
+ASSUMED_HEIGHT_M = 1.5  # of an end whose height is blank: a hand-held phone's
+
+
+def join_links(measurements: Measurements, scene: Scene) -> LinkData:
+    """Join all measurements with a scene as they are: nothing is checked, nothing left out.
+
+    Args:
+        measurements: n links.
+        scene: the 3D map, the radio and the receivers' sensitivity.
+
+    Returns:
+        n links; positions of unknown devices are NaN in x and y, whatever the file gives.
+    """
+    device_m = measurements.device_m.copy()
+    device_m[~measurements.is_anchor, :2] = np.nan
+    return _link_data(measurements, measurements.table.reset_index(drop=True), scene,
+                      measurements.level_db, measurements.receiver_m, device_m,
+                      measurements.device_index, np.arange(len(device_m)), [])
+
+
+def prepare_links(measurements: Measurements, scene: Scene | None,
+                  to_locate: bool = False) -> LinkData:
+    """Join measurements with a scene, leave out what cannot be used, and note what was left out.
+
+    Args:
+        measurements: links.
+        scene: the 3D map and the radio, if there is one.
+        to_locate: whether devices are to be located and nothing is to be learnt. Then unknown
+            devices are kept where there is no scene, and so are few links, and receivers that heard
+            nothing: that tells a position, too.
+
+    Returns:
+        the links that can be used; their `notes` say what was found odd, a sentence each.
+
+    Raises:
+        BadInput: nothing that can be used is left, or positions or levels that cannot be what they
+            are said to be.
+    """
+    table = measurements.table.reset_index(drop=True)
+    level_db, receiver_m = measurements.level_db, measurements.receiver_m
+    device_index = measurements.device_index
+    refuse_empty_levels(level_db, measurements.level_column)
+    notes: list[str] = []
+    keep = np.ones(len(table), dtype=bool)
+
+    def leave_out(bad: np.ndarray, why: str) -> None:
+        bad = np.asarray(bad) & keep
+        if bad.any():
+            notes.append(f"{bad.sum():,} of {len(table):,} links left out: {why}")
+            keep[bad] = False
+
+    declared_z_m = measurements.device_m[:, 2]
+    device_m = np.where(measurements.is_anchor[:, None], measurements.device_m, np.nan)
+    device_m[:, 2] = np.where(np.isnan(declared_z_m), ASSUMED_HEIGHT_M, declared_z_m)
+    notes += check_names(measurements) + check_positions(receiver_m, device_m, scene)
+    from_middle_m = np.abs(receiver_m[:, :2] - np.median(receiver_m[:, :2], axis=0)).max(axis=1)
+    leave_out(from_middle_m > MAX_EXTENT_M,
+              f"their receiver is more than {MAX_EXTENT_M / 1000:.0f} km from the others")
+    from_device_m = np.abs(receiver_m[:, :2] - device_m[device_index, :2]).max(axis=1)
+    leave_out(from_device_m > MAX_EXTENT_M, f"their receiver is more than {MAX_EXTENT_M / 1000:.0f}"
+              " km from the device; both need one frame, in metres")
+    if "time_s" in table:  # without a time, equal rows may be equal measurements
+        twice = table.duplicated().to_numpy() & table["time_s"].notna().to_numpy()
+        leave_out(twice, "they are in the file twice")
+    low_z = np.isnan(receiver_m[:, 2])
+    if low_z.any() and scene is not None:
+        leave_out(low_z, "their receiver's height is empty, and the 3D map needs it")
+    elif low_z.any():
+        notes.append(f"{low_z.sum():,} receiver heights are empty and taken for "
+                     f"{ASSUMED_HEIGHT_M} m")
+        receiver_m = np.where(np.isnan(receiver_m), ASSUMED_HEIGHT_M, receiver_m)
+    flat = np.isnan(declared_z_m).sum()
+    if flat:
+        notes.append(f"{flat:,} device heights are empty and taken for {ASSUMED_HEIGHT_M} m")
+    placed = np.asarray(np.isfinite(device_m).all(axis=1) | (scene is not None) | to_locate)
+    leave_out(~placed[device_index],
+              "without a scene, devices of unknown position cannot be located")
+    for bad, why in [] if to_locate else useless_receivers(table, level_db, keep):
+        leave_out(bad, why)
+    fill_db, share = find_fill_value(level_db[keep])
+    if fill_db is not None:
+        at_fill = (level_db == fill_db) & keep
+        level_db = np.where(at_fill, np.nan, level_db)
+        notes.append(f"{at_fill.sum():,} links read exactly {fill_db:g}, the lowest value, "
+                     f"{share:.0%} of all: taken for not detected")
+    leave_out(*unheard_devices(table, level_db, keep))
+    least, heard = 1 if to_locate else MIN_LINKS, int(np.isfinite(level_db[keep]).sum())
+    if keep.sum() < least or heard < least // 2:
+        raise BadInput(f"{int(keep.sum())} links can be used, {heard} of them detected; at least "
+                       f"{least} are needed, {least // 2} of them detected: "
+                       + ("; ".join(notes) or "measure more"))
+    refuse_empty_levels(level_db[keep], measurements.level_column)
+    device = (np.cumsum(placed) - 1)[device_index[keep]]
+    return _link_data(measurements, table[keep], scene, level_db[keep], receiver_m[keep],
+                      device_m[placed], device, np.flatnonzero(placed), notes)
+
+
+def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,
+               level_db: np.ndarray, receiver_m: np.ndarray, device_m: np.ndarray,
+               device: np.ndarray, kept_devices: np.ndarray, notes: list[str]) -> LinkData:
+    """Join rows that are kept already; `kept_devices` (k,) are rows of the table of devices."""
+    receiver, receiver_names = pd.factorize(table["receiver"], sort=True)
+    flight, flight_names = pd.factorize(table["flight"])
+    heading_deg = _column(table, "heading_deg")
+    turned = np.abs(heading_deg) > 360
+    if turned.any():
+        notes.append(f"{turned.sum():,} headings lie beyond 360° (such as "
+                     f"{heading_deg[turned][0]:g}) and are taken for their remainder; heading_deg "
+                     "is in degrees, clockwise from north")
+    is_gain = measurements.level_column == "gain_db"
+    anchors = frozenset(np.flatnonzero(measurements.is_anchor[kept_devices]).tolist())
+    return LinkData(
+        level_db, _limit_db(level_db, scene, is_gain), receiver_m, device_m, device, receiver,
+        flight, _column(table, "time_s"), heading_deg % 360,
+        list(measurements.devices["device"].iloc[kept_devices]), list(receiver_names),
+        list(flight_names), _frequency_hz(measurements, scene), scene.city if scene else None,
+        is_gain, anchors, notes, _column(table, "pitch_deg"), _column(table, "roll_deg"),
+        _column(table, "quality"))
+
+
+def _limit_db(level_db: np.ndarray, scene: Scene | None, is_gain: bool) -> float | None:
+    if scene is not None:
+        return scene.config.gain_limit_db if is_gain else scene.config.radio.sensitivity_dbm
+    # Without a scene nobody declares it; nothing detected lies below the lowest that was.
+    return float(np.nanmin(level_db)) if np.isnan(level_db).any() else None
+
+
+def _frequency_hz(measurements: Measurements, scene: Scene | None) -> float:
+    if scene is not None:
+        return scene.config.radio.frequency_hz
+    if "frequency_hz" in measurements.devices:
+        return float(measurements.devices["frequency_hz"].median())
+    return float("nan")
+
+
+def _column(table: pd.DataFrame, name: str) -> np.ndarray:
+    return table[name].to_numpy(dtype=float) if name in table else np.full(len(table), np.nan)

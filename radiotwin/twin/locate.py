@@ -1,0 +1,111 @@
+"""Devices of unknown position in a file of measurements, located by a corrected twin."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from radiotwin.errors import BadInput
+from radiotwin.links import prepare_links
+from radiotwin.localize import locate, whole_area
+from radiotwin.measurements import Measurements
+from radiotwin.scene import Scene
+from radiotwin.twin.twin import Twin
+
+MAX_NAMED = 5  # receivers in a note
+
+
+def check_can_locate(twin: Twin, scene: Scene | None) -> None:
+    """Check that a twin can locate devices outside its own fit.
+
+    Args:
+        twin: made by `close-loop`.
+        scene: the 3D map that devices are to be located with.
+
+    Raises:
+        BadInput: it was not, it follows paths, or it was fitted with a map and none is given, or the
+            other way round.
+    """
+    if twin.channel.follows_paths:
+        raise BadInput("the twin's base is 'raytrace', and following paths from every position where "
+                       "a device may be takes too long; `radiotwin fit --model raytrace` locates "
+                       "devices along with the twin, and close-loop --base twin makes one for locate")
+    if twin.fitted is None:
+        raise BadInput("the twin was not made by `radiotwin close-loop`, or by an earlier version of "
+                       "it; run that on measurements of devices whose positions are known")
+    twin.require_map(scene)
+
+
+def locate_file(measurements: Measurements, twin: Twin, scene: Scene | None,
+                on_progress: Callable[[], None]) -> tuple[pd.DataFrame, list[str]]:
+    """Locate the devices of role unknown.
+
+    Args:
+        measurements: their links, and others.
+        twin: made by `close-loop`.
+        scene: the 3D map, if the twin was made with one.
+        on_progress: called after each device.
+
+    Returns:
+        a row a device: `device, x_m, y_m, radius_m` (of 90 % of the probability), `links`; and notes
+        on the data.
+
+    Raises:
+        BadInput: a twin that cannot locate, no unknown device, links of another quantity than the
+            twin's, or nothing that can be used.
+    """
+    check_can_locate(twin, scene)
+    model = twin.fitted
+    assert model is not None
+    unknown = measurements.select(~measurements.is_anchor[measurements.device_index])
+    if unknown.table.empty:
+        raise BadInput("no link is to a device of role unknown; set the role of those that are to be "
+                       "found in devices.csv")
+    if unknown.level_column != twin.level:
+        raise BadInput(f"the measurements have {unknown.level_column}, the twin is of {twin.level}; "
+                       "both need the same")
+    links = prepare_links(unknown, scene, to_locate=True)
+    strangers = [name for name in links.receiver_names if name not in model.receivers]
+    notes = list(links.notes)
+    if strangers:
+        others = " and others" if len(strangers) > MAX_NAMED else ""
+        notes.append(f"nothing is known of receivers {', '.join(strangers[:MAX_NAMED])}{others}: "
+                     "they are taken for faultless ones")
+    every = [*model.receivers, *strangers]
+    number = np.array([every.index(name) for name in links.receiver_names])
+    links = replace(links, receiver=number[links.receiver], receiver_names=every, tracks=None,
+                    device_m=np.nan_to_num(links.device_m),
+                    # A few links do not tell how weak a level can be detected.
+                    limit_db=links.limit_db if twin.limit_db is None else twin.limit_db)
+    area_m = scene.config.extent.bounds if scene is not None else whole_area(model, links)
+    found = list(locate(model, links, area_m, on_progress))
+    table = pd.DataFrame({"device": [links.device_names[each.device] for each in found],
+                          "x_m": [each.x_m for each in found], "y_m": [each.y_m for each in found],
+                          "radius_m": [each.radius_m for each in found],
+                          "links": [each.links for each in found]})
+    return table.round(1), notes
+
+
+def position_errors(positions: pd.DataFrame, truth: pd.DataFrame) -> dict[str, float]:
+    """Return how far located devices are from their true positions.
+
+    Args:
+        positions: as of `locate_file`.
+        truth: `device, x_m, y_m`.
+
+    Returns:
+        number of devices, median and 90 % quantile of the distance [m], and the share of devices
+        within their radius.
+
+    Raises:
+        BadInput: no located device has a true position.
+    """
+    both = positions.merge(truth[["device", "x_m", "y_m"]].dropna(), on="device",
+                           suffixes=("", "_true"))
+    if both.empty:
+        raise BadInput("the table of true positions has none of the located devices")
+    error_m = np.hypot(both["x_m"] - both["x_m_true"], both["y_m"] - both["y_m_true"])
+    return {"devices": len(both), "median_m": float(error_m.median()),
+            "ninety_m": float(error_m.quantile(0.9)),
+            "within": float((error_m <= both["radius_m"]).mean())}

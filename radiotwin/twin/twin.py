@@ -1,0 +1,206 @@
+"""The twin: a channel, the positions of all devices, and the effects and errors fitted upon them."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+import radiotwin
+from radiotwin.channel import ChannelModel
+from radiotwin.channel.regression_kriging import RegressionKriging
+from radiotwin.channel.residual_field import ResidualField
+from radiotwin.effects.correlated_shadowing import NAME as SHADOWING
+from radiotwin.effects.effect_model import EffectModel
+from radiotwin.effects.fold_model import FittedEffect
+from radiotwin.errors import BadInput
+from radiotwin.inference.gaussian import detection_probability
+from radiotwin.links import LinkData
+from radiotwin.links.prediction import Prediction
+from radiotwin.localize import TwinDevice
+from radiotwin.progress import progress
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.twin.store import read_twin, write_twin
+
+CHUNK, CHUNK_WITH_EFFECTS = 200_000, 20_000  # links predicted at once: bounds memory
+
+
+@dataclass(frozen=True, eq=False)
+class Twin:
+    """A learnt model of all links of a scene.
+
+    Attributes:
+        channel: fitted.
+        devices: in the order of the measurements' `devices.csv`.
+        level: `gain_db`, or `rssi_dbm` where transmit power is unknown.
+        limit_db: level below which receivers do not detect [dB]; None where it was not known.
+        provenance: measurements, scene, seed and version that made it.
+        fitted: levels, effects and errors fitted upon the channel; None where `close-loop` did not
+            look and the channel does not need levels.
+    """
+
+    channel: ChannelModel
+    devices: list[TwinDevice]
+    level: str
+    limit_db: float | None
+    provenance: dict = field(default_factory=dict)
+    fitted: EffectModel | None = None
+
+    @property
+    def device_m(self) -> np.ndarray:
+        """(k, 3) positions [m]; NaN where a device could not be located."""
+        positions_m = [(each.x_m, each.y_m, each.z_m) for each in self.devices]
+        return np.array(positions_m, dtype=float).reshape(-1, 3)
+
+    @property
+    def effects(self) -> tuple[FittedEffect, ...]:
+        """Effects that `close-loop` found."""
+        return self.fitted.effects if self.fitted else ()
+
+    @property
+    def is_corrected(self) -> bool:
+        """Whether effects or interpolated shadowing were added to it."""
+        return bool(self.effects) or (self.fitted is not None and self.fitted.shadowing is not None)
+
+    @property
+    def residual_field(self) -> ResidualField | None:
+        """What the twin interpolates of its residual; None where it does not."""
+        if isinstance(self.channel, RegressionKriging):
+            return self.channel.field
+        if self.fitted is not None and self.fitted.shadowing is not None:
+            return self.fitted.shadowing.field
+        return None
+
+    @property
+    def description(self) -> str:
+        """Channel and effects, in one line."""
+        names = [each.effect.name for each in self.effects]
+        if self.fitted is not None and self.fitted.shadowing is not None:
+            names.append(SHADOWING)
+        return self.channel.name + (f" with {', '.join(names)}" if names else "")
+
+    def links(self, receiver_m: np.ndarray, device: np.ndarray, scene: Scene) -> LinkData:
+        """Return links that nobody measured: receiver, flight and time unset.
+
+        Args:
+            receiver_m: (n, 3) positions of the receivers [m].
+            device: (n,) row of each link's device in `devices`.
+            scene: the 3D map and the radio.
+        """
+        anchors = frozenset(i for i, each in enumerate(self.devices) if each.role == "anchor")
+        return LinkData.synthetic(
+            np.nan_to_num(self.device_m), device, receiver_m, limit_db=self.limit_db,
+            device_names=[each.device for each in self.devices],
+            frequency_hz=scene.config.radio.frequency_hz, city=scene.city,
+            is_gain=self.level == "gain_db", anchors=anchors)
+
+    def predict(self, links: LinkData) -> Prediction:
+        """Return the levels that are expected of links.
+
+        Args:
+            links: n links, with the twin's devices; measured ones with the twin's receivers, or
+                `Twin.links`, whose receivers are faultless.
+
+        Returns:
+            of n links.
+        """
+        size = CHUNK_WITH_EFFECTS if self.fitted else CHUNK
+        chunks = [links] if len(links) <= size else [
+            links.select(slice(start, start + size)) for start in range(0, len(links), size)]
+        return Prediction.concatenate([self._predict(chunk) for chunk in chunks])
+
+    def _predict(self, links: LinkData) -> Prediction:
+        if self.fitted is not None:
+            return self.fitted.predict(links)
+        mean_db, sd_db = self.channel.predict(links.geometry)
+        limit_db = -np.inf if links.limit_db is None else links.limit_db
+        return Prediction(mean_db, sd_db, detection_probability(mean_db, sd_db, limit_db))
+
+    def radio_map(self, scene: Scene) -> RadioMap:
+        """Return mean and standard deviation of the level over a scene's lattice.
+
+        For all devices that have a position, at faultless receivers. The mean is given below
+        sensitivity, too; attribute `gain_limit_db` says where detection ends. Where the twin
+        interpolates its residual, `shadowing_share` and `shadowing_length_m` are the variance's share
+        and the correlation length of that (Gudmundson 1991).
+
+        Raises:
+            BadInput: the twin was fitted without a 3D map.
+        """
+        self.require_map(scene)
+        scene_hash = scene.content_hash()
+        self.warn_of_another_scene(scene, scene_hash)
+        known = np.flatnonzero(np.isfinite(self.device_m).all(axis=1))
+        receiver_m = scene.lattice.positions_m
+        shape = (len(known), len(receiver_m))
+        mean_db, sd_db, los = np.empty(shape), np.empty(shape), np.empty(shape, dtype=bool)
+        with progress("mapping", total=len(known)) as advance:
+            for row, device in enumerate(known):
+                for start in range(0, len(receiver_m), CHUNK):
+                    part = slice(start, start + CHUNK)
+                    ends_m = receiver_m[part]
+                    links = self.links(ends_m, np.full(len(ends_m), device), scene)
+                    predicted = self.predict(links)
+                    mean_db[row, part], sd_db[row, part] = predicted.mean_db, predicted.sd_db
+                    los[row, part] = links.los
+                advance(1)
+        if self.level == "rssi_dbm":
+            mean_db -= scene.config.radio.tx_power_dbm
+        attributes = {"source": f"twin:{self.description}",
+                      "frequency_hz": scene.config.radio.frequency_hz,
+                      "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene_hash,
+                      "radiotwin_version": radiotwin.__version__}
+        if self.residual_field is not None:
+            attributes |= {"shadowing_share": self.residual_field.share,
+                           "shadowing_length_m": self.residual_field.length_m}
+        names = [self.devices[i].device for i in known]
+        return RadioMap.build(names, scene.lattice, mean_db, los, sd_db, attributes)
+
+    def save(self, folder: Path | str) -> None:
+        """Write the twin's folder, whole or not at all.
+
+        Raises:
+            BadInput: the folder exists and is not a twin's.
+        """
+        write_twin(folder, self.channel, self.devices, self.level, self.limit_db, self.provenance,
+                   self.fitted)
+
+    @classmethod
+    def load(cls, folder: Path | str) -> Twin:
+        """Read a twin's folder.
+
+        Raises:
+            BadInput: not a twin's folder, a damaged one, or effects that are not installed.
+        """
+        return cls(**read_twin(folder))
+
+    def warn_of_another_scene(self, scene: Scene, scene_hash: str) -> None:
+        """Warn where the twin was learnt in another scene than one with this hash."""
+        if self.provenance.get("scene_hash") not in (None, scene_hash):
+            warnings.warn(f"the twin was learnt in another scene ({self.provenance.get('scene')}) "
+                          f"than {scene.folder}, or this one has changed since: geometry, radio or "
+                          "declared devices differ", stacklevel=3)
+
+    def require_map(self, scene: Scene | None) -> None:
+        """Check that the twin was fitted with a 3D map exactly where one is given now.
+
+        Levels that were fitted to each class of line of sight need a map, and one level for all
+        links cannot use one.
+
+        Raises:
+            BadInput: it was not.
+        """
+        if self.fitted is None or self.channel.follows_paths or not self.channel.uses_map:
+            return
+        with_map = len(self.fitted.level_coefficients) > 2  # a level and a slope for each class
+        if with_map and scene is None:
+            raise BadInput(f"the twin was made with a 3D map (scene "
+                           f"{self.provenance.get('scene', 'unknown')}), and none is given; give it "
+                           "with --scene")
+        if scene is not None and not with_map:
+            raise BadInput(f"the twin was made without a 3D map, and cannot use that of "
+                           f"{scene.folder}: locate devices without --scene, or run close-loop with "
+                           "--scene first")

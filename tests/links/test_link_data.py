@@ -1,0 +1,112 @@
+"""What is left out of a file, and that it is told."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from radiotwin.closeloop.folds import evidence_blocks, make_folds
+from radiotwin.links.link_data import prepare_links
+from radiotwin.errors import BadInput
+from radiotwin.scene.citymap import CityMap
+
+
+def test_what_cannot_be_used_is_left_out_and_told(open_ground):
+    measurements = open_ground.measured(open_ground.fly(0, limit_db=-500.0))
+    table = measurements.table
+    n = len(table)
+    table.loc[0, "receiver_x_m"] = 5.9e6
+    table.loc[1] = table.loc[2]
+    table.loc[3:5, "receiver"] = "broken"
+    table.loc[6:40, "receiver"] = "dead"
+    table.loc[6:40, "gain_db"] = np.nan
+    table.loc[41:60, "receiver"] = "stuck"
+    table.loc[41:60, "gain_db"] = -77.0
+    links = prepare_links(measurements, None)
+    assert len(links) == n - 1 - 1 - 3 - 35 - 20 and links.receiver_names == ["r0", "r1"]
+    told = " ".join(links.notes)
+    for part in ("more than 100 km", "twice", "broken has 3 only", "dead never detected", "stuck always reads -77"):
+        assert part in told, part
+
+
+def test_a_receiver_that_heard_once_is_not_stuck_and_equal_rows_without_a_time_are_measurements(open_ground):
+    measurements = open_ground.measured(open_ground.fly(0, limit_db=-500.0))
+    table, n = measurements.table, len(measurements.table)
+    table.loc[:19, "receiver"] = "far"
+    table.loc[:18, "gain_db"] = np.nan
+    table.loc[30] = table.loc[31]
+    assert len(prepare_links(measurements, None)) == n - 1
+    table["time_s"] = np.nan
+    links = prepare_links(measurements, None)
+    assert len(links) == n and links.receiver_names == ["far", "r0", "r1"] and links.notes == []
+
+
+def test_a_value_that_stands_for_not_detected_becomes_blank(open_ground):
+    world = open_ground.fly(1)
+    measurements = open_ground.measured(world)
+    blank = measurements.table["gain_db"].isna()
+    lowest = measurements.table["gain_db"].nsmallest(300).index
+    measurements.table.loc[blank, "gain_db"] = -140.0
+    measurements.table.loc[lowest, "gain_db"] = -140.0
+    links = prepare_links(measurements, None)
+    assert np.isnan(links.level_db).sum() == blank.sum() + 300 and "-140" in " ".join(links.notes)
+    assert prepare_links(open_ground.measured(world), None).notes == []  # an ordinary tail stays
+
+
+def test_directions_are_compass_bearings(open_ground):
+    world = open_ground.fly(2)
+    links = prepare_links(open_ground.measured(world), None)
+    east, north = links.offset_m[:, 0], links.offset_m[:, 1]
+    rows = (np.abs(east) < 30) & (north > 100)
+    assert rows.any() and (np.abs((links.azimuth_deg[rows] + 180) % 360 - 180) < 20).all()
+    # A receiver that flies straight away from the device has it behind itself.
+    away = np.abs((links.heading_deg - links.azimuth_deg + 180) % 360 - 180) < 5
+    assert away.any() and (np.abs(links.body_azimuth_deg[away] - 180) < 5.01).all()
+
+
+def test_flights_are_held_out_where_they_are_alike_and_places_where_not(open_ground):
+    world = open_ground.fly(3)
+    links = prepare_links(open_ground.measured(world), None)
+    folds = make_folds(links, 0)
+    assert folds.by == "flight"
+    for flight in range(6):
+        assert len(np.unique(folds.index[links.flight == flight])) == 1
+    walks = [f"{device}-{receiver}" for device, receiver in zip(world.device, world.receiver)]
+    one = prepare_links(open_ground.measured(world, flight=walks), None)
+    folds = make_folds(one, 0)
+    assert folds.by == "block" and folds.count == 6
+    cell = np.floor(one.receiver_m[:, :2] / 60).astype(int)
+    for place in np.unique(cell, axis=0)[:40]:
+        assert len(np.unique(folds.index[(cell == place).all(axis=1)])) == 1
+    sizes = np.bincount(folds.index)
+    assert sizes.max() < 1.3 * sizes.min()
+
+
+def test_a_piece_of_evidence_is_of_one_device_receiver_and_flight(open_ground):
+    links = prepare_links(open_ground.measured(open_ground.fly(4)), None)
+    block = evidence_blocks(links)
+    for index in (links.device, links.receiver, links.flight):
+        pairs = np.unique(np.column_stack([block, index]), axis=0)
+        assert len(pairs) == block.max() + 1
+
+
+def test_too_little_is_refused(open_ground):
+    measurements = open_ground.measured(open_ground.fly(5))
+    with pytest.raises(BadInput, match="at least 60 are needed"):
+        prepare_links(measurements.select(np.arange(len(measurements.table)) < 40), None)
+
+
+def test_what_stands_in_the_way_is_measured_along_the_link(open_ground):
+    """A wall 10 m thick and 30 m high, in the middle of links of 100 m that pass 20 m below its top and 10 m above."""
+    city = trimesh.creation.box(extents=[10, 400, 30])
+    city.apply_translation([0, 0, 15])
+    links = prepare_links(open_ground.measured(open_ground.fly(0)), None).select(np.arange(2))
+    links = replace(links, device_m=np.array([[-50.0, 0, 10], [-50, 0, 40]]), device=np.array([0, 1]),
+                      receiver_m=np.array([[50.0, 0, 10], [50, 0, 40]]), frequency_hz=2.4e9,
+                      city=CityMap(city.vertices, city.faces))
+    np.testing.assert_allclose(links.metres_inside, [10, 0], atol=0.01)
+    wavelength_m = 299_792_458 / 2.4e9
+    assert links.diffraction_parameter[0] == pytest.approx(20 * np.sqrt(2 / wavelength_m * 2 / 50), rel=0.01)
+    # Beside the wall the ground is 40 m below, near an end, where the zones are narrow: the roof is what counts.
+    assert links.diffraction_parameter[1] == pytest.approx(-10 * np.sqrt(2 / wavelength_m * 2 / 50), rel=0.01)
