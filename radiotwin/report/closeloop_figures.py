@@ -1,4 +1,4 @@
-"""Draw the figures of a close-loop: error step by step, residual against variables, maps, effects."""
+"""Draw the figures of a close-loop: error step by step, dependence of the residual, maps."""
 
 import textwrap
 from pathlib import Path

@@ -117,9 +117,9 @@ def affected_links_figure(effect: EffectData, background: MapBackground) -> Figu
                               linewidths=0.8, alpha=0.6, zorder=2)
         rays.set_clim(-range_db, range_db)
         ax.add_collection(rays, autolim=False)
-        dots = ax.scatter(*background.moving_m[order, :2].T, c=residual_db[order], s=12,
-                          cmap=RESIDUAL_COLOURS, vmin=-range_db, vmax=range_db, linewidths=0.2,
-                          edgecolors="0.3", zorder=3)
+        x_m, y_m = background.moving_m[order, :2].T
+        dots = ax.scatter(x_m, y_m, c=residual_db[order], s=12, cmap=RESIDUAL_COLOURS,
+                          vmin=-range_db, vmax=range_db, linewidths=0.2, edgecolors="0.3", zorder=3)
         ax.set(xlim=frame[:2], ylim=frame[2:])
         mark(ax, effect)
         error = f"{_rmse_db(residual_db[rows]):.2f} dB" if len(rows) else "none was detected"

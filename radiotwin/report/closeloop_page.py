@@ -1,4 +1,4 @@
-"""Make the page of a close-loop, or its part of a run's page, from the content of `closeloop.json`."""
+"""Make the page of a close-loop, or its part of a run's page, from `closeloop.json`."""
 
 from collections import Counter
 from pathlib import Path
@@ -103,7 +103,8 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
     pictures = [read_picture(folder / name, title, text) for name, title, text in FIGURES]
     return {
         "lead": summary(report), "verdict": verdict, "cards": _cards(report),
-        "figures": [picture for picture in pictures if picture], "effects": _effects(report, folder),
+        "figures": [picture for picture in pictures if picture],
+        "effects": _effects(report, folder),
         "errors": _error_table(report, ("los",)),
         "errors_by_member": _error_table(report, ("device", "receiver", "flight")),
         "trials": f"{len(candidates)} trials in {len({c['step'] for c in candidates})} steps",
@@ -155,7 +156,7 @@ def _driver_names(drivers: list[dict]) -> list[str]:
 
 
 def _evidence(effect: dict) -> str:
-    """Describe the form of an effect, its evidence, and the effects that it may be confused with."""
+    """Describe the form of an effect, its evidence, and what it may be confused with."""
     text = f"{effect['variant'].capitalize()}. " if effect.get("variant") else ""
     evidence = effect["evidence"]
     text += (f"It raises the log-likelihood of the held-out links by "
@@ -172,7 +173,7 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
     """Return errors before and after for groups of links, and of other models for all links."""
     rows: list[list[str]] = []
     others = report["baselines"] if "los" in kinds else {}
-    columns = list(dict.fromkeys([*COLUMNS, *(key for scores in others.values() for key in scores)]))
+    columns = list(dict.fromkeys([*COLUMNS, *(key for each in others.values() for key in each)]))
     groups = [("all links", report["error"])] if "los" in kinds else []
     for kind in kinds:
         group = report["error"].get(f"by_{kind}", {})

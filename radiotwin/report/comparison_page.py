@@ -40,8 +40,8 @@ def _summary(comparison: Comparison) -> str:
     if not {"segmented_nn", "log_distance"} <= set(rmse_db.index) & set(located.index):
         return ""
     median_m = located["median_m"]
-    return ("Fitted to a few flights, the twin predicts the gain over the whole map with an RMSE of "
-            f"{rmse_db['segmented_nn']:.1f} dB (log-distance model: {rmse_db['log_distance']:.1f} "
-            "dB) and locates the unknown devices with a median error of "
-            f"{median_m['segmented_nn']:.1f} m (log-distance model: "
+    return ("Fitted to a few flights, the twin predicts the gain over the whole map with an RMSE "
+            f"of {rmse_db['segmented_nn']:.1f} dB (log-distance model: "
+            f"{rmse_db['log_distance']:.1f} dB) and locates the unknown devices with a median "
+            f"error of {median_m['segmented_nn']:.1f} m (log-distance model: "
             f"{median_m['log_distance']:.1f} m).")

@@ -246,7 +246,7 @@ def _limits(links_db: np.ndarray, means_db: np.ndarray) -> tuple[float, float]:
 
 
 def _with_legend(figure: Figure, axes: list[Axes], effect: EffectData) -> Figure:
-    """Add the legend above the panels, with a note where only links with line of sight are shown."""
+    """Add the legend above the panels, with a note where only LoS links are shown."""
     if axes:
         los = effect.links.los
         los_only = los[effect.shown].all() and not los.all()

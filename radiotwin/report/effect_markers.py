@@ -55,7 +55,7 @@ def _mark_move(ax: Axes, effect: EffectData) -> Label | None:
     device, move_m = effect.params["device"], effect.params["move_m"][:2]
     given_m = effect.links.device_m[device, :2]
     estimate_m = given_m + move_m
-    ax.annotate("", estimate_m, given_m, zorder=6, arrowprops={
+    ax.annotate("", tuple(estimate_m), tuple(given_m), zorder=6, arrowprops={
         "arrowstyle": "->", "color": FOUND, "linewidth": 2, "shrinkA": 0, "shrinkB": 4})
     ax.plot(*estimate_m, "*", color=FOUND, markersize=13, markeredgecolor="white", zorder=7)
     name = plain(effect.links.names["device"][device])
@@ -77,6 +77,6 @@ MARKERS: dict[str, Callable[[Axes, EffectData], Label | None]] = {
 def _draw_label(ax: Axes, text: str, position_m: np.ndarray) -> None:
     """Write beside a marker, on the side of the middle of the map."""
     right = position_m[0] < np.mean(ax.get_xlim())
-    ax.annotate(text, position_m, xytext=(14 if right else -14, 12), textcoords="offset points",
-                color=FOUND, fontsize=9, fontweight="bold", ha="left" if right else "right",
-                zorder=7, path_effects=HALO)
+    ax.annotate(text, tuple(position_m), xytext=(14 if right else -14, 12),
+                textcoords="offset points", color=FOUND, fontsize=9, fontweight="bold",
+                ha="left" if right else "right", zorder=7, path_effects=HALO)

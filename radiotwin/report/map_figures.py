@@ -67,7 +67,7 @@ def radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
             ax.set(xlabel="", xticklabels=[])
     figure.colorbar(image, ax=axes, label="channel gain [dB]", shrink=0.7)
     source = radio_map.dataset.attrs.get("source", "")
-    figure.suptitle(f"{source} at {radio_map.lattice.z_m[0]:g} m")
+    figure.suptitle(f"{source} at {radio_map.lattice.z_m[0]:g} m (triangle: device)")
     return figure
 
 
@@ -90,7 +90,7 @@ def model_maps_figure(truth: RadioMap, models: dict[str, RadioMap], scene: Scene
     axes[1, 0].set_axis_off()
     axes[1, 0].text(
         0.02, 0.5, f"device {device}\nat {truth.lattice.z_m[0]:g} m altitude\n\n"
-        "top: channel gain\nbottom: model − truth\n\nwhite: not detected\n\n"
+        "top: channel gain\nbottom: model − truth\ntriangle: device\nwhite: not detected\n\n"
         "models: mean of\nthe detected levels", transform=axes[1, 0].transAxes, fontsize=11)
     for column, (name, radio_map) in enumerate(models.items(), start=1):
         model_db = comparable_db(radio_map, truth)[radio_map.devices.index(device), 0]

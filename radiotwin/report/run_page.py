@@ -15,7 +15,7 @@ from radiotwin.report.html import Table, read_picture, write_page
 from radiotwin.report.layers import bounds_m, device_layer, flight_layer, link_layer, map_layers
 from radiotwin.report.run_folder import Run
 
-SCALES = {"gain": "viridis", "sigma": "cividis", "residual": "coolwarm", "link": "coolwarm_r"}
+SCALES = {"gain": "viridis", "sigma": "cividis", "error": "coolwarm", "link": "coolwarm_r"}
 LOS_COLOURS = [[209, 73, 91], [42, 127, 158]]  # RGB of no and of line of sight
 
 
@@ -76,8 +76,8 @@ def _planning(run: Run) -> dict[str, Any] | None:
     rows = [[row.method, "" if row.trained_in != row.trained_in else row.trained_in,
              f"{row.real_episodes:,}", f"{row.truth_ratio:.3f}"]
             for row in run.planning.itertuples()]
-    return {"table": Table(("method", "trained in", "real episodes", "collected in the truth"), rows,
-                           "Share of all data that is collected in the truth", 2),
+    columns = ("method", "trained in", "real episodes", "collected in the truth")
+    return {"table": Table(columns, rows, "Share of all data that is collected in the truth", 2),
             "pictures": [
                 read_picture(run.folder / "curve.png", "Collected data over real episodes"),
                 read_picture(run.folder / "trajectories.png", "Trajectories of one flight")]}

@@ -60,7 +60,8 @@ def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
 
 def test_names_from_the_data_are_no_markup(tmp_path):
     text = page(report(), tmp_path)
-    for written in ("device &lt;b&gt;", "step (r&lt;0&gt;)", "receiver &lt;i&gt; has 3 only", "Close-loop of &lt;x&gt;"):
+    for written in ("device &lt;b&gt;", "step (r&lt;0&gt;)", "receiver &lt;i&gt; has 3 only",
+                    "Close-loop of &lt;x&gt;"):
         assert written in text
     assert "<i>" not in text and "<x>" not in text
 
