@@ -10,7 +10,8 @@ import xarray
 
 import radiotwin as rt
 from radiotwin import llvm
-from radiotwin.export import write_csv, write_picture
+from radiotwin.export import write_csv
+from radiotwin.report import write_picture
 
 out = Path("city_to_map")
 rt.build_preset("small", out / "scene")

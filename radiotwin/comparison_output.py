@@ -1,59 +1,70 @@
-"""What a comparison leaves in its folder: tables as CSV and JSON, and figures."""
+"""Read the models that a comparison is asked for, and write its tables."""
 
 import json
 import warnings
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from radiotwin.compare import Comparison
 from radiotwin.errors import BadInput
-from radiotwin.figures import draw_estimates, draw_maps, draw_scatter
 from radiotwin.files import atomic_path
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin
 
 SCHEMA = "radiotwin.comparison/1"
-SHOWN = ("log_distance", "segmented_nn")
 
 
 def judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
                ) -> tuple[dict[str, Twin], dict[str, RadioMap]]:
-    """Twins and radio maps that a user wants in the tables, by the names of their files.
+    """Read twins and radio maps that are to be compared with the models.
 
-    Warns where a twin has been fitted to one of the `held_out` flights already.
+    Warns where a twin was fitted to one of the held-out flights.
+
+    Args:
+        paths: folders of twins, and files of radio maps.
+        truth: map of reference gains; None: there is none.
+        held_out: names of the held-out flights.
+
+    Returns:
+        twins and maps, by their paths
 
     Raises:
-        BadInput: neither a twin's folder nor a radio map, or a map with no truth to hold it against.
+        BadInput: neither a twin's folder nor a radio map, or a map without a truth.
     """
     twins, maps = {}, {}
     for path in paths:
         if path.is_dir():
             twins[str(path)] = Twin.load(path)
-            seen = sorted(set(twins[str(path)].provenance.get("flights", [])) & set(held_out))
+            fitted_to = set(twins[str(path)].provenance.get("flights", []))
+            seen = sorted(fitted_to & set(held_out))
             if seen:
-                warnings.warn(f"{path} was fitted to {', '.join(seen[:4])}, which is held out here: its error on "
-                              "held-out flights is too good", stacklevel=2)
+                warnings.warn(
+                    f"{path} was fitted to {', '.join(seen[:4])}, which is held out here: its "
+                    "error on held-out flights is too good", stacklevel=2)
         elif truth is None:
-            raise BadInput(f"{path}: a radio map can only be judged on a whole map; give --truth, too")
+            raise BadInput(f"{path}: a radio map can only be judged on a whole map; give --truth, "
+                           "too")
         else:
             maps[str(path)] = RadioMap.read(path)
     return twins, maps
 
 
-def write_comparison(comparison: Comparison, scene: Scene, truth: RadioMap | None, folder: Path | str) -> None:
-    """Write `compare.json`, `scores.csv`, `locations.csv`, `predictions.csv.gz` and the figures into a folder.
+def write_comparison(comparison: Comparison, scene: Scene, folder: Path | str) -> None:
+    """Write the tables of a comparison.
 
     Args:
-        comparison: to write.
-        scene: drawn under the figures.
-        truth: with it, maps are drawn, too.
-        folder: made if needed; files of the same names are replaced.
+        comparison: result of `compare_models`.
+        scene: whose name is recorded.
+        folder: for `compare.json`, `scores.csv`, `locations.csv` and `predictions.csv.gz`; made if
+            needed, files of these names are replaced.
     """
     folder = Path(folder)
-    record = {"schema": SCHEMA, "scene": scene.config.name, "scores": _records(comparison.scores),
-              "locations": _records(comparison.locations), "location_summary": _records(comparison.location_summary())}
+    record = {"schema": SCHEMA, "scene": scene.config.name, "scores": _rows(comparison.scores),
+              "locations": _rows(comparison.locations),
+              "location_summary": _rows(comparison.location_summary())}
     with atomic_path(folder / "compare.json") as temporary:
         temporary.write_text(json.dumps(record, indent=1, allow_nan=False), encoding="utf-8")
     for name, table in (("scores.csv", comparison.scores), ("locations.csv", comparison.locations),
@@ -61,21 +72,9 @@ def write_comparison(comparison: Comparison, scene: Scene, truth: RadioMap | Non
         with atomic_path(folder / name) as temporary:
             table.to_csv(temporary, index=False, float_format="%.4f",
                          compression="gzip" if name.endswith(".gz") else None)
-    draw_scatter(comparison, list(comparison.twins), folder / "scatter.png")
-    if len(comparison.locations) and comparison.locations["error_m"].notna().all():
-        draw_estimates(comparison, list(SHOWN), scene, folder / "estimates.png")
-    if truth is not None:
-        maps = {name: comparison.twins[name].radio_map(scene) for name in reversed(SHOWN)}
-        draw_maps(truth, maps, scene, typical_device(truth, maps), folder / "maps.png")
 
 
-def typical_device(truth: RadioMap, maps: dict[str, RadioMap]) -> str:
-    """The device whose share of LoS is nearest to the mean of all that every map has: neither best nor worst case."""
-    devices = [d for d in truth.devices if all(d in radio_map.devices for radio_map in maps.values())]
-    los = np.array([truth.los[truth.devices.index(d)].mean() for d in devices])
-    return devices[int(np.abs(los - los.mean()).argmin())]
-
-
-def _records(table) -> list[dict]:
+def _rows(table: pd.DataFrame) -> list[dict]:
+    """Return the rows of a table for JSON; numbers that are not finite are null."""
     return [{key: None if isinstance(value, float) and not np.isfinite(value) else value
              for key, value in row.items()} for row in table.to_dict("records")]

@@ -6,8 +6,7 @@ from pathlib import Path
 from radiotwin.compare import Comparison, compare_models, split_flights
 from radiotwin.comparison_output import write_comparison
 from radiotwin.errors import BadInput
-from radiotwin.export import write_picture
-from radiotwin.report import read_run, write_report
+from radiotwin.report import read_run, write_comparison_figures, write_picture, write_report
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions, build_scene
 from radiotwin.scene.presets import build_preset
@@ -48,7 +47,8 @@ def run_demo(source: str, folder: Path | str, *, seed: int, say: Callable[[str],
     comparison = compare_models(train, test, scene, truth, seed=seed)
     comparison.twins["segmented_nn"].save(folder / "twin")
     say("5 drawing")
-    write_comparison(comparison, scene, truth, folder / "comparison")
+    write_comparison(comparison, scene, folder / "comparison")
+    write_comparison_figures(comparison, scene, truth, folder / "comparison")
     write_report(read_run(folder), folder / "report.html")
     return comparison
 

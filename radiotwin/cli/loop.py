@@ -32,14 +32,13 @@ def close_loop(
     """Find what the model lacks, add it, and say by how much the error falls."""
     from radiotwin.closeloop.corrected_twin import corrected_twin
     from radiotwin.closeloop.corrected_scene import check_corrected_target, write_corrected_scene
-    from radiotwin.closeloop.figures import draw_figures
-    from radiotwin.closeloop.page import lead, write_page
     from radiotwin.closeloop.result_file import make_report, write_report
     from radiotwin.closeloop.residual_table import write_residuals
     from radiotwin.closeloop.run import close_loop as run
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
     from radiotwin.progress import progress
+    from radiotwin.report import summary, write_closeloop_figures, write_closeloop_page
     from radiotwin.scene import Scene
     from radiotwin.twin import check_twin_target
 
@@ -53,11 +52,11 @@ def close_loop(
     with progress("closing the loop", total=None) as advance:
         loop = run(data, world, base, seed, lambda text: advance(1, text), hold_out)
     report = make_report(loop) | {"inputs": {"measurements": str(measurements), "scene": scene and str(scene)}}
-    draw_figures(loop, world, report, out)
+    write_closeloop_figures(loop, world, report, out)
     write_report(report, out / "closeloop.json")
     write_residuals(loop, out / "residuals.csv.gz")
     corrected_twin(loop, world).save(out / "twin")
-    write_page(report, out, f"What the model of {measurements.name} lacks")
+    write_closeloop_page(report, out, f"Close-loop report of {measurements.name}")
     for note in report["notes"]:
         say(f"note: {note}")
     error = report["error"]
@@ -68,12 +67,12 @@ def close_loop(
     rows += [[name.replace("_", " "), "", value["rmse_db"], float("nan"), float("nan")]
              for name, value in report["baselines"].items()]
     print_rows(f"Error on held-out links (by {report['heldout']['by']}) [dB], base {report['base']}",
-               {"links": "left", "": "left", "RMSE": "right", "MAE": "right", "mean": "right"}, rows)
-    print_rows("What was missing", {"effect": "left", "parameter": "left", "value": "right", "low": "right",
+               {"links": "left", "": "left", "RMSE": "right", "MAE": "right", "bias": "right"}, rows)
+    print_rows("Effects found", {"effect": "left", "parameter": "left", "value": "right", "low": "right",
                                     "high": "right", "unit": "left"},
                [[effect["name"], name, *(float("nan") if p[k] is None else p[k] for k in ("value", "low", "high")),
                  p["unit"]] for effect in report["effects"] for name, p in effect["parameters"].items()])
-    say(lead(report))
+    say(summary(report))
     say(f"wrote {out / 'closeloop.html'}")
     if write_scene is not None and world is not None:
         changes = write_corrected_scene(loop, world, write_scene)

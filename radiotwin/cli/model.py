@@ -77,21 +77,23 @@ def map_(
     """Predict the gain of every device over the scene's lattice, or write a radio map in another form."""
     from radiotwin.export import EXPORTERS, check_format, select
     from radiotwin.radiomap import RadioMap
+    from radiotwin.report import write_picture
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin
 
     show_warnings_plainly()
+    exporters = EXPORTERS | {".png": write_picture}
     is_map = twin.suffix == ".nc"
     if out is None and is_map:
         raise BadInput(f"{twin} is a radio map already; say with --out in which form it is to be written")
     out = out or twin.resolve().with_name(f"{twin.resolve().name}.nc")
     world = Scene.load(scene)
-    check_format(out, world)
+    check_format(out, world, exporters)
     radio_map = RadioMap.read(twin) if is_map else Twin.load(twin).radio_map(world)
     if is_map:
         _check_place(twin, radio_map.dataset.attrs, world)
     radio_map = select(radio_map, devices.split(",") if devices else None, _altitudes(altitudes))
-    EXPORTERS[out.suffix](radio_map, world, out)
+    exporters[out.suffix](radio_map, world, out)
     say(f"wrote {out}: {len(radio_map.devices)} devices on {radio_map.lattice.shape} positions (z, y, x)")
 
 
@@ -138,6 +140,7 @@ def compare(
     from radiotwin.comparison_output import judge_also, write_comparison
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
+    from radiotwin.report import write_comparison_figures
     from radiotwin.scene import Scene
 
     show_warnings_plainly()
@@ -148,7 +151,8 @@ def compare(
     twins, maps = judge_also(also or [], truth_map, test.flights)
     models = (*DEFAULT_MODELS, *["raytrace"] * raytrace)
     comparison = compare_models(train, test, world, truth_map, seed=seed, models=models, twins=twins, maps=maps)
-    write_comparison(comparison, world, truth_map, out)
+    write_comparison(comparison, world, out)
+    write_comparison_figures(comparison, world, truth_map, out)
     print_comparison(comparison)
     say(f"wrote {out}")
 

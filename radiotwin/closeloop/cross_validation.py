@@ -74,7 +74,7 @@ class CrossValidatedModel:
         for number, (model, fit) in enumerate(zip(self.folds, self.fits[1:], strict=True)):
             own, reading = self.index == number, model.predict(fit)
             mean_db[own], scale_db[own] = reading.mean_db[own], reading.scale_db[own]
-        shift, left = self._held_out_shadowing()
+        shift, left = self.held_out_shadowing
         return mean_db + shift * scale_db, scale_db * left
 
     @cached_property
@@ -97,8 +97,9 @@ class CrossValidatedModel:
         error = error if rows is None else error[rows]
         return float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else np.nan
 
-    def _held_out_shadowing(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return what shadowing adds (n,) [error scales], and the share left of the scale (n,)."""
+    @cached_property
+    def held_out_shadowing(self) -> tuple[np.ndarray, np.ndarray]:
+        """(n,) what shadowing adds [error scales], and (n,) the share left of the scale."""
         shift, left = np.zeros(len(self.index)), np.ones(len(self.index))
         for number, shadowing in enumerate(self.shadowing[1:]):
             own = np.flatnonzero(self.index == number)

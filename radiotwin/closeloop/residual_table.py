@@ -1,4 +1,4 @@
-"""Held-out residuals of every link, before and after, as a table."""
+"""Write the held-out residuals of all links, before and after, as a table."""
 
 from pathlib import Path
 
@@ -10,24 +10,32 @@ from radiotwin.files import atomic_path
 
 
 def residual_table(loop: Loop) -> pd.DataFrame:
-    """One row a link: where it was, and measured minus predicted on folds that took no part in fitting.
+    """Return held-out residuals, measured − predicted, one row for each link.
 
-    Columns: time_s, flight, receiver, receiver_x_m, …, device, device_x_m, … (as the model has it), los (1, 0),
-    measured_db (dBm for power), before_db, after_db (empty where it was not detected or never held out).
+    Args:
+        loop: result of the close-loop.
+
+    Returns:
+        columns `time_s, flight, receiver, receiver_x_m, receiver_y_m, receiver_z_m, device,
+        device_x_m, device_y_m, device_z_m` (device positions of the model), `los` (1, 0),
+        `measured_db` (dBm for power), `before_db` and `after_db`, NaN where the link was not
+        detected or never held out
     """
-    links = loop.after.whole.links
+    links = loop.after.links
     device_m = links.device_m[links.device]
-    before_db, after_db = (links.level_db - model.held_out_mean_db for model in (loop.before, loop.after))
+    before_db, after_db = (links.level_db - model.held_out_mean_db
+                           for model in (loop.before, loop.after))
     return pd.DataFrame({
         "time_s": links.time_s, "flight": np.array(links.flight_names)[links.flight],
         "receiver": np.array(links.receiver_names)[links.receiver],
         **{f"receiver_{axis}_m": links.receiver_m[:, i] for i, axis in enumerate("xyz")},
         "device": np.array(links.device_names)[links.device],
-        **{f"device_{axis}_m": device_m[:, i] for i, axis in enumerate("xyz")}, "los": links.los.astype(int),
-        "measured_db": links.level_db, "before_db": before_db, "after_db": after_db})
+        **{f"device_{axis}_m": device_m[:, i] for i, axis in enumerate("xyz")},
+        "los": links.los.astype(int), "measured_db": links.level_db, "before_db": before_db,
+        "after_db": after_db})
 
 
 def write_residuals(loop: Loop, path: Path) -> None:
-    """Write `residuals.csv.gz`, whole or not at all."""
+    """Write `residuals.csv.gz`, completely or not at all."""
     with atomic_path(path) as temporary:
         residual_table(loop).to_csv(temporary, index=False, float_format="%.4f", compression="gzip")

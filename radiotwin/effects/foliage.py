@@ -49,7 +49,7 @@ class Foliage(GainEffect):
     """A box of vegetation; one step finds one."""
 
     name = "foliage"
-    figure = "map"
+    figure = "links"
     repeatable = True
     confused_with = ("missing_obstacle", "excess_attenuation", "device_gain_offset",
                      "antenna_pattern")
@@ -67,9 +67,8 @@ class Foliage(GainEffect):
         centres_m, total = back_project(links.device_m[links.device], links.receiver_m, nats)
         allowed = [i for i, height_m in enumerate(HEIGHTS_M)
                    if MIN_HEIGHT_M <= height_m <= MAX_PROPOSED_HEIGHT_M]
-        return [self.Params(box=Box(*centre_m.tolist(), side_m, side_m, HEIGHTS_M[allowed[height]],
-                                    0.0))
-                for centre_m, height, gain in best_cells(centres_m, total[:, allowed], MAX_CELLS)
+        return [self.Params(box=Box(x_m, y_m, side_m, side_m, HEIGHTS_M[allowed[height]], 0.0))
+                for (x_m, y_m), height, gain in best_cells(centres_m, total[:, allowed], MAX_CELLS)
                 if gain > MIN_NATS for side_m in SIDES_M]
 
     @override

@@ -45,7 +45,7 @@ class MissingObstacle(GainEffect):
     """A box that obstructs links; one step finds one."""
 
     name = "missing_obstacle"
-    figure = "map"
+    figure = "links"
     repeatable = True
     confused_with = ("foliage", "antenna_pattern", "device_position_error")
 
@@ -74,8 +74,8 @@ class MissingObstacle(GainEffect):
         centres_m, total = back_project(links.device_m[links.device[rows]], links.receiver_m[rows],
                                         nats)
         side_m = 1.5 * CELL_M
-        return [self.Params(box=Box(*centre_m.tolist(), side_m, side_m, HEIGHTS_M[height], 0.0))
-                for centre_m, height, gain in best_cells(centres_m, total, MAX_PROPOSALS)
+        return [self.Params(box=Box(x_m, y_m, side_m, side_m, HEIGHTS_M[height], 0.0))
+                for (x_m, y_m), height, gain in best_cells(centres_m, total, MAX_PROPOSALS)
                 if gain > MIN_NATS]
 
     @override
@@ -131,9 +131,9 @@ class MissingObstacle(GainEffect):
         low = np.maximum(variation.values - below, variation.low)
         high = np.minimum(variation.values + above, variation.high)
         units = {"turn_deg": "deg", "scattered_db": "dB"}
-        return {name: Parameter(*map(float, interval), units.get(name, "m"))
-                for name, *interval in zip((*Box._fields, "scattered_db"), variation.values, low,
-                                           high, strict=True)}
+        return {name: Parameter(float(value), float(least), float(most), units.get(name, "m"))
+                for name, value, least, most in zip((*Box._fields, "scattered_db"),
+                                                    variation.values, low, high, strict=True)}
 
 
 def _gain_db(crossing: Crossing, scattered: np.ndarray | float,

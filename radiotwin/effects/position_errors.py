@@ -31,7 +31,7 @@ class DevicePositionError(GainEffect):
     """A wrong position of an anchor and of all on its mast; one step finds one, the worst."""
 
     name = "device_position_error"
-    figure = "map"
+    figure = "links"
     repeatable = True
     always_exact = True
     confused_with = ("removed_obstacle", "missing_obstacle", "antenna_pattern",
@@ -110,7 +110,7 @@ class ReceiverPositionError(GainEffect):
     """A constant error of all positions of a receiver; one step finds one receiver, the worst."""
 
     name = "receiver_position_error"
-    figure = "map"
+    figure = "links"
     of_receiver = True
     repeatable = True
     confused_with = ("receiver_gain_offset",)

@@ -29,7 +29,7 @@ class RemovedObstacle(GainEffect):
     """One building of the map; one step finds one."""
 
     name = "removed_obstacle"
-    figure = "map"
+    figure = "links"
     nlos_only = True
     repeatable = True
     confused_with = ("device_position_error",)

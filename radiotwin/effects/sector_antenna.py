@@ -7,6 +7,7 @@ it leaves the device. Power on paths that are not followed, which is fitted too,
 pattern.
 """
 
+from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -80,7 +81,7 @@ class SectorAntenna(GainEffect):
 
     name = "antenna_pattern"
     variant = "sector antenna of a device"
-    figure = "sector_pattern"
+    figure = "pattern"
     repeatable = True
     confused_with = ("device_gain_offset", "device_position_error", "missing_obstacle", "foliage")
 
@@ -117,8 +118,7 @@ class SectorAntenna(GainEffect):
         for device, pattern in params.devices.items():
             rows = np.flatnonzero(links.device == device)
             if len(rows):
-                rays = self._rays.get(links, device,
-                                      lambda rows=rows: _Rays.of(links.select(rows)))
+                rays = self._rays.get(links, device, partial(_Rays.of, links, rows))
                 offset_db[rows] = rays.offset_db(pattern)
         return Term(offset_db, one_hot(links.device, list(params.devices)),
                     np.full(len(params.devices), LEVEL_SD_DB))
@@ -130,7 +130,7 @@ class SectorAntenna(GainEffect):
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
-        reported = {}
+        reported: dict[str, Parameter] = {}
         patterns_sd = np.reshape(estimate.params_sd, (len(params.devices), -1))
         for number, (device, pattern) in enumerate(params.devices.items()):
             name = links.device_names[device]
@@ -164,8 +164,9 @@ class _Rays(NamedTuple):
     free: np.ndarray
 
     @classmethod
-    def of(cls, links: LinkData) -> "_Rays":
-        """Return those of n links, which are followed over the map."""
+    def of(cls, links: LinkData, rows: np.ndarray) -> "_Rays":
+        """Return those of some links, which are followed over the map."""
+        links = links.select(rows)
         if links.city is None:
             return cls(np.ones((len(links), 1)), links.azimuth_deg[:, None],
                        links.elevation_deg[:, None], free_space(links))
@@ -193,16 +194,15 @@ def _best_patterns(view: ResidualView,
         rows = subsample(every, MAX_PROPOSE_LINKS)
         if not len(rows):
             continue
-        pattern, nats = _best_pattern(_Rays.of(view.links.select(rows)), view, rows)
+        pattern, nats = _best_pattern(view, rows)
         if nats * len(every) / len(rows) > MIN_NATS:
             found[device] = pattern, nats * len(every) / len(rows)
     return found
 
 
-def _best_pattern(rays: _Rays, view: ResidualView,
-                  rows: np.ndarray) -> tuple[SectorPattern, float]:
+def _best_pattern(view: ResidualView, rows: np.ndarray) -> tuple[SectorPattern, float]:
     """Return the pattern of a grid that fits links best, and its gain over a level alone [nats]."""
-    residual_db = view.residual_db[rows]
+    rays, residual_db = _Rays.of(view.links, rows), view.residual_db[rows]
     weight = view.weight[rows] * np.isfinite(view.links.level_db[rows])
 
     def nats(offset_db: np.ndarray) -> float:

@@ -7,6 +7,7 @@ which it comes. Power on paths that are not followed, which is fitted too, has t
 pattern.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -65,7 +66,7 @@ class TiltedDipole(GainEffect):
 
     name = "antenna_pattern"
     variant = "tilted dipole of a receiver"
-    figure = "dipole_pattern"
+    figure = "pattern"
     of_receiver = True
     confused_with = ("body_shadowing", "receiver_gain_offset")
 
@@ -104,7 +105,7 @@ class TiltedDipole(GainEffect):
         for receiver, dipole in params.receivers.items():
             rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
             arrivals = self._arrivals.get(links, receiver,
-                                          lambda rows=rows: _Arrivals.of(links.select(rows)))
+                                          partial(_Arrivals.of, links, rows))
             offset_db[rows] = arrivals.offset_db(dipole)
         return offset_db
 
@@ -116,7 +117,7 @@ class TiltedDipole(GainEffect):
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
-        reported = {}
+        reported: dict[str, Parameter] = {}
         dipoles_sd = np.reshape(estimate.params_sd, (len(params.receivers), -1))
         for (receiver, dipole), sd in zip(params.receivers.items(), dipoles_sd, strict=True):
             reported |= report_pattern(dipole, sd, links.receiver_names[receiver],
@@ -159,8 +160,9 @@ class _Arrivals(NamedTuple):
     free: np.ndarray
 
     @classmethod
-    def of(cls, links: LinkData) -> "_Arrivals":
-        """Return those of n links, which are followed over the map."""
+    def of(cls, links: LinkData, rows: np.ndarray) -> "_Arrivals":
+        """Return those of some links, which are followed over the map."""
+        links = links.select(rows)
         if links.city is None:
             return cls(-_unit(links.offset_m)[:, None], np.ones((len(links), 1)),
                        links.receiver_axes, free_space(links))

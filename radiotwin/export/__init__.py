@@ -1,6 +1,6 @@
 """Radio maps as files that other programs read, by the name of the file."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 from radiotwin.errors import BadInput
@@ -10,24 +10,24 @@ from radiotwin.export.tables import write_csv, write_netcdf, write_numpy
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 
-
-def write_picture(radio_map: RadioMap, scene: Scene, path: Path) -> None:
-    """All devices at the lowest altitude, over the city's outlines."""
-    from radiotwin.figures import draw_radio_map
-
-    draw_radio_map(radio_map, scene, path)
-
-
 EXPORTERS: dict[str, Callable[[RadioMap, Scene, Path], None]] = {
-    ".nc": write_netcdf, ".csv": write_csv, ".npz": write_numpy, ".tif": write_geotiff, ".kmz": write_kmz,
-    ".png": write_picture}
+    ".nc": write_netcdf, ".csv": write_csv, ".npz": write_numpy, ".tif": write_geotiff, ".kmz": write_kmz}
 NEED_ORIGIN = (".kmz",)
 
 
-def check_format(path: Path, scene: Scene | None = None) -> None:
-    """Raise BadInput for a file name that no exporter writes, or that needs to know where on the globe `scene` is."""
-    if path.suffix not in EXPORTERS:
-        raise BadInput(f"{path}: unknown format {path.suffix!r}; allowed are {', '.join(EXPORTERS)}")
+def check_format(path: Path, scene: Scene | None = None, formats: Collection[str] = tuple(EXPORTERS)) -> None:
+    """Check that a radio map of a scene can be written to a file.
+
+    Args:
+        path: file to write.
+        scene: scene of the map.
+        formats: suffixes that can be written.
+
+    Raises:
+        BadInput: another suffix, or a format that needs the origin of a scene that has none.
+    """
+    if path.suffix not in formats:
+        raise BadInput(f"{path}: unknown format {path.suffix!r}; allowed are {', '.join(formats)}")
     if scene is not None and path.suffix in NEED_ORIGIN and scene.config.origin is None:
         raise BadInput(f"{path}: Google Earth needs to know where the scene is, and {scene.folder / 'scene.toml'} has "
                        "no [origin]; add one with latitude_deg and longitude_deg of x = y = 0")

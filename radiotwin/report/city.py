@@ -1,4 +1,4 @@
-"""What is drawn of a city: its triangles, or fewer of them where there are too many for a browser."""
+"""Prepare a city for the viewer: its triangles, or blocks where a browser could not draw them."""
 
 import numpy as np
 
@@ -7,33 +7,41 @@ from radiotwin.scene import Scene
 from radiotwin.scene.preview import height_grid
 from radiotwin.scene.surfaces import FLAT_M
 
-MOST_FACES = 80_000
-CELLS = 160  # along the longer side of a city that is drawn as blocks
+MAX_FACES = 80_000
+BLOCK_CELLS = 160  # along the longer side of a city that is drawn as blocks
 
 
 def city_mesh(scene: Scene) -> tuple[dict, str]:
-    """Triangles of the buildings for the page, and a sentence on what was simplified (empty for nothing).
+    """Return the buildings of a scene for the viewer.
 
-    Flat ground is left out. A city with more than `MOST_FACES` triangles is drawn as blocks: the height of its highest
-    surface on a grid.
+    Flat ground is left out. A city of more than `MAX_FACES` triangles is drawn as blocks, each as
+    high as the highest surface in its cell.
+
+    Args:
+        scene: with its 3D map.
+
+    Returns:
+        packed coordinates and faces, and a note on what was simplified (empty for nothing)
     """
     city = scene.city
     keep = city.vertices[city.faces][:, :, 2].max(axis=1) > FLAT_M
-    if keep.sum() <= MOST_FACES:
+    if keep.sum() <= MAX_FACES:
         used, index = np.unique(city.faces[keep], return_inverse=True)
         return _packed(city.vertices[used], index.reshape(-1, 3)), ""
-    height_m, (x_min, x_max, y_min, y_max) = height_grid(scene, CELLS)
-    cell_m = max(x_max - x_min, y_max - y_min) / CELLS
+    height_m, (x_min, x_max, y_min, y_max) = height_grid(scene, BLOCK_CELLS)
+    cell_m = max(x_max - x_min, y_max - y_min) / BLOCK_CELLS
     return _packed(*blocks(height_m, x_min, y_min, cell_m)), (
         f"The city has {keep.sum():,} triangles and is drawn as blocks of {cell_m:.1f} m.")
 
 
-def blocks(height_m: np.ndarray, x_m: float, y_m: float, cell_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """Roofs of a grid's cells, and walls where neighbours differ.
+def blocks(height_m: np.ndarray, x_m: float, y_m: float,
+           cell_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Build roofs over the cells of a grid, and walls where neighbours differ in height.
 
     Args:
-        height_m: (ny, nx), south first [m]; cells up to `FLAT_M` are left open.
-        x_m, y_m: south-west corner [m].
+        height_m: (ny, nx) heights, south first [m]; cells up to `FLAT_M` stay open.
+        x_m: west edge of the grid [m].
+        y_m: south edge of the grid [m].
         cell_m: side of a cell [m].
 
     Returns:
@@ -57,7 +65,7 @@ def blocks(height_m: np.ndarray, x_m: float, y_m: float, cell_m: float) -> tuple
 
 
 def _quads(*coordinates: np.ndarray) -> np.ndarray:
-    """(n, 4, 3) corners from twelve arrays (n,)."""
+    """Stack twelve coordinates (n,) to corners (n, 4, 3)."""
     return np.stack(coordinates, axis=-1).reshape(-1, 4, 3)
 
 

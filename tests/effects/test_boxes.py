@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from radiotwin.effects import boxes
-from radiotwin.effects.boxes import CELL_M, HEIGHTS_M, Box, back_project, cross, knife_edge_db, two_edges_db
+from radiotwin.effects.boxes import (
+    CELL_M,
+    HEIGHTS_M,
+    Box,
+    back_project,
+    cross,
+    knife_edge_db,
+    two_edges_db,
+)
 
 
 def inside(box, points_m):

@@ -8,7 +8,7 @@ import pytest
 
 from radiotwin.radiomap import RadioMap
 from radiotwin.report import Run, city, layers, read_run
-from radiotwin.report.packing import NOTHING, pack, pack_db
+from radiotwin.report.packing import NOT_DETECTED, pack, pack_db
 
 
 def unpacked(packed):
@@ -17,7 +17,7 @@ def unpacked(packed):
 
 def test_levels_are_kept_to_a_hundredth_of_a_decibel():
     level_db = np.array([[-78.126, np.nan], [0.0, -400.0]])
-    assert unpacked(pack_db(level_db)).tolist() == [[-7813, NOTHING], [0, -32767]]
+    assert unpacked(pack_db(level_db)).tolist() == [[-7813, NOT_DETECTED], [0, -32767]]
     assert unpacked(pack(np.array([1, 2], dtype=">i4"))).tolist() == [1, 2]
 
 
@@ -39,7 +39,7 @@ def test_blocks_have_the_citys_volume_and_a_closed_surface():
 def test_a_city_with_too_many_triangles_is_drawn_as_blocks(small_scene, monkeypatch):
     whole, note = city.city_mesh(small_scene)
     assert note == "" and unpacked(whole["i"]).size < len(small_scene.city.faces)  # without the ground
-    monkeypatch.setattr(city, "MOST_FACES", 20)
+    monkeypatch.setattr(city, "MAX_FACES", 20)
     blocks, note = city.city_mesh(small_scene)
     assert "blocks" in note
     assert unpacked(blocks["z"]).max() == pytest.approx(small_scene.city.vertices[:, 2].max(), abs=0.01)
@@ -48,23 +48,23 @@ def test_a_city_with_too_many_triangles_is_drawn_as_blocks(small_scene, monkeypa
 def test_large_maps_are_thinned_and_the_page_says_so(run_folder, monkeypatch):
     run = read_run(run_folder)
     assert layers.map_layers(run)[0]["step_m"] == 20 and run.notes == []
-    monkeypatch.setattr(layers, "MOST_VALUES", 3000)
+    monkeypatch.setattr(layers, "MAX_VALUES", 3000)
     thinned = layers.map_layers(run)[0]
     step = int(thinned["step_m"] / 20)
     assert step > 1 and f"every {step}th" in run.notes[0]
-    expected_db = np.nan_to_num(run.maps["truth"].gain_db[..., ::step, ::step], nan=NOTHING / 100)
+    expected_db = np.nan_to_num(run.maps["truth"].gain_db[..., ::step, ::step], nan=NOT_DETECTED / 100)
     np.testing.assert_allclose(unpacked(thinned["fields"][0]["values"]) / 100, expected_db, atol=0.006)
 
 
-def test_the_residual_counts_only_what_the_truth_detects(run_folder):
+def test_the_error_counts_only_what_the_truth_detects(run_folder):
     run = read_run(run_folder)
     truth, twin = run.maps["truth"], run.maps["twin"]
     fields = {field["label"]: field for field in layers.map_layers(run)[1]["fields"]}
-    error = unpacked(fields["twin: residual (model − truth)"]["values"])
-    np.testing.assert_array_equal(error == NOTHING, np.isnan(truth.gain_db))
-    assert fields["twin: residual (model − truth)"]["low"] == -fields["twin: residual (model − truth)"]["high"]
+    error = unpacked(fields["twin: error (model − truth)"]["values"])
+    np.testing.assert_array_equal(error == NOT_DETECTED, np.isnan(truth.gain_db))
+    assert fields["twin: error (model − truth)"]["low"] == -fields["twin: error (model − truth)"]["high"]
     stranger = RadioMap(twin.dataset.assign_coords(device=[f"x{n}" for n in range(len(twin.devices))]))
-    assert np.isnan(layers._difference_db(stranger, truth)).all()
+    assert np.isnan(layers._error_db(stranger, truth)).all()
 
 
 def links(n=6):
@@ -80,7 +80,7 @@ def test_residuals_stand_where_the_moving_end_is(tmp_path):
     layer = layers.link_layer(run)
     np.testing.assert_allclose(unpacked(layer["x"]), run.residuals["receiver_x_m"], rtol=1e-6)
     assert layer["devices"] == ["a", "b"] and unpacked(layer["device"]).tolist() == [1, 0] * 3
-    assert unpacked(layer["before"]).tolist() == [400, NOTHING, -300, 200, 100, 0] and layer["range_db"] == 4.0
+    assert unpacked(layer["before"]).tolist() == [400, NOT_DETECTED, -300, 200, 100, 0] and layer["range_db"] == 4.0
     x_min, x_max, *_ = layers.bounds_m(run)
     assert x_min <= 5.0 and x_max >= run.residuals["receiver_x_m"].max()
 

@@ -53,12 +53,12 @@ def test_each_device_and_altitude_shows_its_own_map(opened, run, path, pixels, t
     assert picture.stat().st_size > 20_000
 
 
-def test_line_of_sight_and_the_residual_are_shown(opened, run, path):
+def test_line_of_sight_and_the_error_are_shown(opened, run, path):
     page, truth, twin = opened(path), run.maps["truth"], run.maps["twin"]
     choose(page, "view", "truth: line of sight")
     choose(page, "device", "d5")
     np.testing.assert_array_equal(shown_db(page), truth.los[truth.devices.index("d5"), 0].ravel())
-    choose(page, "view", "twin: residual (model − truth)")
+    choose(page, "view", "twin: error (model − truth)")
     assert page.evaluate("control('device').selectedOptions[0].text") == "d5", "a chosen device stays chosen"
     error_db = (twin.gain_db[twin.devices.index("d5"), 0] - truth.gain_db[truth.devices.index("d5"), 0]).ravel()
     np.testing.assert_allclose(shown_db(page), error_db, atol=0.02)
@@ -78,7 +78,7 @@ def test_the_slider_moves_the_uavs(opened, run, path, pixels):
         for uav in page.evaluate("uavsNow()"):
             track = second[second["uav"] == uav["name"]]
             expected_m = [np.interp(start_s + time_s, track["time_s"], track[f"{axis}_m"]) for axis in "xyz"]
-            np.testing.assert_allclose(uav["place"], expected_m, atol=0.01)
+            np.testing.assert_allclose(uav["position"], expected_m, atol=0.01)
         pictures.append(pixels(page))
     assert page.inner_text("#control-clock") == f"{end_s - start_s:.0f} of {end_s - start_s:.0f} s"
     for one, other in zip(pictures, pictures[1:]):

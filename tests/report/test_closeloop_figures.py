@@ -1,18 +1,12 @@
-"""The report's page and pictures: right for each verdict, and never stopped by what a file may hold."""
+"""The figures of a close-loop: one for each effect, whatever was found and however names are written."""
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.drawing import bins, means
-from radiotwin.closeloop.effect_figures import draw_effects
-from radiotwin.closeloop.figures import draw_figures
-from radiotwin.closeloop.map_figures import Ground, draw_residual_map
-from radiotwin.closeloop.page import lead, write_page
 from radiotwin.closeloop.report import make_report
 from radiotwin.closeloop.run import Loop, close_loop
 from radiotwin.closeloop.selection import Model, Search
-from radiotwin.closeloop.words import listed, parameter, variable
 from radiotwin.effects.body_shadowing import BodyShadowing
 from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.detection_limit import DetectionLimit
@@ -31,96 +25,14 @@ from radiotwin.effects.removed_obstacle import RemovedObstacle
 from radiotwin.effects.sector_antenna import SectorAntenna
 from radiotwin.effects.tilted_dipole import TiltedDipole
 from radiotwin.measurements import Measurements
-
-SCORES = {"n": 900, "bias_db": 0.04, "std_db": 3.0, "correlation": 0.9, "rmse_db": 3.0, "mae_db": 2.2, "nll": 2.5}
-NOTHING = {"n": 0} | dict.fromkeys(["bias_db", "std_db", "correlation", "rmse_db", "mae_db", "nll"])
-DRIFT = {"name": "receiver_drift", "variant": "", "rank": 1, "params": {}, "confused_with": ["interference"],
-         "indistinguishable_from": ["receiver_gain_offset"],
-         "parameters": {"step_db[r<0>]": {"value": -6.0, "low": -6.5, "high": -5.5, "unit": "dB"},
-                        "step_time_s[r<0>]": {"value": 500.0, "low": None, "high": None, "unit": "s"}},
-         "evidence": {"heldout_nll_gain": 210.0, "p_value": 1e-9}}
-
-
-def report(verdict="effect", **changes):
-    """The content of a `closeloop.json`."""
-    found = verdict == "effect"
-    after = SCORES | {"rmse_db": 2.0, "std_db": 2.0} if found else SCORES
-    drivers = [{"variable": "time_in_flight_s", "p_value": 0.0004, "effect_db": 1.5}]
-    return {
-        "schema": "radiotwin.closeloop/1", "radiotwin_version": "0", "base": "twin", "verdict": verdict,
-        "effects": [DRIFT] if found else [],
-        "candidates": [{"name": "receiver_drift", "step": 1, "heldout_rmse_db": 2.0, "heldout_nll_gain": 210.0,
-                        "p_value": 1e-9, "kept": found, "reason": "" if found else "gains nothing"},
-                       {"name": "foliage", "step": 1, "heldout_rmse_db": None, "heldout_nll_gain": None,
-                        "p_value": None, "kept": False, "reason": "nothing in the residual looks like it"}],
-        "heldout": {"by": "flight", "folds": 6, "n": 900},
-        "error": {"before": SCORES, "after": after, "noise_floor_db": None,
-                  "by_device": {"<b>": {"before": SCORES, "after": after},
-                                "d1": {"before": NOTHING, "after": NOTHING}}},
-        "baselines": {"log_distance": SCORES | {"rmse_db": 7.0},
-                      "regression_kriging": {"rmse_db": 5.5, "median_db": 1}},
-        "structure_before": drivers,
-        "remaining": {"structured": verdict == "unexplained", "drivers": drivers if verdict == "unexplained" else []},
-        "notes": ["receiver <i> has 3 only"]} | changes
-
-
-def page(content, folder):
-    write_page(content, folder, "What the model of <x> unavailable")
-    return (folder / "closeloop.html").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize("verdict, sentence, badge", [
-    ("effect", "The model lacked receiver drift. With it the error on held-out links falls from 3.00 to 2.00 dB",
-     "found: receiver drift"),
-    ("none", "Nothing is missing: what the model leaves over (3.00 dB)", "nothing is missing"),
-    ("unexplained",
-     "none of the effects in the catalogue is_cause it: the error (3.00 dB) depends on time in the flight",
-     "unexplained")])
-def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
-    text = page(report(verdict), tmp_path)
-    assert sentence in text and f"<b>{badge}</b>" in text
-    assert text.index(sentence) < text.index("<h2>")
-    assert "http" not in text and "<script" not in text  # one file, no network
-
-
-def test_names_from_the_data_are_no_markup(tmp_path):
-    text = page(report(), tmp_path)
-    for written in ("device &lt;b&gt;", "step (r&lt;0&gt;)", "receiver &lt;i&gt; has 3 only", "the model of &lt;x&gt;"):
-        assert written in text
-    assert "<i>" not in text and "<x>" not in text
-
-
-def test_the_figures_that_planners_judge_by_stand_in_one_table_with_the_other_models(tmp_path):
-    text = page(report(), tmp_path)
-    table = text[text.index("Error before and after"):text.index("by device, receiver and flight")]
-    for words in ("mean [dB]", "standard deviation [dB]", "correlation", "log-distance law", "7.00",
-                  "regression kriging", "5.50", "median db"):
-        assert words in table
-
-
-def test_what_an_effect_may_be_taken_for_is_said(tmp_path):
-    text = page(report(), tmp_path)
-    assert "The data cannot tell it from receiver gain offset." in text
-    assert "Others that may look alike: interference." in text
-    assert "−6.50 to −5.50" in text
-    assert "nothing in the residual looks like it" in text
-
-
-def test_numbers_that_are_not_known_are_dashes(tmp_path):
-    unknown = report("none", baselines={"log_distance": NOTHING}, structure_before=[])
-    unknown["error"] |= {"before": NOTHING, "after": NOTHING}
-    assert "(– dB)" in lead(unknown)
-    assert "None" not in page(unknown, tmp_path) and "nan" not in page(unknown, tmp_path)
-
-
-def test_a_last_resort_is_not_called_an_explanation(tmp_path):
-    shadowing = DRIFT | {"name": "correlated_shadowing", "rank": 2}
-    filled = report("unexplained", effects=[shadowing])
-    assert "which is_cause nothing, brings it to 3.00 dB" in lead(filled)
-    filled = report("effect", effects=[DRIFT, shadowing])
-    filled["error"]["after"] |= {"rmse_db": 1.5}
-    assert "lacked receiver drift. With it the error on held-out links falls from 3.00 to 2.00 dB" in lead(filled)
-    assert "brings it to 1.50 dB" in lead(filled) and "found: receiver drift<" in page(filled, tmp_path)
+from radiotwin.report.binning import bin_index, bin_means
+from radiotwin.report.closeloop_data import collect
+from radiotwin.report.closeloop_figures import write_closeloop_figures
+from radiotwin.report.closeloop_maps import residual_map_figure
+from radiotwin.report.closeloop_page import write_closeloop_page
+from radiotwin.report.effect_figures import effect_figure
+from radiotwin.report.map_background import MapBackground
+from radiotwin.report.style import save
 
 
 def measured(device_m, receiver_m, index, odd=0.0):
@@ -168,25 +80,33 @@ def with_effect(model, effect, params):
     return Model(whole, model.folds, [whole.fit(), *model.fits[1:]], model.index)
 
 
-def test_every_picture_is_written_without_a_map(loop, tmp_path):
+def drawn(loop, scene=None):
+    """The figure of the first effect of a loop."""
+    data = collect(loop)
+    return effect_figure(data.effects[0], MapBackground(data.links, scene))
+
+
+def test_every_figure_is_written_without_a_map(loop, tmp_path):
     content = make_report(loop)
     assert [effect["name"] for effect in content["effects"]] == ["receiver_gain_offset"]
     (tmp_path / "effect_7_of_an_earlier_run.png").write_bytes(b"")
-    draw_figures(loop, None, content, tmp_path)
+    write_closeloop_figures(loop, None, content, tmp_path)
     found = sorted(path.name for path in tmp_path.glob("*.png"))
     assert found == ["drivers.png", "effect_1_receiver_gain_offset.png", "level_map.png", "residual_map.png",
                      "waterfall.png"]
     assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in found)
-    assert page(content, tmp_path).count("data:image/png;base64,") == 5
+    write_closeloop_page(content, tmp_path, "page")
+    assert (tmp_path / "closeloop.html").read_text().count("data:image/png;base64,") == 5
 
 
-def test_pictures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_path):
+def test_figures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_path):
     nothing = with_model(loop, loop.before)
     nothing.dependences_before = []
     content = make_report(nothing)
     assert content["verdict"] == "none" and not content["effects"]
-    draw_figures(nothing, None, content, tmp_path)
-    text = page(content, tmp_path)
+    write_closeloop_figures(nothing, None, content, tmp_path)
+    write_closeloop_page(content, tmp_path, "page")
+    text = (tmp_path / "closeloop.html").read_text()
     assert text.count("data:image/png;base64,") == 4 and "No structure" in text
 
 
@@ -209,8 +129,24 @@ def test_pictures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_
     (Foliage, {"box": [250.0, 120.0, 30.0, 20.0, 20.0, 20.0], "law": [0.6, 15.0]})])
 def test_an_effect_is_drawn_in_its_own_terms(loop, tmp_path, effect, params):
     changed = with_model(loop, with_effect(loop.before, effect, params))
-    draw_effects(changed, Ground(loop.links, None), tmp_path)
-    assert (tmp_path / f"effect_1_{effect.name}.png").stat().st_size > 5000
+    save(drawn(changed), tmp_path / "effect.png")
+    assert (tmp_path / "effect.png").stat().st_size > 5000
+
+
+class OwnEffect(ExcessAttenuation):
+    """An effect that the report does not know."""
+
+    name = "own_effect"
+
+
+def test_an_effect_without_a_figure_of_its_own_is_drawn_over_what_explains_it(loop, monkeypatch):
+    changed = with_model(loop, with_effect(loop.before, OwnEffect, {"scale_height_m": 100.0}))
+    labels = [ax.get_xlabel() for ax in drawn(changed).axes]
+    assert labels and all(label.endswith("]") for label in labels), "a variable with its unit"
+    monkeypatch.setattr(OwnEffect, "figure", "histogram", raising=False)
+    assert [ax.get_ylabel() for ax in drawn(changed).axes] == ["links"]
+    monkeypatch.setattr(OwnEffect, "figure", "no such figure")
+    assert [ax.get_xlabel() for ax in drawn(changed).axes] == labels
 
 
 def test_effects_of_the_map_are_drawn_on_it(small_scene, tmp_path):
@@ -222,32 +158,27 @@ def test_effects_of_the_map_are_drawn_on_it(small_scene, tmp_path):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("radiotwin.closeloop.run.CATALOGUE", ())
         loop = close_loop(data, small_scene, "log-distance", 0, lambda text: None)
-    ground = Ground(loop.links, small_scene)
     for effect, params in ((RemovedObstacle, {"building": 0, "centre_m": [0.0, 0.0, 9.0]}),
                             (WallReflection, {"strength_db": 0.0, "level_db": 0.0})):
         changed = with_model(loop, with_effect(loop.before, effect, params))
-        draw_residual_map(changed, ground, tmp_path / "residual_map.png")
-        draw_effects(changed, ground, tmp_path)
-        assert (tmp_path / f"effect_1_{effect.name}.png").stat().st_size > 5000
+        data = collect(changed)
+        assert len(residual_map_figure(data, MapBackground(data.links, small_scene)).axes) == 3  # with the colour bar
+        save(drawn(changed, small_scene), tmp_path / "effect.png")
+        assert (tmp_path / "effect.png").stat().st_size > 5000
 
 
 def test_means_of_bins_and_their_errors():
     rng = np.random.default_rng(0)
     value = rng.uniform(0, 100, 4000)
-    level = bins(value, 10)
+    level = bin_index(value, 10)
     assert np.bincount(level).min() >= 399 and level.max() == 9
-    found = means(level, value, 0.1 * value + rng.normal(0, 1.0, 4000), np.arange(4000))
+    found = bin_means(level, value, 0.1 * value + rng.normal(0, 1.0, 4000), np.arange(4000))
     assert found.mean == pytest.approx(0.1 * found.at, abs=0.25)
     assert found.error == pytest.approx(np.hypot(1.0, 1 / np.sqrt(12)) / 20, rel=0.15)
     # Links that err as one: no more is known from ten times as many.
     alike = np.repeat(rng.normal(0, 1.0, 400), 10)
     zeros = np.zeros(4000, dtype=int)
-    assert means(zeros, value, alike, np.repeat(np.arange(400), 10)).error[0] == pytest.approx(1 / 20, rel=0.15)
-    assert list(bins(np.array([50.0, 70.0, 50.0, 60.0]), 10)) == [0, 2, 0, 1]
+    assert bin_means(zeros, value, alike, np.repeat(np.arange(400), 10)).error[0] == pytest.approx(1 / 20, rel=0.15)
+    assert list(bin_index(np.array([50.0, 70.0, 50.0, 60.0]), 10)) == [0, 2, 0, 1]
 
 
-def test_names_in_words():
-    assert parameter("tilt_deg[uav1]") == "tilt (uav1)" and parameter("odd_thing_db") == "odd thing"
-    assert variable("time_in_flight_s") == ("time in the flight", "s")
-    assert variable("odd_length_m") == ("odd length", "m")
-    assert listed(["a", "b", "a", "c"]) == "a, b and c"

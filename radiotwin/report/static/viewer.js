@@ -1,16 +1,16 @@
 "use strict";
-// The controls: which map, device and altitude is shown, and which moment of which flight. The page holds all data as
-// JSON (layers.py); nothing is fetched.
+// The controls: which map, device and altitude is shown, and which moment of which flight. The page
+// holds all data as JSON (layers.py); nothing is fetched.
 
-const NOTHING = -32768;  // a level that is not there (packing.py)
+const NOT_DETECTED = -32768;  // stands for NaN among levels (packing.py)
 const PLAY_MS = 40, PLAY_FRAMES = 400;
 const HOVER_PIXELS = 8;
-const HOLES = "Holes: not detected.", DOTS = "Each dot is a link that took no part in fitting, at the place of the end that moves.";
+const HOLES = "Holes: not detected.", DOTS = "Each dot is a held-out link, at the position of its moving end.";
 
 const control = name => document.getElementById("control-" + name);
 const chosen = name => Number(control(name).value);
 
-// Every packed array becomes a typed one.
+// Replaces every packed array by a typed one.
 function unpack(value) {
   if (Array.isArray(value)) return value.map(unpack);
   if (value === null || typeof value !== "object") return value;
@@ -39,7 +39,7 @@ function fill(select, labels) {
   select.disabled = labels.length < 2;
 }
 
-function refill(name, labels) {  // keeps what was chosen, where it is still there
+function refill(name, labels) {  // keeps the choice where it is still available
   const before = control(name).selectedOptions[0]?.text;
   fill(control(name), labels);
   if (labels.includes(before)) control(name).value = labels.indexOf(before);
@@ -81,17 +81,19 @@ function drawView() {
 function levelsOf({map, field}) {
   const size = map.x.length * map.y.length, start = (chosen("device") * map.z.length + chosen("altitude")) * size;
   return Array.from(field.values.subarray(start, start + size),
-                    value => field.kind === "los" ? value : value === NOTHING ? null : value / 100);
+                    value => field.kind === "los" ? value : value === NOT_DETECTED ? null : value / 100);
 }
 
-// Numbers of the links that the chosen view shows.
+// Indices of the links that the chosen view shows.
 function linksOf({links: when}) {
   const device = chosen("device") - 1, {links} = data;
-  return Array.from(links.x.keys()).filter(n => links[when][n] !== NOTHING && (device < 0 || links.device[n] === device));
+  return Array.from(links.x.keys()).filter(
+    n => links[when][n] !== NOT_DETECTED && (device < 0 || links.device[n] === device));
 }
 
 // Flights
-function placeAt(track, time) {  // the last moment that has passed, and the place between it and the next one
+// Index of the last sample before a time, and the position interpolated to that time.
+function positionAt(track, time) {
   let low = 0, high = track.t.length - 1;
   if (time >= track.t[high]) return [high, [track.x[high], track.y[high], track.z[high]]];
   while (high - low > 1) {
@@ -105,9 +107,9 @@ function placeAt(track, time) {  // the last moment that has passed, and the pla
 function uavsNow() {
   const flight = data.flights[chosen("flight")];
   return !flight ? [] : flight.uavs.map(track => {
-    const [last, place] = placeAt(track, chosen("time")), trail = [];
+    const [last, position] = positionAt(track, chosen("time")), trail = [];
     for (let n = 0; n <= last; n++) trail.push([track.x[n], track.y[n], track.z[n]]);
-    return {name: track.name, place, trail: [...trail, place]};
+    return {name: track.name, position, trail: [...trail, position]};
   });
 }
 
@@ -116,7 +118,7 @@ function showTime() {
   stage.redraw();
 }
 
-function chooseFlight() {  // at its end: all of it is seen
+function chooseFlight() {  // at its end, where all of its path is shown
   const flight = data.flights[chosen("flight")], slider = control("time");
   if (!flight) return;
   slider.max = Math.max(flight.end_s, 1e-3);
@@ -142,35 +144,37 @@ function play() {
   control("play").textContent = player ? "❚❚" : "▶";
 }
 
-// The level under the mouse
+// The level under the pointer
 function textUnder(event) {
   const shown = view();
   if (!shown) return "";
   if (!shown.map) {
-    const box = stage.place.getBoundingClientRect();
+    const box = stage.container.getBoundingClientRect();
     const near = linksOf(shown).find(n => {
       const at = stage.pixel(data.links.x[n], data.links.y[n], data.links.z[n]);
       return at && Math.hypot(at[0] + box.left - event.clientX, at[1] + box.top - event.clientY) < HOVER_PIXELS;
     });
-    return near === undefined ? "" : `${data.links.devices[data.links.device[near]]}, ${data.links.los[near] ? "LoS" : "NLoS"}: ` +
-      `${(data.links[shown.links][near] / 100).toFixed(2)} dB`;
+    if (near === undefined) return "";
+    const name = data.links.devices[data.links.device[near]], sight = data.links.los[near] ? "LoS" : "NLoS";
+    return `${name}, ${sight}: ${(data.links[shown.links][near] / 100).toFixed(2)} dB`;
   }
   const {map, field} = shown, z = map.z[chosen("altitude")], at = stage.under(event, z);
   if (!at) return "";
   const column = Math.round((at.x - map.x[0]) / map.step_m), row = Math.round((at.y - map.y[0]) / map.step_m);
   if (column < 0 || row < 0 || column >= map.x.length || row >= map.y.length) return "";
   const level = levelsOf(shown)[row * map.x.length + column];
-  const words = level === null ? "not detected" : field.kind !== "los" ? `${level.toFixed(2)} dB` : level ? "line of sight" : "no line of sight";
-  return `(${map.x[column]}, ${map.y[row]}, ${z}) m: ${words}`;
+  const text = level === null ? "not detected" : field.kind !== "los" ? `${level.toFixed(2)} dB`
+    : level ? "line of sight" : "no line of sight";
+  return `(${map.x[column]}, ${map.y[row]}, ${z}) m: ${text}`;
 }
 
 let stage = null;
 function start() {
-  const place = document.getElementById("viewer");
+  const container = document.getElementById("viewer");
   try {
-    stage = new Stage(place, data);
+    stage = new Stage(container, data);
   } catch (error) {
-    place.textContent = "This browser gives no WebGL, so the city cannot be drawn: " + error.message;
+    container.textContent = "The city cannot be drawn without WebGL, which this browser does not provide: " + error.message;
     return;
   }
   stage.drawings.push(context => drawAxes(context, stage),

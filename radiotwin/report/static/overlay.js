@@ -1,5 +1,5 @@
 "use strict";
-// What is drawn over the 3D picture: axes, devices and their estimates, paths and places of the UAVs.
+// The overlay of the 3D picture: axes, devices and their estimates, paths and positions of the UAVs.
 
 const UAV_COLOURS = ["#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9"];  // Okabe and Ito
 const FOUND = "#c1121f", UNKNOWN = "#f08a00", INK = "#111";
@@ -19,7 +19,8 @@ function path(context, stage, points, colour, width) {
 }
 
 function label(context, text, [x, y], colour = INK) {
-  Object.assign(context, {font: FONT, textAlign: "center", lineWidth: 3, strokeStyle: "rgba(255, 255, 255, 0.85)", fillStyle: colour});
+  Object.assign(context, {font: FONT, textAlign: "center", lineWidth: 3, fillStyle: colour,
+                          strokeStyle: "rgba(255, 255, 255, 0.85)"});
   context.strokeText(text, x, y);
   context.fillText(text, x, y);
 }
@@ -42,14 +43,15 @@ function mark(context, kind, [x, y], size, colour) {
   context.stroke();
 }
 
-// A round number of metres, of which a handful make `length`.
+// A round number of metres that divides `length` into at most six parts.
 function roundStep(length) {
   const power = 10 ** Math.floor(Math.log10(length / 5));
   return [1, 2, 5, 10].map(part => part * power).find(step => length / step <= 6);
 }
 
 function drawAxes(context, stage) {
-  const [x0, x1, y0, y1] = stage.data.bounds, step = roundStep(Math.max(x1 - x0, y1 - y0)), off = 0.03 * Math.max(x1 - x0, y1 - y0);
+  const [x0, x1, y0, y1] = stage.data.bounds, side = Math.max(x1 - x0, y1 - y0);
+  const step = roundStep(side), off = 0.03 * side;
   path(context, stage, [[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0], [x0, y0, 0]], "#9aa5ad", 1);
   const write = (text, x, y) => { const at = stage.pixel(x, y, 0); if (at) label(context, text, at, "#4a5964"); };
   for (let x = Math.ceil(x0 / step) * step; x <= x1; x += step) write(x.toFixed(0), x, y0 - off);
@@ -61,11 +63,11 @@ function drawAxes(context, stage) {
 function drawDevices(context, stage) {
   const [x0, x1, y0, y1] = stage.data.bounds, most = Math.max(x1 - x0, y1 - y0) / 4;
   const {devices} = stage.data;
-  for (const {estimate, true: place, radius_m: radius} of devices) {
+  for (const {estimate, true: position, radius_m: radius} of devices) {
     if (!estimate) continue;
     const [x, y, z] = estimate;
-    if (place) path(context, stage, [place, estimate], FOUND, 1.5);
-    if (radius > 0 && radius < most)  // a larger circle says little and hides much
+    if (position) path(context, stage, [position, estimate], FOUND, 1.5);
+    if (radius > 0 && radius < most)  // a larger circle would hide the city
       path(context, stage, Array.from({length: 49}, (_, n) => [x + radius * Math.cos(n * Math.PI / 24),
                                                                y + radius * Math.sin(n * Math.PI / 24), z]), FOUND, 1);
     const at = stage.pixel(x, y, z);
@@ -82,8 +84,8 @@ function drawDevices(context, stage) {
 
 function drawFlight(context, stage, uavs) {
   uavs.forEach(({trail}, number) => path(context, stage, trail, UAV_COLOURS[number % UAV_COLOURS.length], 2.5));
-  uavs.forEach(({name, place}, number) => {
-    const at = stage.pixel(...place);
+  uavs.forEach(({name, position}, number) => {
+    const at = stage.pixel(...position);
     if (!at) return;
     mark(context, "circle", at, 7, UAV_COLOURS[number % UAV_COLOURS.length]);
     label(context, name, [at[0], at[1] - 11]);

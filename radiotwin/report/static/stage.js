@@ -1,13 +1,15 @@
 "use strict";
-// The 3D picture: the city and a slice in WebGL (three.js), and over it a plain canvas with everything that must stay
-// readable at any distance: devices, paths, labels. Coordinates are metres, x east, y north, z up.
+// The 3D picture: the city and a slice in WebGL (three.js), and over it a plain canvas with everything
+// that must stay readable at any distance: devices, paths, labels. Coordinates are in metres, x east,
+// y north, z up.
 
-// Shaders of a few lines: those of three.js's own materials take a second each to compile without a graphics card.
-const PLACE = `precision highp float;
+// Shaders of a few lines: those of three.js's own materials take a second each to compile without a
+// graphics card.
+const POSITION = `precision highp float;
 uniform mat4 modelViewMatrix, projectionMatrix;
 attribute vec3 position;`;
 const COLOURED = {
-  vertexShader: `${PLACE}
+  vertexShader: `${POSITION}
     attribute vec3 color;
     uniform float size;  // of dots, in pixels
     varying vec3 shown;
@@ -18,7 +20,7 @@ const COLOURED = {
     }`,
   fragmentShader: "precision mediump float; varying vec3 shown; void main() { gl_FragColor = vec4(shown, 1.0); }"};
 const CELLS = {
-  vertexShader: `${PLACE}
+  vertexShader: `${POSITION}
     attribute vec2 uv;
     varying vec2 cell;
     void main() {
@@ -36,8 +38,8 @@ const GROUND = [0.945, 0.953, 0.957];
 const DOT_PIXELS = 6;
 const SOFTWARE = /swiftshader|llvmpipe|software|basic render/i;
 
-// Pixels that are drawn for each one of the page, along a side. Edges are smooth where a graphics card draws two. Without
-// a card one is enough, and antialiasing, which WebGL would do itself, would take four times as long for each triangle.
+// Drawn pixels for each pixel of the page, along a side. Two smooth the edges where there is a graphics
+// card. Without one, WebGL's own antialiasing would take four times as long for each triangle.
 function sharpness(gl) {
   const names = gl.getExtension("WEBGL_debug_renderer_info");
   const by = gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
@@ -45,14 +47,14 @@ function sharpness(gl) {
 }
 
 class Stage {
-  constructor(place, data) {
-    this.place = place;
+  constructor(container, data) {
+    this.container = container;
     this.data = data;
     this.renderer = new THREE.WebGLRenderer();
     this.renderer.setPixelRatio(sharpness(this.renderer.context));
     this.renderer.setClearColor(0xffffff);
     this.overlay = document.createElement("canvas");
-    place.append(this.renderer.domElement, this.overlay);
+    container.append(this.renderer.domElement, this.overlay);
     this.scene = new THREE.Scene();
     this.camera = new THREE.PerspectiveCamera(35, 1, 1, 1e6);
     this.camera.up.set(0, 0, 1);
@@ -68,18 +70,18 @@ class Stage {
     this.fit();
     this.look("oblique");
     this.listen();
-    new ResizeObserver(() => { if (this.fit()) this.draw(); }).observe(place);
+    new ResizeObserver(() => { if (this.fit()) this.draw(); }).observe(container);
   }
 
   addCity({x, y, z, i, j, k}) {
-    // Every face in one colour, lit once and for all: brighter the higher it is and the more it faces the light.
+    // One constant colour for each face: brighter the higher it is and the more it faces the light.
     const light = new THREE.Vector3(-0.35, -0.62, 0.7).normalize(), top = Math.max(this.data.top_m, 1);
-    const place = new Float32Array(9 * i.length), colour = new Float32Array(9 * i.length);
+    const position = new Float32Array(9 * i.length), colour = new Float32Array(9 * i.length);
     const corners = [new THREE.Vector3(), new THREE.Vector3(), new THREE.Vector3()], across = new THREE.Vector3();
     for (let face = 0; face < i.length; face++) {
       [i, j, k].forEach((index, n) => {
         const from = index[face];
-        corners[n].set(x[from], y[from], z[from]).toArray(place, 9 * face + 3 * n);
+        corners[n].set(x[from], y[from], z[from]).toArray(position, 9 * face + 3 * n);
       });
       const normal = corners[1].sub(corners[0]).cross(across.subVectors(corners[2], corners[0])).normalize();
       const lit = 0.5 + 0.3 * Math.abs(normal.dot(light)), high = Math.max(z[i[face]], z[j[face]], z[k[face]]) / top;
@@ -87,7 +89,7 @@ class Stage {
         colour.set([lit, lit + 0.012, lit + 0.03].map(part => Math.min(part + 0.15 * high, 1)), 9 * face + 3 * n);
     }
     const geometry = new THREE.BufferGeometry();
-    geometry.addAttribute("position", new THREE.BufferAttribute(place, 3));
+    geometry.addAttribute("position", new THREE.BufferAttribute(position, 3));
     geometry.addAttribute("color", new THREE.BufferAttribute(colour, 3));
     const mesh = new THREE.Mesh(geometry, this.coloured);
     this.scene.add(mesh);
@@ -111,11 +113,11 @@ class Stage {
     return slice;
   }
 
-  // A slice of coloured cells: RGBA bytes (ny, nx), south first, and where the middle of the first cell is.
+  // A slice of coloured cells: RGBA bytes (ny, nx), south first, and the centre of the first cell [m].
   showSlice(rgba, nx, ny, west, south, step, z) {
     const {cells} = this.slice.material.uniforms;
     cells.value?.dispose();
-    cells.value = new THREE.DataTexture(rgba, nx, ny, THREE.RGBAFormat);  // nearest cell, no mean over cells
+    cells.value = new THREE.DataTexture(rgba, nx, ny, THREE.RGBAFormat);  // nearest cell, not interpolated
     cells.value.needsUpdate = true;
     this.slice.scale.set(nx * step, ny * step, 1);
     this.slice.position.set(west + (nx - 1) * step / 2, south + (ny - 1) * step / 2, z);
@@ -123,10 +125,10 @@ class Stage {
     this.dots.visible = false;
   }
 
-  showDots(place, colour) {
+  showDots(position, colour) {
     this.dots.geometry.dispose();
     this.dots.geometry = new THREE.BufferGeometry();
-    this.dots.geometry.addAttribute("position", new THREE.BufferAttribute(new Float32Array(place), 3));
+    this.dots.geometry.addAttribute("position", new THREE.BufferAttribute(new Float32Array(position), 3));
     this.dots.geometry.addAttribute("color", new THREE.BufferAttribute(new Float32Array(colour), 3));
     this.dots.visible = true;
     this.slice.visible = false;
@@ -143,7 +145,7 @@ class Stage {
     } else {
       [this.turn, this.lift] = [-Math.PI / 2 + 0.45, 0.72];
       this.far = most * Math.max(1.8, 2.85 / aspect);
-      this.middle.x += 0.14 * most * Math.cos(this.turn);  // what is near looks larger
+      this.middle.x += 0.14 * most * Math.cos(this.turn);  // near parts look larger
       this.middle.y += 0.14 * most * Math.sin(this.turn);
     }
     this.redraw();
@@ -151,13 +153,13 @@ class Stage {
 
   listen() {
     const pointers = new Map();
-    this.place.addEventListener("pointerdown", event => {
-      this.place.setPointerCapture(event.pointerId);
+    this.container.addEventListener("pointerdown", event => {
+      this.container.setPointerCapture(event.pointerId);
       pointers.set(event.pointerId, event);
     });
     for (const end of ["pointerup", "pointercancel"])
-      this.place.addEventListener(end, event => pointers.delete(event.pointerId));
-    this.place.addEventListener("pointermove", event => {
+      this.container.addEventListener(end, event => pointers.delete(event.pointerId));
+    this.container.addEventListener("pointermove", event => {
       const before = pointers.get(event.pointerId);
       if (!before) { this.hover?.(event); return; }
       const dx = event.clientX - before.clientX, dy = event.clientY - before.clientY;
@@ -173,8 +175,8 @@ class Stage {
       pointers.set(event.pointerId, event);
       this.redraw();
     });
-    this.place.addEventListener("contextmenu", event => event.preventDefault());
-    this.place.addEventListener("wheel", event => {
+    this.container.addEventListener("contextmenu", event => event.preventDefault());
+    this.container.addEventListener("wheel", event => {
       event.preventDefault();
       this.zoom(Math.exp(0.001 * event.deltaY));
       this.redraw();
@@ -184,14 +186,14 @@ class Stage {
   zoom(factor) { this.far = Math.min(Math.max(this.far * factor, 5), 1e5); }
 
   pan(dx, dy) {
-    const metres = 2 * this.far * Math.tan(Math.PI * this.camera.fov / 360) / this.place.clientHeight;
+    const metres = 2 * this.far * Math.tan(Math.PI * this.camera.fov / 360) / this.container.clientHeight;
     const [sin, cos] = [Math.sin(this.turn), Math.cos(this.turn)];
     this.middle.x += metres * (sin * dx - cos * dy);
     this.middle.y += metres * (-cos * dx - sin * dy);
   }
 
-  fit() {  // both canvases to their place; whether that changed anything
-    const {clientWidth: width, clientHeight: height} = this.place;
+  fit() {  // resizes both canvases; returns whether the size has changed
+    const {clientWidth: width, clientHeight: height} = this.container;
     if (width === this.width && height === this.height) return false;
     Object.assign(this, {width, height});
     this.renderer.setSize(width, height);
@@ -208,7 +210,8 @@ class Stage {
 
   draw() {
     const {camera, far} = this;
-    camera.position.set(Math.cos(this.lift) * Math.cos(this.turn), Math.cos(this.lift) * Math.sin(this.turn), Math.sin(this.lift));
+    const across = Math.cos(this.lift);
+    camera.position.set(across * Math.cos(this.turn), across * Math.sin(this.turn), Math.sin(this.lift));
     camera.position.multiplyScalar(far).add(this.middle);
     Object.assign(camera, {near: far / 200, far: 10 * far + 1e4});
     camera.lookAt(this.middle);
@@ -216,7 +219,7 @@ class Stage {
     this.renderer.render(this.scene, camera);
     const context = this.overlay.getContext("2d");
     context.setTransform(window.devicePixelRatio, 0, 0, window.devicePixelRatio, 0, 0);
-    context.clearRect(0, 0, this.place.clientWidth, this.place.clientHeight);
+    context.clearRect(0, 0, this.container.clientWidth, this.container.clientHeight);
     this.drawings.forEach(drawing => drawing(context));
   }
 
@@ -224,12 +227,12 @@ class Stage {
   pixel(x, y, z) {
     const at = new THREE.Vector3(x, y, z).project(this.camera);
     if (at.z > 1) return null;
-    return [(at.x + 1) / 2 * this.place.clientWidth, (1 - at.y) / 2 * this.place.clientHeight];
+    return [(at.x + 1) / 2 * this.container.clientWidth, (1 - at.y) / 2 * this.container.clientHeight];
   }
 
-  // (x, y) on a level [m] under a mouse event; null where it is not met.
+  // (x, y) of the height z [m] under a pointer event; null where the ray does not meet it.
   under(event, z) {
-    const box = this.place.getBoundingClientRect(), ray = new THREE.Raycaster();
+    const box = this.container.getBoundingClientRect(), ray = new THREE.Raycaster();
     ray.setFromCamera(new THREE.Vector2(2 * (event.clientX - box.left) / box.width - 1,
                                         1 - 2 * (event.clientY - box.top) / box.height), this.camera);
     return ray.ray.intersectPlane(new THREE.Plane(new THREE.Vector3(0, 0, 1), -z), new THREE.Vector3());

@@ -1,0 +1,230 @@
+"""Collect what the figures of a close-loop draw, as plain arrays.
+
+The figures read nothing else, so that they do not depend on how the loop fits its models.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from radiotwin.closeloop.run import Loop, significant
+from radiotwin.effects.params import Parameter
+from radiotwin.links import LinkData, evidence_blocks, residual_variables
+from radiotwin.report.labels import variable_label
+from radiotwin.scene.citymap import CityMap
+
+MAX_MEMBERS = 6  # devices or receivers with a panel of their own
+MIN_SHARE = 0.02  # of the largest standard deviation of a contribution; below it, no panel
+TIME_UNITS = (("days", 86_400.0), ("h", 3600.0), ("s", 1.0))
+MIN_LOS_LINKS = 300  # with fewer, links without line of sight are drawn, too
+
+
+@dataclass(frozen=True, eq=False)
+class LinkArrays:
+    """Measured links, n of them to k devices.
+
+    Attributes:
+        level_db: (n,) measured gain [dB] or power [dBm]; NaN: not detected.
+        is_gain: whether the level is a gain.
+        receiver_m: (n, 3) receiver positions [m].
+        device_m: (k, 3) device positions of the model [m].
+        anchor: (k,) whether a device's position is declared.
+        los: (n,) whether a link has line of sight.
+        block: (n,) index of the block of links with a common error.
+        first_s: time of the first measurement [s]; NaN without times.
+        names: labels of the variables `device`, `receiver`, `flight` and `los`, by their index.
+        variables: variable -> (n,) value; integers are an index into `names` or a map cell.
+        city: 3D map, where there is one.
+    """
+
+    level_db: np.ndarray
+    is_gain: bool
+    receiver_m: np.ndarray
+    device_m: np.ndarray
+    anchor: np.ndarray
+    los: np.ndarray
+    block: np.ndarray
+    first_s: float
+    names: dict[str, list[str]]
+    variables: dict[str, np.ndarray]
+    city: CityMap | None
+
+    @property
+    def level_unit(self) -> str:
+        """Return the unit of the level."""
+        return "dB" if self.is_gain else "dBm"
+
+    @property
+    def ends_m(self) -> np.ndarray:
+        """Return the (n, 2, 3) positions of device and receiver of each link [m]."""
+        return np.stack([self.device_m[self.variables["device"]], self.receiver_m], axis=1)
+
+    def on_axis(self, name: str, value: np.ndarray) -> tuple[np.ndarray, str]:
+        """Return a variable as it is drawn, and the label of its axis.
+
+        Times count from the first measurement, in days, hours or seconds.
+
+        Args:
+            name: name of the variable.
+            value: (n,) its values.
+        """
+        label, unit = variable_label(name)
+        if name == "time_s":
+            label, value = "time since the first measurement", value - self.first_s
+            span_s = np.nanmax(value, initial=0.0)
+            unit, unit_s = next(each for each in TIME_UNITS if span_s >= 3 * each[1]
+                                or each[0] == "s")
+            value = value / unit_s
+        unit = self.level_unit if unit == "dB" else unit
+        return value, f"{label} [{unit}]" if unit else label
+
+
+@dataclass(frozen=True, eq=False)
+class EffectData:
+    """An effect that was found, and its contribution while all other effects stay as they are.
+
+    Attributes:
+        name: name in the catalogue.
+        figure: kind of figure that the effect asks for; empty: chosen by name and stage.
+        stage: stage of the model that the effect acts in.
+        nlos_only: whether it acts on links without line of sight only.
+        of_receiver: whether it belongs to a receiver.
+        params: nonlinear parameters.
+        parameters: printed parameters with their 90 % intervals.
+        links: measured links.
+        without_db: (n,) predicted level without the effect [dB].
+        with_db: (n,) predicted level with it [dB].
+    """
+
+    name: str
+    figure: str
+    stage: str
+    nlos_only: bool
+    of_receiver: bool
+    params: Mapping[str, Any]
+    parameters: dict[str, Parameter]
+    links: LinkArrays
+    without_db: np.ndarray
+    with_db: np.ndarray
+
+    @property
+    def contribution_db(self) -> np.ndarray:
+        """Return the (n,) change of the predicted level [dB]."""
+        return self.with_db - self.without_db
+
+    @property
+    def residual_db(self) -> np.ndarray:
+        """Return the (n,) residual without the effect [dB]."""
+        return self.links.level_db - self.without_db
+
+    @property
+    def variables(self) -> dict[str, np.ndarray]:
+        """Return the variables of the links; the predicted level is that without the effect."""
+        return self.links.variables | {"predicted_level_db": self.without_db}
+
+    @property
+    def member_kind(self) -> str:
+        """Return `device` or `receiver` where the effect differs between them, else ``""``."""
+        if "devices" in self.params:
+            return "device"
+        return "receiver" if self.of_receiver else ""
+
+    @property
+    def shown(self) -> np.ndarray:
+        """Return the (n,) mask of links to draw: for a receiver those with line of sight."""
+        detected = np.isfinite(self.residual_db)
+        clear = detected & self.links.los
+        return clear if self.of_receiver and clear.sum() >= MIN_LOS_LINKS else detected
+
+    def panels(self) -> list[tuple[str, np.ndarray]]:
+        """Return title and links (indices) of the members that the effect changes most."""
+        shown, kind = self.shown, self.member_kind
+        if not kind:
+            return [("all links", np.flatnonzero(shown))]
+        index = self.links.variables[kind]
+        rows = {int(member): np.flatnonzero(shown & (index == member))
+                for member in np.unique(index[shown])}
+        sd_db = {member: float(np.std(self.contribution_db[each])) for member, each in rows.items()}
+        chosen = sorted(sorted(sd_db, key=lambda member: -sd_db[member])[:MAX_MEMBERS])
+        return [(f"{kind} {self.links.names[kind][member]}", rows[member]) for member in chosen
+                if sd_db[member] > MIN_SHARE * max(sd_db.values())]
+
+
+@dataclass(frozen=True, eq=False)
+class LoopData:
+    """A close-loop as its figures draw it.
+
+    Attributes:
+        links: measured links, with the devices where the final model has them.
+        base: name of the base model.
+        before_db: (n,) held-out prediction of the base alone [dB]; NaN: none.
+        after_db: (n,) the same with all effects [dB].
+        changed: whether anything was added to the base.
+        kept: names of the candidates that were kept, in order.
+        drivers: variables that the residual depends on, those before the effects first.
+        effects: the effects that were found.
+        interpolated_db: (n,) held-out contribution of correlated shadowing [dB], where it is kept.
+    """
+
+    links: LinkArrays
+    base: str
+    before_db: np.ndarray
+    after_db: np.ndarray
+    changed: bool
+    kept: list[str]
+    drivers: list[str]
+    effects: list[EffectData]
+    interpolated_db: np.ndarray | None
+
+
+def collect(loop: Loop) -> LoopData:
+    """Copy what the figures need out of a close-loop.
+
+    Args:
+        loop: result of `radiotwin.closeloop`.
+    """
+    model = loop.after
+    links = _links(model.links, loop.before.held_out_mean_db)
+    before = loop.dependences_before
+    dependences = [*significant(before, loop.criteria), *loop.remaining]
+    interpolated_db = None
+    if model.shadowing:
+        scale_db = model.held_out(lambda fold, fit: fold.predict(fit).scale_db)
+        interpolated_db = model.held_out_shadowing[0] * scale_db
+    return LoopData(
+        links, loop.base, loop.before.held_out_mean_db, model.held_out_mean_db,
+        model is not loop.before, [score.name for score in loop.selection.scores if score.kept],
+        [each.variable for each in dependences or before[:3]], _effects(loop, links),
+        interpolated_db)
+
+
+def _links(links: LinkData, predicted_db: np.ndarray) -> LinkArrays:
+    return LinkArrays(
+        links.level_db, links.is_gain, links.receiver_m, links.device_m,
+        np.isin(np.arange(len(links.device_m)), list(links.anchors)), links.los,
+        evidence_blocks(links), links.first_s,
+        {"device": links.device_names, "receiver": links.receiver_names,
+         "flight": links.flight_names, "los": ["without", "with"]},
+        residual_variables(links, predicted_db), links.city)
+
+
+def _effects(loop: Loop, links: LinkArrays) -> list[EffectData]:
+    """Predict all links with and without each effect, by the model fitted to all links."""
+    whole, fit = loop.after.whole, loop.after.fits[0]
+    if not whole.effects:
+        return []
+    with_db = np.where(whole.usable, whole.predict(fit).mean_db, np.nan)
+    effects = []
+    for own, applied, parameters in zip(whole.coefficient_slices, whole.effects, loop.parameters,
+                                        strict=True):
+        others = [other for other in whole.effects if other is not applied]
+        rest = replace(fit, coefficients=np.delete(fit.coefficients, own))
+        without_db = whole.with_effects(others).predict(rest).mean_db
+        effect = applied.effect
+        effects.append(EffectData(
+            effect.name, effect.figure, effect.stage, effect.nlos_only, effect.of_receiver,
+            dict(applied.params), parameters, links,
+            np.where(whole.usable, without_db, np.nan), with_db))
+    return effects

@@ -1,0 +1,232 @@
+"""Make the page of a close-loop, or its part of a run's page, from `closeloop.json`."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+from radiotwin.report.html import Table, read_picture, write_page
+from radiotwin.report.labels import (
+    INTERPOLATIONS,
+    join_names,
+    name_label,
+    parameter_label,
+    variable_label,
+)
+
+FIGURES = (
+    ("waterfall.png", "Error step by step",
+     "RMSE on held-out links, which were used neither to choose nor to fit the model: the base "
+     "alone, the change by each effect, and the result. Horizontal lines: other models, held out "
+     "in the same way."),
+    ("residual_map.png", "Residual on the map",
+     "Measured minus predicted level on held-out links, before and after. Red: less was measured "
+     "than predicted. Purple: the effects that were found."),
+    ("level_map.png", "Levels on the map",
+     "Measured level, level predicted while the link was held out, and their difference, at the "
+     "position of the moving end."),
+    ("drivers.png", "Dependence of the residual",
+     "Mean held-out residual over the variables that it depends on most, with one standard error. "
+     "Dashed: contribution of the effects to the prediction."),
+)
+VERDICTS = {
+    "effect": "The model lacked {names}. With {it} the RMSE on held-out links falls from {before} "
+              "to {after} dB.",
+    "none": "Nothing is missing: the residual ({before} dB RMSE) depends on none of the variables "
+            "that were tested, and no effect of the catalogue lowers it.",
+    "unexplained": "Something is missing that no effect of the catalogue explains: the residual "
+                   "({before} dB RMSE) depends on {drivers}.",
+}
+BADGES = {"effect": "found: ", "none": "nothing is missing", "unexplained": "unexplained"}
+KINDS = {"los": "", "device": "device ", "receiver": "receiver ", "flight": "flight "}
+GROUPS = {"los": "with line of sight", "nlos": "without line of sight"}
+COLUMNS = {"n": "links", "bias_db": "bias [dB]", "std_db": "standard deviation [dB]",
+           "correlation": "correlation", "rmse_db": "RMSE [dB]", "mae_db": "MAE [dB]",
+           "nll": "−log-likelihood [nats]"}
+CARDS = (("rmse_db", "RMSE", " dB"), ("bias_db", "bias", " dB"),
+         ("std_db", "standard deviation", " dB"), ("correlation", "correlation", ""))
+MAX_NAMED = 4  # variables in a sentence
+MAX_ROWS = 40  # groups with more members are left out of the tables
+
+
+def write_closeloop_page(report: dict, folder: Path | str, title: str) -> None:
+    """Write `closeloop.html`, one file that opens without a network.
+
+    Args:
+        report: content of `closeloop.json`.
+        folder: of the page and of the figures that go into it.
+        title: heading of the page.
+    """
+    folder = Path(folder)
+    write_page("closeloop.html", folder / "closeloop.html", {
+        "title": title, "page_title": title, "facts": _facts(report),
+        "closeloop": closeloop_context(report, folder)})
+
+
+def summary(report: dict) -> str:
+    """Summarise the result of a close-loop in one to three sentences.
+
+    Args:
+        report: content of `closeloop.json`.
+    """
+    error, causes = report["error"], _causes(report)
+    drivers = _driver_names(report["remaining"]["drivers"])
+    before, after = (_number(error[when]["rmse_db"]) for when in ("before", "after"))
+    interpolated = len(causes) < len(report["effects"])
+    explained = [candidate["heldout_rmse_db"] for candidate in report["candidates"]
+                 if candidate["kept"] and candidate["name"] not in INTERPOLATIONS]
+    text = VERDICTS[report["verdict"]].format(
+        names=join_names(_cause_names(report)), it="it" if len(causes) == 1 else "them",
+        before=before, after=_number(explained[-1]) if interpolated and explained else after,
+        drivers=join_names(drivers or _driver_names(report.get("dependences_before", []))))
+    if report["verdict"] == "effect" and drivers:
+        text += f" The remaining residual depends on {join_names(drivers)}."
+    if interpolated:
+        text += (" Interpolation of the remaining residual, which explains nothing, brings the "
+                 f"RMSE to {after} dB.")
+    return text
+
+
+def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
+    """Collect the variables of the template `closeloop_sections.html`.
+
+    Args:
+        report: content of `closeloop.json`.
+        folder: of the figures.
+
+    Raises:
+        KeyError, TypeError, ValueError: a damaged report.
+    """
+    candidates = report["candidates"]
+    verdict = BADGES[report["verdict"]]
+    if report["verdict"] == "effect":
+        verdict += join_names(_cause_names(report))
+    pictures = [read_picture(folder / name, title, text) for name, title, text in FIGURES]
+    return {
+        "lead": summary(report), "verdict": verdict, "cards": _cards(report),
+        "figures": [picture for picture in pictures if picture],
+        "effects": _effects(report, folder),
+        "errors": _error_table(report, ("los",)),
+        "errors_by_member": _error_table(report, ("device", "receiver", "flight")),
+        "trials": f"{len(candidates)} trials in {len({c['step'] for c in candidates})} steps",
+        "candidates": _candidate_table(candidates),
+        "remaining": Table(
+            ("variable", "standard deviation of the mean residual over it [dB]", "p, corrected"),
+            [[variable_label(driver["variable"])[0], _number(driver.get("effect_db")),
+              _p_value(driver["p_value"])] for driver in report["remaining"]["drivers"]]),
+        "notes": report["notes"]}
+
+
+def _cards(report: dict) -> list[tuple[str, str]]:
+    cards = []
+    for key, label, unit in CARDS:
+        before, after = (_number(report["error"][when].get(key)) for when in ("before", "after"))
+        unchanged = before == after and not report["effects"]
+        cards.append((label, (before if unchanged else f"{before} → {after}") + unit))
+    return cards
+
+
+def _effects(report: dict, folder: Path) -> dict[str, list[dict]]:
+    """Return the effects by the heading that they stand under."""
+    sections: dict[str, list[dict]] = {}
+    for effect in report["effects"]:
+        name, label = effect["name"], name_label(effect["name"])
+        heading = "Interpolated, not explained" if name in INTERPOLATIONS else "Effects found"
+        rows = [[parameter_label(key), _number(p["value"]), _interval(p), p["unit"]]
+                for key, p in effect["parameters"].items()]
+        sections.setdefault(heading, []).append({
+            "rank": effect["rank"], "name": name, "label": label, "evidence": _evidence(effect),
+            "picture": read_picture(folder / f"effect_{effect['rank']}_{name}.png", label),
+            "parameters": Table(("parameter", "value", "90 % interval", "unit"), rows)})
+    return sections
+
+
+def _causes(report: dict) -> list[dict]:
+    """Return the effects that explain something, which an interpolation does not."""
+    return [effect for effect in report["effects"] if effect["name"] not in INTERPOLATIONS]
+
+
+def _cause_names(report: dict) -> list[str]:
+    """Return their names, with a count where one was found several times."""
+    counts = Counter(name_label(effect["name"]) for effect in _causes(report))
+    return [name if count == 1 else f"{name} ({count} times)" for name, count in counts.items()]
+
+
+def _driver_names(drivers: list[dict]) -> list[str]:
+    return [variable_label(driver["variable"])[0] for driver in drivers[:MAX_NAMED]]
+
+
+def _evidence(effect: dict) -> str:
+    """Describe the form of an effect, its evidence, and what it may be confused with."""
+    text = f"{effect['variant'].capitalize()}. " if effect.get("variant") else ""
+    evidence = effect["evidence"]
+    text += (f"It raises the log-likelihood of the held-out links by "
+             f"{_number(evidence['heldout_nll_gain'])} nats (p {_p_value(evidence['p_value'])}).")
+    same = [name_label(name) for name in effect.get("indistinguishable_from", [])]
+    alike = [name_label(name) for name in effect.get("confused_with", [])
+             if name_label(name) not in same]
+    if same:
+        text += f" The data cannot distinguish it from {join_names(same)}."
+    return text + (f" Effects that may look alike: {join_names(alike)}." if alike else "")
+
+
+def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
+    """Return errors before and after for groups of links, and of other models for all links."""
+    rows: list[list[str]] = []
+    others = report["baselines"] if "los" in kinds else {}
+    columns = list(dict.fromkeys([*COLUMNS, *(key for each in others.values() for key in each)]))
+    groups = [("all links", report["error"])] if "los" in kinds else []
+    for kind in kinds:
+        group = report["error"].get(f"by_{kind}", {})
+        groups += [(GROUPS.get(name, KINDS[kind] + name), both) for name, both in group.items()
+                   if len(group) <= MAX_ROWS and both["before"]["n"]
+                   and (kind != "los" or both["before"]["n"] < report["error"]["before"]["n"])]
+    for number, (label, both) in enumerate(groups):
+        rows += [[label if when == "before" else "", when,
+                  *(_number(both[when].get(key)) for key in columns)]
+                 for when in ("before", "after")]
+        if number == 0:
+            rows += [["", name_label(name), *(_number(scores.get(key)) for key in columns)]
+                     for name, scores in others.items()]
+    heldout = report["heldout"]
+    headings = [COLUMNS.get(key, key.replace("_", " ")) for key in columns]
+    return Table(["", "model", *headings], rows,
+                 f"On held-out links (by {heldout['by']}, {heldout['folds']} folds)", 2)
+
+
+def _candidate_table(candidates: list[dict]) -> Table:
+    rows = [[c["step"], name_label(c["name"]), "kept" if c["kept"] else c["reason"],
+             _number(c["heldout_nll_gain"]), _number(c["heldout_rmse_db"]), _p_value(c["p_value"])]
+            for c in candidates]
+    return Table(("step", "effect", "kept, or why not", "held-out gain [nats]",
+                  "held-out RMSE [dB]", "p"), rows, "", 3,
+                 [number for number, c in enumerate(candidates) if c["kept"]])
+
+
+def _facts(report: dict) -> list[str]:
+    heldout, floor_db = report["heldout"], report["error"]["noise_floor_db"]
+    facts = [f"radiotwin {report.get('radiotwin_version', '')}", f"base {report['base']}",
+             f"{heldout['n']:,} links held out by {heldout['by']}"]
+    if floor_db is not None:
+        facts.append(f"standard deviation of repeated measurements {floor_db:.2f} dB")
+    return facts
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return "–"
+    if isinstance(value, int):
+        text = f"{value:,}"
+    elif 0.0005 < abs(value) < 0.1:
+        text = f"{value:.2g}"
+    else:
+        text = f"{value:.2f}" if abs(value) < 1000 else f"{value:,.0f}"
+    return text.replace("-", "−")
+
+
+def _interval(parameter: dict) -> str:
+    low, high = parameter["low"], parameter["high"]
+    return "–" if None in (low, high) or low == high else f"{_number(low)} to {_number(high)}"
+
+
+def _p_value(value: float | None) -> str:
+    return "–" if value is None else "< 0.001" if value < 0.001 else f"{value:.3f}"

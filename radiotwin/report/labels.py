@@ -1,0 +1,81 @@
+"""Names of variables, effects, models and parameters as they are printed."""
+
+VARIABLES = {  # label and unit
+    "distance_m": ("distance", "m"), "elevation_deg": ("elevation at the device", "°"),
+    "azimuth_deg": ("azimuth at the device", "° from north"),
+    "body_azimuth_deg": ("direction of arrival", "° from the heading"),
+    "heading_deg": ("heading of the receiver", "° from north"),
+    "time_in_flight_s": ("time in flight", "s"), "time_s": ("time", "s"),
+    "flight": ("flight", ""), "altitude_m": ("receiver altitude", "m"),
+    "receiver": ("receiver", ""), "device": ("device", ""), "los": ("line of sight", ""),
+    "predicted_level_db": ("predicted level", "dB"),
+    "metres_inside_m": ("path length inside buildings", "m"),
+    "diffraction_parameter": ("diffraction parameter", ""), "quality": ("quality", ""),
+    "place_of_ray": ("position of the link's midpoint", ""),
+    "place_of_receiver": ("receiver position", ""),
+}
+PARAMETERS = {
+    "x_m": "x, east", "y_m": "y, north", "turn_deg": "orientation", "offset_db": "offset",
+    "gain_db": "gain", "warm_up_db": "excess at switch-on",
+    "warm_up_each_flight_db": "excess at take-off", "ageing_db": "change from first to last",
+    "step_db": "step", "step_time_s": "time of the step", "time_constant_s": "time constant",
+    "azimuth_deg": "boresight", "front_to_back_db": "front-to-back ratio", "tilt_deg": "tilt",
+    "vertical_beamwidth_deg": "vertical beamwidth", "beamwidth_deg": "beamwidth",
+    "lean_azimuth_deg": "azimuth of the tilt, from the heading",
+    "clearest_side_deg": "least obstructed side, from the heading",
+    "limit": "limit of detection", "floor": "noise floor", "saturation_level": "saturation level",
+    "strength_db": "strength relative to theory",
+    "specific_attenuation_db_km": "specific attenuation",
+    "specific_attenuation_db_m": "specific attenuation", "greatest_loss_db": "maximum loss",
+    "scale_height_m": "scale height (1/e)",
+    "scattered_db": "scattered power, relative to free space", "strength": "strength",
+    "roughness_m": "ground roughness", "ground_m": "ground height",
+    "lost_share": "dropout probability", "rise_and_fall_db": "peak-to-peak variation",
+    "level_at_100_m": "level at 100 m", "length_m": "length", "width_m": "width",
+    "height_m": "height", "share": "share of the variance", "sigma_db": "standard deviation",
+    "true_minus_given_x_m": "true − given position, east",
+    "true_minus_given_y_m": "true − given position, north",
+    "true_minus_given_z_m": "true − given height",
+}
+SUFFIXES = {"_db_km": "dB/km", "_db_m": "dB/m", "_deg": "°", "_db": "dB", "_dbm": "dBm",
+            "_m": "m", "_s": "s"}
+NAMES = {"log_distance": "log-distance law", "raytrace": "ray tracer"}
+MODELS = {"log_distance": "log-distance", "segmented_log_distance": "segmented log-distance",
+          "segmented_nn": "segmented NN", "regression_kriging": "regression kriging"}
+INTERPOLATIONS = ("correlated_shadowing", "unexplained_trend")
+"""Effects that fit what is left without a cause."""
+
+
+def name_label(name: str) -> str:
+    """Return the printed name of an effect or a base: `receiver_drift` -> `receiver drift`."""
+    return NAMES.get(name, name.replace("_", " "))
+
+
+def variable_label(name: str) -> tuple[str, str]:
+    """Return the label and the unit of a variable; without an entry, both from its name."""
+    if name in VARIABLES:
+        return VARIABLES[name]
+    stem, unit = _split_unit(name)
+    return stem.replace("_", " "), unit
+
+
+def parameter_label(name: str) -> str:
+    """Return the label of a parameter with its member: `tilt_deg[uav1]` -> `tilt (uav1)`."""
+    stem, bracket, member = name.partition("[")
+    label = PARAMETERS.get(stem) or _split_unit(stem)[0].replace("_", " ")
+    return f"{label} ({member.removesuffix(']')})" if bracket else label
+
+
+def join_names(names: list[str]) -> str:
+    """Join names as `a, b and c`, each once."""
+    names = list(dict.fromkeys(names))
+    if not names:
+        return "no variable"
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
+
+
+def _split_unit(name: str) -> tuple[str, str]:
+    for suffix, unit in SUFFIXES.items():
+        if name.endswith(suffix) and name != suffix:
+            return name.removesuffix(suffix), unit
+    return name, ""

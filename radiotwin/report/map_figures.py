@@ -1,0 +1,141 @@
+"""Draw radio maps over the outlines of the buildings."""
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+
+from radiotwin.compare import comparable_db
+from radiotwin.radiomap import RadioMap
+from radiotwin.report.labels import MODELS
+from radiotwin.report.style import (
+    DIFFERENCE_COLOURS,
+    GAIN_COLOURS,
+    level_range_db,
+    new_figure,
+    save,
+)
+from radiotwin.scene import Scene
+from radiotwin.scene.preview import height_grid
+
+BUILDING_M = 2.0  # lowest height that is outlined
+OUTLINE_CELLS = 400  # along the longer side
+MAX_COLUMNS = 5
+ERROR_RANGE_DB = 25.0
+HeightGrid = tuple[np.ndarray, tuple[float, float, float, float]]
+"""(ny, nx) heights [m], and x_min, x_max, y_min, y_max [m]."""
+
+
+def write_picture(radio_map: RadioMap, scene: Scene, path: Path | str) -> None:
+    """Write the gain of all devices at the lowest altitude as a PNG file.
+
+    Args:
+        radio_map: map to draw.
+        scene: whose buildings are outlined.
+        path: PNG file.
+    """
+    save(radio_map_figure(radio_map, scene), path)
+
+
+def radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
+    """Draw the gain of every device at the lowest altitude, a panel for each.
+
+    Args:
+        radio_map: map to draw.
+        scene: whose buildings are outlined.
+    """
+    names, gain_db = radio_map.devices, radio_map.gain_db[:, 0]
+    columns = min(len(names), MAX_COLUMNS)
+    x_min, x_max, y_min, y_max = scene.config.extent.bounds
+    figure, axes = panels(-(-len(names) // columns), columns, 2.6,
+                          0.6 + 2.3 * (y_max - y_min) / (x_max - x_min))
+    colour_range = level_range_db(gain_db)
+    heights = height_grid(scene, OUTLINE_CELLS)
+    position_m = true_positions_m(scene)
+    for number, ax in enumerate(axes.flat):
+        if number >= len(names):
+            ax.set_axis_off()
+            continue
+        image = _draw_map(ax, gain_db[number], radio_map, heights, GAIN_COLOURS, *colour_range)
+        _mark_device(ax, position_m.get(names[number]), 8)
+        ax.set_title(names[number], fontsize=10)
+        if number % columns:
+            ax.set(ylabel="", yticklabels=[])
+        if number + columns < len(names):
+            ax.set(xlabel="", xticklabels=[])
+    figure.colorbar(image, ax=axes, label="channel gain [dB]", shrink=0.7)
+    source = radio_map.dataset.attrs.get("source", "")
+    figure.suptitle(f"{source} at {radio_map.lattice.z_m[0]:g} m (triangle: device)")
+    return figure
+
+
+def model_maps_figure(truth: RadioMap, models: dict[str, RadioMap], scene: Scene,
+                      device: str) -> Figure:
+    """Draw the truth beside models, and their errors, for one device at the lowest altitude.
+
+    Args:
+        truth: map of reference gains.
+        models: name -> map over the same lattice with that device.
+        scene: whose buildings are outlined.
+        device: name of the device.
+    """
+    figure, axes = panels(2, 1 + len(models), 4.0, 4.3)
+    heights = height_grid(scene, OUTLINE_CELLS)
+    true_db = truth.gain_db[truth.devices.index(device), 0]
+    colour_range = level_range_db(true_db)
+    gain_image = _draw_map(axes[0, 0], true_db, truth, heights, GAIN_COLOURS, *colour_range)
+    axes[0, 0].set_title("truth")
+    axes[1, 0].set_axis_off()
+    axes[1, 0].text(
+        0.02, 0.5, f"device {device}\nat {truth.lattice.z_m[0]:g} m altitude\n\n"
+        "top: channel gain\nbottom: model − truth\ntriangle: device\nwhite: not detected\n\n"
+        "models: mean of\nthe detected levels", transform=axes[1, 0].transAxes, fontsize=11)
+    for column, (name, radio_map) in enumerate(models.items(), start=1):
+        model_db = comparable_db(radio_map, truth)[radio_map.devices.index(device), 0]
+        error_db = model_db - true_db
+        _draw_map(axes[0, column], model_db, radio_map, heights, GAIN_COLOURS, *colour_range)
+        axes[0, column].set_title(MODELS.get(name, name))
+        error_image = _draw_map(axes[1, column], error_db, truth, heights, DIFFERENCE_COLOURS,
+                                -ERROR_RANGE_DB, ERROR_RANGE_DB)
+        axes[1, column].set_title(f"difference, RMSE {np.sqrt(np.nanmean(error_db**2)):.1f} dB",
+                                  fontsize=10)
+    for ax in (*axes[0], *axes[1, 1:]):
+        _mark_device(ax, true_positions_m(scene).get(device), 9)
+    figure.colorbar(gain_image, ax=axes[0], label="channel gain [dB]", shrink=0.85)
+    figure.colorbar(error_image, ax=axes[1], label="model − truth [dB]", shrink=0.85,
+                    extend="both")
+    return figure
+
+
+def panels(rows: int, columns: int, width_in: float, height_in: float) -> tuple[Figure, np.ndarray]:
+    """Return a figure and its (rows, columns) axes, each of a size in inches."""
+    figure = new_figure(width_in * columns + 1.2, height_in * rows)
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def true_positions_m(scene: Scene) -> dict[str, np.ndarray]:
+    """Return the position (3,) of each device of a scene [m]."""
+    return dict(zip([device.device for device in scene.config.devices], scene.device_m))
+
+
+def _draw_map(ax: Axes, level_db: np.ndarray, radio_map: RadioMap, heights: HeightGrid,
+              colours: str, low_db: float, high_db: float) -> AxesImage:
+    """Draw (ny, nx) levels over the lattice of a map, with the outlines of the buildings."""
+    lattice = radio_map.lattice
+    half_m = lattice.step_m / 2
+    extent = (lattice.x_m[0] - half_m, lattice.x_m[-1] + half_m,
+              lattice.y_m[0] - half_m, lattice.y_m[-1] + half_m)
+    image = ax.imshow(level_db, origin="lower", extent=extent, cmap=colours, vmin=low_db,
+                      vmax=high_db, interpolation="nearest")
+    height_m, bounds = heights
+    ax.contour(height_m > BUILDING_M, levels=[0.5], origin="lower", extent=bounds, colors="black",
+               linewidths=0.4, alpha=0.5)
+    ax.set(xlabel="x, east [m]", ylabel="y, north [m]", aspect="equal")
+    return image
+
+
+def _mark_device(ax: Axes, position_m: np.ndarray | None, size: float) -> None:
+    if position_m is not None:
+        ax.plot(*position_m[:2], "^", color="white", markeredgecolor="black", markersize=size)

@@ -1,0 +1,106 @@
+"""The page of a close-loop: right for each verdict, and never stopped by what a file may hold."""
+
+import re
+
+import pytest
+
+from radiotwin.report.closeloop_page import summary, write_closeloop_page
+from radiotwin.report.labels import join_names, parameter_label, variable_label
+
+SCORES = {"n": 900, "bias_db": 0.04, "std_db": 3.0, "correlation": 0.9, "rmse_db": 3.0, "mae_db": 2.2, "nll": 2.5}
+NOTHING = {"n": 0} | dict.fromkeys(["bias_db", "std_db", "correlation", "rmse_db", "mae_db", "nll"])
+DRIFT = {"name": "receiver_drift", "variant": "", "rank": 1, "setting": {}, "confused_with": ["interference"],
+         "indistinguishable_from": ["receiver_gain_offset"],
+         "parameters": {"step_db[r<0>]": {"value": -6.0, "low": -6.5, "high": -5.5, "unit": "dB"},
+                        "step_time_s[r<0>]": {"value": 500.0, "low": None, "high": None, "unit": "s"}},
+         "evidence": {"heldout_nll_gain": 210.0, "p_value": 1e-9}}
+
+
+def report(verdict="effect", **changes):
+    """The content of a `closeloop.json`."""
+    found = verdict == "effect"
+    after = SCORES | {"rmse_db": 2.0, "std_db": 2.0} if found else SCORES
+    drivers = [{"variable": "time_in_flight_s", "p_value": 0.0004, "effect_db": 1.5}]
+    return {
+        "schema": "radiotwin.closeloop/1", "radiotwin_version": "0", "base": "twin", "verdict": verdict,
+        "effects": [DRIFT] if found else [],
+        "candidates": [{"name": "receiver_drift", "step": 1, "heldout_rmse_db": 2.0, "heldout_nll_gain": 210.0,
+                        "p_value": 1e-9, "kept": found, "reason": "" if found else "gains nothing"},
+                       {"name": "foliage", "step": 1, "heldout_rmse_db": None, "heldout_nll_gain": None,
+                        "p_value": None, "kept": False, "reason": "nothing in the residual looks like it"}],
+        "heldout": {"by": "flight", "folds": 6, "n": 900},
+        "error": {"before": SCORES, "after": after, "noise_floor_db": None,
+                  "by_device": {"<b>": {"before": SCORES, "after": after},
+                                "d1": {"before": NOTHING, "after": NOTHING}}},
+        "baselines": {"log_distance": SCORES | {"rmse_db": 7.0},
+                      "regression_kriging": {"rmse_db": 5.5, "median_db": 1}},
+        "structure_before": drivers,
+        "remaining": {"structured": verdict == "unexplained", "drivers": drivers if verdict == "unexplained" else []},
+        "remarks": ["receiver <i> has 3 only"]} | changes
+
+
+def page(content, folder):
+    write_closeloop_page(content, folder, "Close-loop of <x>")
+    return (folder / "closeloop.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("verdict, sentence, badge", [
+    ("effect", "The model lacked receiver drift. With it the RMSE on held-out links falls from 3.00 to 2.00 dB",
+     "found: receiver drift"),
+    ("none", "Nothing is missing: the residual (3.00 dB RMSE)", "nothing is missing"),
+    ("unexplained",
+     "no effect of the catalogue explains: the residual (3.00 dB RMSE) depends on time in flight",
+     "unexplained")])
+def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
+    text = page(report(verdict), tmp_path)
+    assert sentence in text and f"<b>{badge}</b>" in text
+    assert text.index(sentence) < text.index("<h2>")
+    assert not re.search(r'(src|href)="(?!data:)|https?://|<script', text)  # one file, no network
+
+
+def test_names_from_the_data_are_no_markup(tmp_path):
+    text = page(report(), tmp_path)
+    for written in ("device &lt;b&gt;", "step (r&lt;0&gt;)", "receiver &lt;i&gt; has 3 only",
+                    "Close-loop of &lt;x&gt;"):
+        assert written in text
+    assert "<i>" not in text and "<x>" not in text
+
+
+def test_the_figures_that_planners_judge_by_stand_in_one_table_with_the_other_models(tmp_path):
+    text = page(report(), tmp_path)
+    table = text[text.index("Error before and after"):text.index("by device, receiver and flight")]
+    for words in ("mean residual [dB]", "standard deviation [dB]", "correlation", "log-distance law", "7.00",
+                  "regression kriging", "5.50", "median db"):
+        assert words in table
+
+
+def test_what_an_effect_may_be_taken_for_is_said(tmp_path):
+    text = page(report(), tmp_path)
+    assert "The data cannot distinguish it from receiver gain offset." in text
+    assert "Effects that may look alike: interference." in text
+    assert "−6.50 to −5.50" in text
+    assert "nothing in the residual looks like it" in text
+
+
+def test_numbers_that_are_not_known_are_dashes(tmp_path):
+    unknown = report("none", baselines={"log_distance": NOTHING}, structure_before=[])
+    unknown["error"] |= {"before": NOTHING, "after": NOTHING}
+    assert "(– dB RMSE)" in summary(unknown)
+    assert "None" not in page(unknown, tmp_path) and "nan" not in page(unknown, tmp_path)
+
+
+def test_a_last_resort_is_not_called_an_explanation(tmp_path):
+    shadowing = DRIFT | {"name": "correlated_shadowing", "rank": 2}
+    filled = report("unexplained", effects=[shadowing])
+    assert "which explains nothing, brings the RMSE to 3.00 dB" in summary(filled)
+    filled = report("effect", effects=[DRIFT, shadowing])
+    filled["error"]["after"] |= {"rmse_db": 1.5}
+    assert "lacked receiver drift. With it the RMSE on held-out links falls from 3.00 to 2.00 dB" in summary(filled)
+    assert "brings the RMSE to 1.50 dB" in summary(filled) and "found: receiver drift<" in page(filled, tmp_path)
+
+
+def test_names_in_words():
+    assert parameter_label("tilt_deg[uav1]") == "tilt (uav1)" and parameter_label("odd_thing_db") == "odd thing"
+    assert variable_label("time_in_flight_s") == ("time in flight", "s")
+    assert variable_label("odd_length_m") == ("odd length", "m")
+    assert join_names(["a", "b", "a", "c"]) == "a, b and c"
