@@ -204,7 +204,7 @@ WRONG = {
     "a device that is not declared": (lambda links, devices: (links, devices[1:]),
                                       ["row 2, column device", "'d0' is not in devices.csv", "add it there"]),
     "a device declared twice": (lambda links, devices: (links, pd.concat([devices, devices[:1]])),
-                                ["devices.csv: row 6", "'d0' stands there twice", "one row"]),
+                                ["devices.csv: row 6", "'d0' occurs twice", "one row"]),
     "an anchor without a place": (put("x_m", "", [0], 1), ["devices.csv: row 2", "anchor 'd0' has no x_m", "fill"]),
     "no anchor": (put("role", "unknown", table=1), ["at least 60", "without a scene", "cannot be located"]),
     "a frequency in megahertz": (put("frequency_hz", 2400, table=1), ["frequency_hz", "'2400'", "the unit is Hz"]),

@@ -60,7 +60,7 @@ def test_a_moving_device_is_named_by_its_position(bring_in, local):
     result = bring_in(text, columns=by_position, length_unit="m")
     assert list(result.table["device"]) == ["p1", "p2", "p1"] and reasons(result) == {"no device": 1}
     assert result.measurements.device_m[:, :2].tolist() == [[30, 40], [50, 60]] and result.measurements.is_anchor.all()
-    with pytest.raises(BadInput, match=r"device '_' stands at places 20 m apart.*by position"):
+    with pytest.raises(BadInput, match=r"device '_' has positions 20 m apart.*by position"):
         bring_in(text, columns=by_position | {"device": "device"}, length_unit="m")
 
 
@@ -134,7 +134,7 @@ def test_local_means_say_how_many_readings(bring_in, local):
 @pytest.mark.parametrize(("text", "given", "words"), [
     ("a,0,0,-80\nb,300000,0,-80\n", {}, "300 km apart"),
     ("a,0,0,none\na,0,1,none\na,0,2,-80\n", {"not_detected": ["empty"]}, "67% of the levels are not detected"),
-    ("".join(f"a,{i},0,{-90 - i % 5}\n" for i in range(30)), {}, "20% of the levels are -94, the least"),
+    ("".join(f"a,{i},0,{-90 - i % 5}\n" for i in range(30)), {}, "20% of the levels are -94, the smallest"),
     ("a,0,0,-80\n", {}, "1 of 1 devices have no position"),
 ])
 def test_what_looks_odd_is_said(bring_in, local, text, given, words):
@@ -201,7 +201,7 @@ def test_degrees_that_are_none(bring_in, text, message):
 
 @pytest.mark.parametrize(("table", "message"), [
     ("name,x,y\na,1,2\n", r"column 'device'.*is missing"),
-    ("device,x,y\na,1,2\na,1,2\n", "row 3, column device: 'a' stands there twice"),
+    ("device,x,y\na,1,2\na,1,2\n", "row 3, column device: 'a' occurs twice"),
     ("device,height\na,1\n", "there is no position"),
     ("device,latitude,longitude\na,95,2\n", "row 2, column latitude: '95' is no latitude"),
     ("device,x,y,frequency_hz\na,1,2,2.4\n", "row 2, column frequency_hz: '2.4' is no frequency"),
