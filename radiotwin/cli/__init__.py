@@ -1,6 +1,6 @@
-"""The command `radiotwin`: options in, one function of the library called, its result shown.
+"""The command `radiotwin`: parse options, call one function of the library, show its result.
 
-Whatever is heavy is imported inside the commands, so that `--help` answers at once.
+Heavy packages are imported inside the commands, so that `--help` answers at once.
 """
 
 import sys
@@ -10,14 +10,14 @@ import typer
 from radiotwin import __version__
 from radiotwin.cli import importing, loop, model, report, scenes, tools, world
 from radiotwin.command import add_output_options, exit_status
+from radiotwin.console import show_warnings_plainly
 
 app = typer.Typer(
     name="radiotwin", no_args_is_help=True, pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # else every [default] in a help text is taken for markup
-
+    rich_markup_mode=None,  # or every [default] in a help text is taken for markup
     context_settings={"help_option_names": ["-h", "--help"]},
-    help="Radio digital twins of cities, learnt from measurements. A scene is built, traced and surveyed; a twin is "
-         "fitted to the measurements, mapped and compared.")
+    help="Radio digital twins of cities, learnt from measurements. Build, trace and survey a "
+         "scene; fit a twin to the measurements; map and compare it.")
 
 for module in (scenes, world, importing, model, loop, report, tools):
     module.add_commands(app)
@@ -33,9 +33,9 @@ def _show_version(wanted: bool) -> None:
 @app.callback()
 def _options(version: bool = typer.Option(False, "--version", callback=_show_version, is_eager=True,
                                           help="Print the version and exit.")) -> None:
-    """Options before the command."""
+    show_warnings_plainly()
 
 
 def main() -> None:
     """Run the command line and end the process; see `exit_status`."""
-    sys.exit(exit_status(app, "what was finished is kept, run the same command again to go on"))
+    sys.exit(exit_status(app, "finished parts are kept; run the same command again to go on"))
