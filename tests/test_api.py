@@ -1,4 +1,4 @@
-"""`import radiotwin as rt`: quick, complete, and the documented lines run as they stand."""
+"""`import radiotwin as rt`: quick, complete, and the documented lines run as they are."""
 
 import ast
 import re

@@ -1,4 +1,4 @@
-"""The diagnosis: what it lists, and that each thing that can be wrong is said with what to do."""
+"""The diagnosis: its sections, and a remedy for each problem."""
 
 import io
 import sys

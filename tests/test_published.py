@@ -45,7 +45,7 @@ def wheel(tmp_path_factory):
     pytest.importorskip("setuptools", minversion="77")
     folder = tmp_path_factory.mktemp("wheel")
     shutil.copytree(ROOT, folder / "tree", symlinks=True,
-                    ignore=shutil.ignore_patterns(".*", "docs", "tests", "build", "dist", "site", "cache", "__pycache__"))
+                    ignore=shutil.ignore_patterns(".*", "docs", "tests", "build", "dist", "site", "cache", "runs"))
     program = "from setuptools import build_meta; print(build_meta.build_wheel('..'))"
     done = subprocess.run([sys.executable, "-c", program], cwd=folder / "tree", capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

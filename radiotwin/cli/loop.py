@@ -125,16 +125,16 @@ def locate(
     with progress("locating", total=unknown) as advance:
         world = Scene.load(scene) if scene else None
         model = corrected_model(known, world)
-        places, remarks = locate_file(data, known, model, world, lambda: advance(1))
-    for remark in remarks:
-        say(f"note: {remark}")
+        positions, notes = locate_file(data, known, model, world, lambda: advance(1))
+    for note in notes:
+        say(f"note: {note}")
     with atomic_path(out) as temporary:
-        places.to_csv(temporary, index=False)
+        positions.to_csv(temporary, index=False)
     if true is not None:
-        error = off_by(places, true)
+        error = off_by(positions, true)
         print_rows("How far off [m]", {"devices": "right", "median": "right", "90 %": "right",
                                        "within the 90 % radius": "right"},
                    [[error["devices"], error["median_m"], error["ninety_m"],
                      f"{error['within']:.0%}"]])
-    say(f"wrote {out}: {len(places)} of {unknown} unknown devices; half of the 90 % radii are "
-        f"below {places['radius_m'].median():.0f} m")
+    say(f"wrote {out}: {len(positions)} of {unknown} unknown devices; half of the 90 % radii are "
+        f"below {positions['radius_m'].median():.0f} m")
