@@ -62,7 +62,10 @@ def import_(
         help="Table of fixed receivers, in the same form.")] = None,
     gzip: Annotated[bool, typer.Option("--gzip", help="Write measurements.csv.gz.")] = False,
 ) -> None:
-    """Convert measurements of any layout for the other commands, and report what was left out."""
+    """Import measurements from a table of any layout.
+
+    The other commands read the result. A report counts what was left out.
+    """
     from radiotwin.importing import import_file, parse_columns, read_settings
     from radiotwin.progress import progress
 

@@ -35,7 +35,10 @@ def close_loop(
     seed: Annotated[int, typer.Option(
         min=0, help="Seed of folds, fits and permutations.")] = 0,
 ) -> None:
-    """Find what the model lacks, add it, and report by how much the error falls."""
+    """Find the effects that a model lacks.
+
+    They are added to the model, and the error before and after is reported.
+    """
     from radiotwin.closeloop.corrected import corrected_twin
     from radiotwin.closeloop.corrected_scene import check_corrected_target, write_corrected_scene
     from radiotwin.closeloop.figures import draw_figures
@@ -109,7 +112,10 @@ def locate(
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="Table of the positions.")] = Path("located.csv"),
 ) -> None:
-    """Find devices of role unknown by a corrected model, with or without a 3D map."""
+    """Locate unknown devices with a corrected model.
+
+    It works with or without a 3D map.
+    """
     from radiotwin.closeloop.corrected import corrected_model
     from radiotwin.closeloop.locate_file import locate_file, off_by
     from radiotwin.files import atomic_path, require_writable

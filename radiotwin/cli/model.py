@@ -47,7 +47,10 @@ def fit(
         "--allow-indoor", help="Unknown devices may be inside buildings.")] = False,
     seed: FitSeed = 0,
 ) -> None:
-    """Learn the channel from the anchors, then find the unknown devices: the twin."""
+    """Fit a twin: the channel and the unknown devices.
+
+    The channel is learnt from the anchors; then the unknown devices are located with it.
+    """
     from radiotwin.measurements import read_measurements
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin, check_twin_target, fit_twin
@@ -86,7 +89,10 @@ def map_(
     altitudes: Annotated[str | None, typer.Option(
         metavar="Z,…", help="Only these of the lattice's altitudes [m].")] = None,
 ) -> None:
-    """Predict the gain of every device over the scene's lattice, or convert a radio map."""
+    """Predict a radio map, or convert one.
+
+    It holds the gain of every device over the scene's lattice.
+    """
     from radiotwin.export import EXPORTERS, check_format, select
     from radiotwin.radiomap import RadioMap
     from radiotwin.scene import Scene
@@ -150,7 +156,10 @@ def compare(
              "repeated.")] = None,
     seed: FitSeed = 0,
 ) -> None:
-    """Compare all channel models on held-out flights, and with the truth map where there is one."""
+    """Compare all channel models on held-out flights.
+
+    With --truth they are compared with the truth map, too.
+    """
     from radiotwin.channel import MODELS
     from radiotwin.compare import compare_models, split_flights
     from radiotwin.comparison_output import judge_also, write_comparison

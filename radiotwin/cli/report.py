@@ -26,9 +26,9 @@ def report(
     measurements: Annotated[Path | None, typer.Option(
         help="Measurements of the flights to show, where the run does not hold them.")] = None,
 ) -> None:
-    """Write one HTML page of a run: the city in 3D with maps, flights and devices, and tables.
+    """Write one HTML page of a run.
 
-    The page opens without a network.
+    It shows the city in 3D with maps, flights and devices, and tables, and needs no network.
     """
     from radiotwin.files import require_writable
     from radiotwin.report import read_run, write_report

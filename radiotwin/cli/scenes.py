@@ -58,7 +58,10 @@ def build_scene(
         min=0, help="UAVs to place near the middle [3].")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the placement [0].")] = None,
 ) -> None:
-    """Convert a map or a city model to a scene folder, and report its contents and its errors."""
+    """Build a scene folder from a map or a city model.
+
+    A report lists its contents and all problems that were found.
+    """
     from radiotwin.footprints import map_suffix
     from radiotwin.scene.report import print_report
 

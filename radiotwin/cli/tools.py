@@ -23,9 +23,9 @@ def demo(
     seed: Annotated[int, typer.Option(
         min=0, help="Seed of placement, flights and fits.")] = 0,
 ) -> None:
-    """Run the whole chain on a small scene, in minutes: build, trace, survey, fit, compare, report.
+    """Run the whole chain on a small scene, in minutes.
 
-    It ends in an HTML page.
+    The steps are build, trace, survey, fit and compare; an HTML page shows the result.
     """
     from radiotwin.cli.model import print_comparison
     from radiotwin.demo import run_demo
@@ -36,7 +36,10 @@ def demo(
 
 
 def doctor() -> None:
-    """Check what works on this machine, and say how to mend what does not."""
+    """Check what works on this machine.
+
+    Each problem comes with its remedy.
+    """
     from radiotwin.doctor import print_diagnosis
 
     diagnosis = print_diagnosis(console)

@@ -27,7 +27,10 @@ def trace(
     devices: OnlyDevices = None,
     seed: RaySeed = 1,
 ) -> None:
-    """Ray-trace the truth with Sionna RT; resume a killed run, reuse a finished one."""
+    """Ray-trace the truth with Sionna RT.
+
+    A killed run is resumed, a finished one is reused.
+    """
     from radiotwin.scene import Scene
     from radiotwin.trace import SolverSettings, trace_map
 
@@ -57,7 +60,10 @@ def gains(
     quality: Quality = "default",
     seed: RaySeed = 1,
 ) -> None:
-    """Ray-trace gains at any points; an empty gain has a reason, such as no path."""
+    """Ray-trace gains at any points.
+
+    An empty gain has a reason, such as no path.
+    """
     from radiotwin.scene import Scene
     from radiotwin.trace import SolverSettings, read_points, trace_points
 
@@ -85,7 +91,10 @@ def survey(
              "shadowing of its own].")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of paths and noise.")] = 0,
 ) -> None:
-    """Fly the scene's UAVs through a truth map and write their measurements."""
+    """Fly the scene's UAVs through a truth map.
+
+    Their measurements are written, with a table of the devices.
+    """
     from radiotwin.scene import Scene
     from radiotwin.survey import fly_survey, read_truth
 
