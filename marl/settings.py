@@ -6,6 +6,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from radiotwin.errors import BadInput
+from radiotwin.published import published_scene
 
 
 class LearnerSettings(BaseModel):
@@ -62,7 +63,7 @@ class RunSettings(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
-    scene: Path = Field(Path("scenes/rbm"), description="scene folder")
+    scene: Path = Field(published_scene("rbm"), description="scene folder")
     truth: Literal["traced", "segmented"] = Field(
         "traced", description="what real flights meet: SCENE/truth.nc, or the statistical truth of the paper")
     twin: Literal["nn", "log-distance", "kriging", "raytrace", "truth"] = Field(

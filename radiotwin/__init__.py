@@ -1,7 +1,7 @@
 """Radio digital twins of cities, learnt from measurements.
 
-The objects and what is done with them stand here, `import radiotwin as rt`; each is loaded when it is first used, so
-that importing the package takes no time.
+`import radiotwin as rt` gives the objects and functions of `__all__`. Each is loaded when it is
+first used, so that importing the package takes no time.
 """
 
 from importlib import import_module
@@ -45,19 +45,20 @@ _MODULES = {
     "trace": ["SolverSettings", "trace_map"],
     "twin": ["Twin", "fit_twin"],
 }
-_WHERE = {name: module for module, names in _MODULES.items() for name in names}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [  # noqa: F822 - names that __getattr__ finds
-    "BadInput", "BuildOptions", "Comparison", "Loop", "Measurements", "RadioMap", "RunFailed", "Scene",
-    "SolverSettings", "Twin", "__version__", "build_preset", "build_scene", "close_loop", "compare_models",
-    "corrected_twin", "fit_twin", "fly_survey", "make_report", "read_measurements", "read_run", "score_map",
-    "segmented_truth", "split_flights", "trace_map", "write_report"]
+    "BadInput", "BuildOptions", "Comparison", "Loop", "Measurements", "RadioMap", "RunFailed",
+    "Scene", "SolverSettings", "Twin", "__version__", "build_preset", "build_scene", "close_loop",
+    "compare_models", "corrected_twin", "fit_twin", "fly_survey", "make_report",
+    "read_measurements", "read_run", "score_map", "segmented_truth", "split_flights", "trace_map",
+    "write_report"]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _WHERE:
+    if name not in _MODULE_OF:
         raise AttributeError(f"module 'radiotwin' has no attribute {name!r}")
-    return getattr(import_module(f"radiotwin.{_WHERE[name]}"), name)
+    return getattr(import_module(f"radiotwin.{_MODULE_OF[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -1,4 +1,4 @@
-"""What works on this machine, and what to do about what does not."""
+"""Checks of this machine: what works, and how to mend what does not."""
 
 import math
 import os
@@ -17,11 +17,11 @@ from scipy.constants import speed_of_light
 from radiotwin import llvm
 
 GIB = 2**30
-MEMORY_WANTED_GIB = 4
-DISK_WANTED_GIB = 2
-TRACE_TIMEOUT_S = 120
+MIN_MEMORY_GIB = 4  # twice what tracing scenes/rbm takes (docs/results.md)
+MIN_DISK_GIB = 2
+TRACE_TIMEOUT_S = 120  # a first run compiles its kernels
 
-# One link through free space: the whole way from the import to a gain, in a process that may well abort.
+# One link in free space, in a process of its own: a wrong libLLVM may abort it.
 _TRACE = """
 import numpy as np
 from radiotwin import llvm
@@ -36,103 +36,96 @@ scene.add(sionna.rt.Receiver("receiver", [100, 0, 10]))
 real, imaginary = sionna.rt.PathSolver(deterministic=True)(scene, max_depth=0).a
 print(10 * np.log10(float((np.square(real) + np.square(imaginary)).sum())))
 """
-_FREE_SPACE_GAIN_DB = 20 * math.log10(speed_of_light / 2.4e9 / (4 * math.pi * 100))  # Friis, the same link
-_TESTED_VERSIONS = "install the versions of sionna-rt, mitsuba and drjit that constraints.txt names"
+# Friis' equation for the same link.
+_FREE_SPACE_GAIN_DB = 20 * math.log10(speed_of_light / 2.4e9 / (4 * math.pi * 100))
+_REMEDY = "install the versions of sionna-rt, mitsuba and drjit that constraints.txt names"
+
+Rows = list[tuple[str, str]]
 
 
 @dataclass
 class Diagnosis:
-    """What was found: rows of (what, finding) under each heading, and one line for each thing to do.
+    """Findings about this machine.
 
-    `problems` keep something from working; `cautions` do not.
+    Attributes:
+        sections: heading -> rows of (item, finding).
+        problems: what keeps something from working, with the remedy; one line each.
+        cautions: what does not, but may later.
     """
 
-    sections: dict[str, list[tuple[str, str]]] = field(default_factory=dict)
+    sections: dict[str, Rows] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
     cautions: list[str] = field(default_factory=list)
 
     @property
     def healthy(self) -> bool:
+        """Whether everything works."""
         return not self.problems
 
 
-def _check_packages(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """The packages that radiotwin itself declares, with the versions that are installed."""
-    try:
-        rows = [("radiotwin", version("radiotwin"))]
-        requirements = requires("radiotwin") or []
-    except PackageNotFoundError:
-        diagnosis.problems.append("radiotwin runs from a folder and is not installed: pip install -e .")
-        return [("radiotwin", "not installed")]
-    for requirement in requirements:
-        name = re.findall(r"^[\w.-]+", requirement)[0]
-        extra = re.search(r"extra == ['\"]([\w-]+)", requirement)
-        try:
-            rows.append((name, version(name)))
-        except PackageNotFoundError:
-            rows.append((name, f"not installed (extra '{extra[1]}')" if extra else "MISSING"))
-            if not extra and ";" not in requirement:
-                diagnosis.problems.append(f"the package {name} is missing: pip install '{requirement}'")
-    return rows
+def diagnose() -> Diagnosis:
+    """Check everything that radiotwin needs; what may crash runs in a process of its own."""
+    diagnosis = Diagnosis()
+    diagnosis.sections["System"] = [
+        ("Python", f"{platform.python_version()} ({sys.executable})"),
+        ("platform", platform.platform()),
+    ]
+    diagnosis.sections["Machine"] = _check_machine(diagnosis)
+    diagnosis.sections["GPU"] = _check_gpu()
+    diagnosis.sections["Packages"] = _check_packages(diagnosis)
+    diagnosis.sections["libLLVM"] = _check_llvm(diagnosis)
+    diagnosis.sections["Tracing"] = (
+        _check_tracing(diagnosis) if llvm.available()
+        else [("rays", "cannot be traced; everything else works")])
+    return diagnosis
 
 
-def _check_llvm(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    chosen = llvm.choose()
-    rows = []
-    for candidate in llvm.find():
-        reason = llvm.refusal(candidate)
-        state = "works, chosen" if candidate == chosen else reason or "works"
-        rows.append((str(candidate), state))
-    if os.environ.get(llvm.VARIABLE):
-        rows.append((llvm.VARIABLE, os.environ[llvm.VARIABLE]))
-    if chosen is None:
-        diagnosis.problems.append(llvm.advice())
-    return rows or [("libLLVM", "none found")]
+def print_diagnosis(console: Console) -> Diagnosis:
+    """Check this machine, and print findings and remedies.
+
+    Args:
+        console: to print on.
+    """
+    with console.status("checking this machine"):
+        diagnosis = diagnose()
+
+    def say(text: str, style: str | None = None) -> None:  # neither wraps paths nor reads markup
+        console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
+    for heading, rows in diagnosis.sections.items():
+        say(heading, "bold")
+        width = max(len(item) for item, _ in rows)
+        for item, finding in rows:
+            say(f"  {item:<{width}}  {finding}")
+    say("What to do", "bold")
+    for lines, style in ((diagnosis.problems, "red"), (diagnosis.cautions, "yellow")):
+        for line in lines:
+            say(f"  - {line}".replace("\n", "\n    "), style)
+    if diagnosis.healthy:
+        say("  Everything works.", "green")
+    return diagnosis
 
 
-def _check_tracing(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    """Trace one free-space link in a process of its own and hold it against its closed form."""
-    name = "one link of 100 m at 2.4 GHz"
-    command = [sys.executable, "-c", _TRACE]
-    try:
-        done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=TRACE_TIMEOUT_S)
-    except subprocess.TimeoutExpired:
-        diagnosis.problems.append(f"tracing one link did not end within {TRACE_TIMEOUT_S} s")
-        return [(name, "did not end")]
-    if done.returncode != 0:
-        complaint = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
-        diagnosis.problems.append(f"tracing fails ({complaint}): {_TESTED_VERSIONS}")
-        return [(name, f"fails: {complaint}")]
-    gain_db = float(done.stdout.split()[-1])
-    if abs(gain_db - _FREE_SPACE_GAIN_DB) > 0.01:
-        diagnosis.problems.append(
-            f"tracing gives {gain_db:.2f} dB, free space has {_FREE_SPACE_GAIN_DB:.2f} dB: {_TESTED_VERSIONS}"
-        )
-    return [(name, f"{gain_db:.2f} dB (free space: {_FREE_SPACE_GAIN_DB:.2f} dB)")]
-
-
-def _check_gpu() -> list[tuple[str, str]]:
-    """Graphics processors; none is no problem, everything runs on the processor."""
-    rows = []
-    if shutil.which("nvidia-smi"):
-        query = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
-        answer = subprocess.run(query, check=False, capture_output=True, text=True)
-        if answer.returncode == 0:
-            rows += [("GPU", line) for line in answer.stdout.strip().splitlines()]
-    if not rows:
-        return [("GPU", "none: everything runs on the processor")]
-    try:
-        import torch  # takes seconds
-
-        used = torch.cuda.is_available()
-        rows.append(("torch", "uses it" if used else "does not use it (a CPU build, or the driver)"))
-    except (ImportError, OSError) as error:
-        rows.append(("torch", f"cannot be imported: {error}"))
-    return rows
+def _check_machine(diagnosis: Diagnosis) -> Rows:
+    affinity = getattr(os, "sched_getaffinity", None)  # missing on macOS and Windows
+    cores = len(affinity(0)) if affinity else os.cpu_count()
+    memory_gib = _memory_gib()
+    disk_gib = shutil.disk_usage(Path.cwd()).free / GIB
+    if memory_gib is not None and memory_gib < MIN_MEMORY_GIB:
+        diagnosis.cautions.append(f"{memory_gib:.1f} GiB of memory: tracing a city takes up to "
+                                  f"{MIN_MEMORY_GIB} GiB")
+    if disk_gib < MIN_DISK_GIB:
+        diagnosis.cautions.append(f"{disk_gib:.1f} GiB of disk free here: have {MIN_DISK_GIB} GiB "
+                                  "before you trace cities")
+    return [
+        ("cores", str(cores)),
+        ("memory", "unknown" if memory_gib is None else f"{memory_gib:.1f} GiB"),
+        ("free disk here", f"{disk_gib:.1f} GiB"),
+    ]
 
 
 def _memory_gib() -> float | None:
-    """What this process may use [GiB]: the machine's memory or its container's limit; None if unknown."""
+    """Return the memory of the machine, or its container's limit [GiB]; None if unknown."""
     try:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):  # Windows
@@ -144,60 +137,77 @@ def _memory_gib() -> float | None:
     return memory / GIB
 
 
-def _check_machine(diagnosis: Diagnosis) -> list[tuple[str, str]]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    memory_gib = _memory_gib()
-    disk_gib = shutil.disk_usage(Path.cwd()).free / GIB
-    if memory_gib is not None and memory_gib < MEMORY_WANTED_GIB:
-        diagnosis.cautions.append(
-            f"{memory_gib:.1f} GiB of memory: tracing a city takes up to {MEMORY_WANTED_GIB} GiB"
-        )
-    if disk_gib < DISK_WANTED_GIB:
-        diagnosis.cautions.append(
-            f"{disk_gib:.1f} GiB of disk free here: have {DISK_WANTED_GIB} GiB before you trace cities"
-        )
-    return [
-        ("cores", str(cores)),
-        ("memory", "unknown" if memory_gib is None else f"{memory_gib:.1f} GiB"),
-        ("free disk here", f"{disk_gib:.1f} GiB"),
-    ]
+def _check_gpu() -> Rows:
+    """List graphics processors; without one everything runs on the processor."""
+    rows = []
+    if shutil.which("nvidia-smi"):
+        query = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version",
+                 "--format=csv,noheader"]
+        answer = subprocess.run(query, check=False, capture_output=True, text=True)
+        if answer.returncode == 0:
+            rows += [("GPU", line) for line in answer.stdout.strip().splitlines()]
+    if not rows:
+        return [("GPU", "none: everything runs on the processor")]
+    try:
+        import torch  # takes seconds
+
+        used = torch.cuda.is_available()
+        rows.append(("torch", "uses it" if used else
+                     "does not use it (a CPU build, or the driver)"))
+    except (ImportError, OSError) as error:
+        rows.append(("torch", f"cannot be imported: {error}"))
+    return rows
 
 
-def diagnose() -> Diagnosis:
-    """Look at everything that radiotwin needs; nothing that fails in it can end this process."""
-    diagnosis = Diagnosis()
-    diagnosis.sections["System"] = [
-        ("Python", f"{platform.python_version()} ({sys.executable})"),
-        ("platform", platform.platform()),
-    ]
-    diagnosis.sections["Machine"] = _check_machine(diagnosis)
-    diagnosis.sections["GPU"] = _check_gpu()
-    diagnosis.sections["Packages"] = _check_packages(diagnosis)
-    diagnosis.sections["libLLVM"] = _check_llvm(diagnosis)
-    if llvm.available():
-        diagnosis.sections["Tracing"] = _check_tracing(diagnosis)
-    else:
-        diagnosis.sections["Tracing"] = [("rays", "cannot be traced; everything else works")]
-    return diagnosis
+def _check_packages(diagnosis: Diagnosis) -> Rows:
+    """List the packages that radiotwin declares, with their installed versions."""
+    try:
+        rows = [("radiotwin", version("radiotwin"))]
+        requirements = requires("radiotwin") or []
+    except PackageNotFoundError:
+        diagnosis.problems.append("radiotwin runs from a folder and is not installed: pip install "
+                                  "-e .")
+        return [("radiotwin", "not installed")]
+    for requirement in requirements:
+        name = re.findall(r"^[\w.-]+", requirement)[0]
+        extra = re.search(r"extra == ['\"]([\w-]+)", requirement)
+        try:
+            rows.append((name, version(name)))
+        except PackageNotFoundError:
+            rows.append((name, f"not installed (extra '{extra[1]}')" if extra else "MISSING"))
+            if not extra and ";" not in requirement:
+                diagnosis.problems.append(f"the package {name} is missing: pip install "
+                                          f"'{requirement}'")
+    return rows
 
 
-def run(console: Console) -> Diagnosis:
-    """Print the diagnosis, and what to do, on `console`."""
-    with console.status("looking at this machine"):
-        diagnosis = diagnose()
+def _check_llvm(diagnosis: Diagnosis) -> Rows:
+    chosen = llvm.choose()
+    rows = [(str(candidate), "works, chosen" if candidate == chosen
+             else llvm.rejection(candidate) or "works") for candidate in llvm.find()]
+    if os.environ.get(llvm.VARIABLE):
+        rows.append((llvm.VARIABLE, os.environ[llvm.VARIABLE]))
+    if chosen is None:
+        diagnosis.problems.append(llvm.advice())
+    return rows or [("libLLVM", "none found")]
 
-    def say(text: str, style: str | None = None) -> None:  # paths as they are: neither wrapped nor markup
-        console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
-    for heading, rows in diagnosis.sections.items():
-        say(heading, "bold")
-        width = max(len(what) for what, _ in rows)
-        for what, finding in rows:
-            say(f"  {what:<{width}}  {finding}")
-    say("What to do", "bold")
-    for lines, style in ((diagnosis.problems, "red"), (diagnosis.cautions, "yellow")):
-        for line in lines:
-            say(f"  - {line}".replace("\n", "\n    "), style)
-    if diagnosis.healthy:
-        say("  Everything works.", "green")
-    return diagnosis
+def _check_tracing(diagnosis: Diagnosis) -> Rows:
+    """Trace one link in free space and compare it with Friis' equation."""
+    item = "one link of 100 m at 2.4 GHz"
+    command = [sys.executable, "-c", _TRACE]
+    try:
+        done = subprocess.run(command, check=False, capture_output=True, text=True,
+                              timeout=TRACE_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        diagnosis.problems.append(f"tracing one link did not end within {TRACE_TIMEOUT_S} s")
+        return [(item, "did not end")]
+    if done.returncode != 0:
+        complaint = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
+        diagnosis.problems.append(f"tracing fails ({complaint}): {_REMEDY}")
+        return [(item, f"fails: {complaint}")]
+    gain_db = float(done.stdout.split()[-1])
+    if abs(gain_db - _FREE_SPACE_GAIN_DB) > 0.01:
+        diagnosis.problems.append(f"tracing gives {gain_db:.2f} dB, free space has "
+                                  f"{_FREE_SPACE_GAIN_DB:.2f} dB: {_REMEDY}")
+    return [(item, f"{gain_db:.2f} dB (free space: {_FREE_SPACE_GAIN_DB:.2f} dB)")]

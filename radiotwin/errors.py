@@ -1,13 +1,13 @@
-"""The two ways a command can end badly, each with its exit status."""
+"""The two errors that a command reports to its user, each with its exit status."""
 
 
 class BadInput(Exception):
     """Input that cannot be used: exit status 2.
 
-    The message says what was given, what is allowed and what to do, with file, row and column where there
-    is one. Nothing has been written when it is raised.
+    The message names what was given, what is allowed and what to do, with file, row and column
+    where there is one. Nothing has been written when it is raised.
     """
 
 
 class RunFailed(Exception):
-    """The input was fine but the work could not be done: exit status 1."""
+    """Valid input on which the work could not be done: exit status 1."""

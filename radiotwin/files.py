@@ -1,4 +1,4 @@
-"""Outputs that are either whole or absent: written under a temporary name, then renamed."""
+"""Atomic output: files and folders are written under a temporary name, then renamed."""
 
 import errno
 import os
@@ -14,25 +14,42 @@ _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
 
 def require_writable(path: Path | str) -> None:
-    """Raise BadInput unless a file can be written at `path`; to be asked before long work, not after it."""
+    """Check that a file can be written; call it before long work.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        BadInput: the folder cannot be made or written, or `path` is not an ordinary file.
+    """
     path = Path(path)
     _refuse_folder(path)
-    with _parent_of(path), _reported(path), tempfile.NamedTemporaryFile(prefix=_prefix(path), dir=path.parent):
+    with (_parent_of(path), _reported(path),
+          tempfile.NamedTemporaryFile(prefix=_prefix(path), dir=path.parent)):
         pass
 
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """Yield a temporary path beside `path` (same suffixes); rename it on success, remove it on failure.
+    """Write a file atomically.
+
+    Args:
+        path: of the file; missing folders are made.
+
+    Yields:
+        a temporary path in the same folder with the same suffixes; it is renamed to `path` on
+        success and removed on failure.
 
     Raises:
-        BadInput: the folder cannot be made or written, the disk is full, or `path` is no ordinary file.
+        BadInput: the folder cannot be made or written, the disk is full, or `path` is not an
+            ordinary file.
     """
     path = Path(path)
     _refuse_folder(path)
     with _parent_of(path):
         with _reported(path):
-            handle, name = tempfile.mkstemp(prefix=_prefix(path), suffix="".join(path.suffixes), dir=path.parent)
+            handle, name = tempfile.mkstemp(prefix=_prefix(path), suffix="".join(path.suffixes),
+                                            dir=path.parent)
             os.close(handle)
         temporary = Path(name)
         try:
@@ -41,7 +58,7 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             with _reported(path):
                 umask = os.umask(0)
                 os.umask(umask)
-                temporary.chmod(0o666 & ~umask)  # mkstemp makes private files; an output is an ordinary one
+                temporary.chmod(0o666 & ~umask)  # mkstemp makes private files
                 os.replace(temporary, path)
         finally:
             temporary.unlink(missing_ok=True)
@@ -49,7 +66,14 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
 
 @contextmanager
 def atomic_folder(path: Path | str) -> Iterator[Path]:
-    """Yield an empty temporary folder beside `path`; it takes the place of `path` on success only.
+    """Write a folder atomically.
+
+    Args:
+        path: of the folder; missing parents are made.
+
+    Yields:
+        an empty temporary folder beside `path`, which replaces `path` on success and is removed on
+        failure.
 
     Raises:
         BadInput: the parent cannot be written, the disk is full, or `path` is a file.
@@ -72,7 +96,7 @@ def atomic_folder(path: Path | str) -> Iterator[Path]:
 
 
 def _swap(new: Path, path: Path) -> None:
-    """Put the folder `new` at `path`; the old one goes when the new one is there, and comes back when it fails."""
+    """Replace the folder `path` by `new`; restore the old one if that fails."""
     if not path.exists():
         os.replace(new, path)
         return
@@ -92,7 +116,7 @@ def _swap(new: Path, path: Path) -> None:
 
 @contextmanager
 def _parent_of(path: Path) -> Iterator[None]:
-    """Make the folders above `path`; of the new ones, those go again that got no file."""
+    """Make the folders above `path`, and remove the new ones that are empty in the end."""
     with _reported(path):
         new = [folder for folder in path.parents if not folder.exists()]
     try:
@@ -107,13 +131,14 @@ def _parent_of(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _reported(path: Path, numbers: tuple[int, ...] | None = None) -> Iterator[None]:
-    """Turn an OSError, or only those with these numbers, into BadInput about `path`."""
+    """Turn an OSError, or only those with these error numbers, into BadInput about `path`."""
     try:
         yield
     except OSError as error:
         if numbers is not None and error.errno not in numbers:
             raise
-        raise BadInput(f"cannot write {path}: {error.strerror or error}; choose another output path") from error
+        raise BadInput(f"cannot write {path}: {error.strerror or error}; choose another output "
+                       "path") from error
 
 
 def _refuse_folder(path: Path) -> None:

@@ -1,11 +1,12 @@
-"""Find a libLLVM that Dr.Jit can use, and name it to Dr.Jit before Dr.Jit is imported.
+"""Choice of a libLLVM that Dr.Jit can use, before Dr.Jit is imported.
 
-Dr.Jit loads libLLVM when it is imported, takes the first that it meets, and cannot be told otherwise later.
-One older than 15 leaves it without a CPU backend ("could not be found", though it was); 15 and 16 load, and
-abort the whole process at the first kernel that they cannot compile. So each candidate is tried in a process
-of its own.
+Dr.Jit loads the first libLLVM that it finds when it is imported, and never another one. A version
+below 15 leaves it without a CPU backend ("could not be found", though it was); 15 and 16 load, and
+abort the process at the first kernel that they cannot compile. Therefore each candidate is tried in
+a process of its own.
 
-`python -m radiotwin.llvm` prints the library that would be used, or says why there is none and exits with 1.
+`python -m radiotwin.llvm` prints the library that would be used, or the reason why there is none,
+with exit status 1.
 """
 
 import json
@@ -24,14 +25,13 @@ from radiotwin.errors import BadInput, RunFailed
 from radiotwin.files import atomic_path
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
-MINIMUM_VERSION = 17
+MIN_VERSION = 17  # of Dr.Jit 1.5
 PROBE_TIMEOUT_S = 120
 
-# libLLVM-14.so.1, libLLVM-14.0.6.so.1, libLLVM.so.19.1, libLLVM.19.dylib, libLLVM.dylib, LLVM-C.dll; neither
-# the parts of LLVM (libLLVMCore.so) nor what rustc brings for itself (libLLVM-17-rust-1.77.0-stable.so).
-_NAME = re.compile(
-    r"libLLVM(?:[-.](?P<before>\d+(?:\.\d+)*))?\.(?:so|dylib)(?:\.(?P<after>\d+(?:\.\d+)*))?|LLVM-C\.dll"
-)
+# libLLVM-14.so.1, libLLVM-14.0.6.so.1, libLLVM.so.19.1, libLLVM.19.dylib, libLLVM.dylib and
+# LLVM-C.dll; not the parts of LLVM (libLLVMCore.so), not rustc's own (libLLVM-17-rust-1.77.0.so).
+_NAME = re.compile(r"libLLVM(?:[-.](?P<before>\d+(?:\.\d+)*))?\.(?:so|dylib)"
+                   r"(?:\.(?P<after>\d+(?:\.\d+)*))?|LLVM-C\.dll")
 _FOLDERS = (
     "/usr/lib", "/usr/lib64", "/usr/lib/*-linux-*", "/usr/lib/llvm*/lib", "/usr/lib64/llvm*/lib*",
     "/usr/local/lib", "/usr/local/lib64", "/usr/local/opt/llvm*/lib", "/opt/homebrew/opt/llvm*/lib",
@@ -43,7 +43,7 @@ parts = [ctypes.c_uint() for _ in range(3)]
 ctypes.CDLL(sys.argv[1]).LLVMGetVersion(*map(ctypes.byref, parts))
 print(*(part.value for part in parts))
 """
-# The minimum is what LLVM 15 cannot compile. A new HOME keeps Dr.Jit from using a kernel out of its cache.
+# LLVM 15 cannot compile `minimum`. A new HOME keeps Dr.Jit from using a cached kernel.
 _PROBE = """
 import ctypes, os, sys, tempfile
 ctypes.CDLL(sys.argv[1])
@@ -64,13 +64,19 @@ with tempfile.TemporaryDirectory() as home:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A libLLVM on this machine. `version` is None where neither its name nor the library itself tells."""
+    """A libLLVM on this machine.
+
+    Attributes:
+        path: of the library.
+        version: None where neither the name nor the library itself gives it.
+    """
 
     path: Path
     version: tuple[int, ...] | None
 
     def __str__(self) -> str:
-        return f"{self.path} (version {'.'.join(map(str, self.version)) if self.version else 'unknown'})"
+        version = ".".join(map(str, self.version)) if self.version else "unknown"
+        return f"{self.path} (version {version})"
 
 
 def _version_in_name(name: str) -> tuple[int, ...] | None:
@@ -80,12 +86,12 @@ def _version_in_name(name: str) -> tuple[int, ...] | None:
 
 
 def _run_python(program: str, path: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-c", program, str(path)]
-    return subprocess.run(command, check=False, capture_output=True, text=True, timeout=PROBE_TIMEOUT_S)
+    return subprocess.run([sys.executable, "-c", program, str(path)], check=False,
+                          capture_output=True, text=True, timeout=PROBE_TIMEOUT_S)
 
 
-def _version_by_asking(path: Path) -> tuple[int, ...] | None:
-    """What the library says of itself; None where it cannot be loaded, or is older than 16 and cannot say."""
+def _version_in_library(path: Path) -> tuple[int, ...] | None:
+    """Return the version that the library reports; None if it cannot be loaded or is below 16."""
     try:
         answer = _run_python(_ASK_VERSION, path)
     except subprocess.TimeoutExpired:
@@ -94,7 +100,7 @@ def _version_by_asking(path: Path) -> tuple[int, ...] | None:
 
 
 def search_folders() -> list[Path]:
-    """The folders where this system, Homebrew, MacPorts, conda or an LLVM installer puts libLLVM."""
+    """Return the folders where systems, Homebrew, MacPorts, conda and LLVM's installer put it."""
     folders = [Path(found) for pattern in _FOLDERS for found in sorted(Path("/").glob(pattern[1:]))]
     for prefix in (sys.prefix, sys.base_prefix, os.environ.get("CONDA_PREFIX")):
         if prefix:
@@ -107,30 +113,44 @@ def search_folders() -> list[Path]:
 
 
 def _loader_files() -> list[Path]:
-    """What the dynamic loader of Linux knows, wherever it lies."""
+    """Return the libraries that the dynamic loader of Linux knows."""
     ldconfig = shutil.which("ldconfig") or shutil.which("ldconfig", path="/sbin:/usr/sbin")
     if ldconfig is None or platform.system() != "Linux":
         return []
     listing = subprocess.run([ldconfig, "-p"], check=False, capture_output=True, text=True)
-    return [Path(line.rpartition(" => ")[2]) for line in listing.stdout.splitlines() if "libLLVM" in line]
+    return [Path(line.rpartition(" => ")[2])
+            for line in listing.stdout.splitlines() if "libLLVM" in line]
 
 
 def find() -> list[Candidate]:
-    """Every libLLVM on this machine, the newest first; also what DRJIT_LIBLLVM_PATH names, there or not."""
+    """Find every libLLVM on this machine, the newest first.
+
+    The list includes the file that DRJIT_LIBLLVM_PATH names, even if it does not exist.
+    """
     files = _loader_files()
     for folder in search_folders():
-        files += sorted(file for pattern in ("libLLVM*", "LLVM-C.dll") for file in folder.glob(pattern))
-    # Links are followed: one library has many names, and a link without a number points to a name with one.
-    paths = {file.resolve(): None for file in files if _NAME.fullmatch(file.name) and file.is_file()}
+        files += sorted(file for pattern in ("libLLVM*", "LLVM-C.dll")
+                        for file in folder.glob(pattern))
+    # Links are resolved: one library has many names, and a link without a version points to one.
+    paths = {file.resolve(): None for file in files
+             if _NAME.fullmatch(file.name) and file.is_file()}
     if os.environ.get(VARIABLE):
         named = Path(os.environ[VARIABLE])
         paths[named.resolve() if named.is_file() else named] = None
-    candidates = [Candidate(path, _version_in_name(path.name) or _version_by_asking(path)) for path in paths]
+    candidates = [Candidate(path, _version_in_name(path.name) or _version_in_library(path))
+                  for path in paths]
     return sorted(candidates, key=lambda candidate: candidate.version or (0,), reverse=True)
 
 
 def probe(path: Path) -> str | None:
-    """Compile and run a kernel with this library in a process of its own; None, or what went wrong."""
+    """Compile and run a kernel in a process of its own.
+
+    Args:
+        path: of the library.
+
+    Returns:
+        None if it works, or else the reason.
+    """
     try:
         done = _run_python(_PROBE, path)
     except subprocess.TimeoutExpired:
@@ -139,22 +159,24 @@ def probe(path: Path) -> str | None:
         return None
     if done.returncode < 0:
         return f"a kernel killed the process (signal {-done.returncode})"
-    complaint = done.stderr.strip().splitlines() or [f"a kernel ended with exit status {done.returncode}"]
-    return complaint[-1].removeprefix("OSError: ")
+    lines = done.stderr.strip().splitlines()
+    complaint = lines[-1] if lines else f"a kernel ended with exit status {done.returncode}"
+    return complaint.removeprefix("OSError: ")
 
 
 def _memory_file() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "radiotwin" / "llvm.json"
+    caches = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return caches / "radiotwin" / "llvm.json"
 
 
 def _probe_key(path: Path) -> list:
-    """What a probe's result holds for: this file, this Dr.Jit, this Python."""
+    """Return the file, Dr.Jit and Python that the result of a probe is valid for."""
     status = path.stat()
     return [str(path), status.st_mtime_ns, status.st_size, version("drjit"), sys.executable]
 
 
 def _remembered() -> list:
-    """Keys of the probes that passed; a file that is missing or unreadable counts as none."""
+    """Return the keys of the probes that passed; none if the file is missing or damaged."""
     try:
         content = json.loads(_memory_file().read_text(encoding="utf-8"))
     except (OSError, ValueError, RuntimeError):
@@ -163,7 +185,7 @@ def _remembered() -> list:
 
 
 def _remember(key: list) -> None:
-    """Save the cost of the next probe. Where the folder cannot be written, it is simply paid again."""
+    """Save the key of a probe that passed; without a writable cache the next run probes again."""
     try:
         passed = [old for old in _remembered() if isinstance(old, list) and old[:1] != key[:1]]
         with atomic_path(_memory_file()) as temporary:
@@ -173,10 +195,16 @@ def _remember(key: list) -> None:
 
 
 @cache
-def refusal(candidate: Candidate) -> str | None:
-    """Why this library cannot be used, or None if it can. A pass is remembered over runs, a failure not."""
-    if candidate.version and candidate.version[0] < MINIMUM_VERSION:
-        return f"too old: Dr.Jit needs version {MINIMUM_VERSION} or newer"
+def rejection(candidate: Candidate) -> str | None:
+    """Return the reason why a library cannot be used, or None if it can.
+
+    Successful probes are remembered between runs, failures are not.
+
+    Args:
+        candidate: as `find` returns it.
+    """
+    if candidate.version and candidate.version[0] < MIN_VERSION:
+        return f"too old: Dr.Jit needs version {MIN_VERSION} or newer"
     try:
         key = _probe_key(candidate.path)
     except (OSError, PackageNotFoundError):  # a name that only the loader resolves, or no Dr.Jit
@@ -190,7 +218,7 @@ def refusal(candidate: Candidate) -> str | None:
 
 
 def _eligible() -> list[Candidate]:
-    """All that were found; with DRJIT_LIBLLVM_PATH set only that one, as Dr.Jit keeps to it as well."""
+    """Return the candidates; only that of DRJIT_LIBLLVM_PATH where it is set, as in Dr.Jit."""
     candidates = find()
     if not os.environ.get(VARIABLE):
         return candidates
@@ -199,20 +227,24 @@ def _eligible() -> list[Candidate]:
 
 
 def choose() -> Candidate | None:
-    """The newest libLLVM that works (where DRJIT_LIBLLVM_PATH is set: that one, if it works), or None."""
-    return next((candidate for candidate in _eligible() if refusal(candidate) is None), None)
+    """Return the newest libLLVM that works, or None.
+
+    Where DRJIT_LIBLLVM_PATH is set, only that one is considered.
+    """
+    return next((candidate for candidate in _eligible() if rejection(candidate) is None), None)
 
 
 def available() -> bool:
-    """Whether rays can be traced on this machine's processor."""
+    """Return whether rays can be traced on this machine's processor."""
     return choose() is not None
 
 
 def install_line() -> str:
-    """The one line that installs a libLLVM on this machine."""
+    """Return the command that installs a libLLVM on this machine."""
     system = platform.system()
     if os.environ.get("CONDA_PREFIX"):
-        return f"conda install -y -c conda-forge {'libllvm-c19' if system == 'Windows' else 'libllvm19'}"
+        package = "libllvm-c19" if system == "Windows" else "libllvm19"
+        return f"conda install -y -c conda-forge {package}"
     if system == "Darwin":
         return "brew install llvm"
     if system == "Windows":
@@ -226,34 +258,39 @@ def install_line() -> str:
         "apk": "apk add llvm19-libs",
     }
     line = next((line for manager, line in managers.items() if shutil.which(manager)), None)
-    return sudo + line if line else "this system's package manager has it as libLLVM, llvm or llvm-libs"
+    if line is None:
+        return "this system's package manager has it as libLLVM, llvm or llvm-libs"
+    return sudo + line
 
 
 def advice() -> str:
-    """What was found, why none of it can be used, and what to do about it."""
+    """Explain which libraries were found, why none can be used, and how to get one."""
     named = os.environ.get(VARIABLE)
     return "\n".join([
-        f"tracing needs libLLVM {MINIMUM_VERSION} or newer, and "
+        f"tracing needs libLLVM {MIN_VERSION} or newer, and "
         + (f"{VARIABLE} names one that does not work:" if named else "none that works was found."),
-        *(f"  {candidate}: {refusal(candidate)}" for candidate in _eligible()),
-        f"To have another one looked for: unset {VARIABLE}" if named else f"To install one: {install_line()}",
-        f"To use one that lies elsewhere: name it in {VARIABLE}. Everything but tracing works without any.",
+        *(f"  {candidate}: {rejection(candidate)}" for candidate in _eligible()),
+        f"To search for another one: unset {VARIABLE}" if named
+        else f"To install one: {install_line()}",
+        f"To use one in another folder: name it in {VARIABLE}. Everything but tracing works "
+        "without any.",
     ])
 
 
 def prepare() -> None:
-    """Name the chosen libLLVM in DRJIT_LIBLLVM_PATH. Call it before drjit, mitsuba or sionna.rt is imported.
+    """Choose a libLLVM and set DRJIT_LIBLLVM_PATH.
+
+    Call it before drjit, mitsuba or sionna.rt is imported.
 
     Raises:
         RunFailed: no libLLVM works, or Dr.Jit was imported earlier and took one that does not.
     """
     if "drjit" in sys.modules:
-        if sys.modules["drjit"].detail.llvm_version()[0] >= MINIMUM_VERSION:
+        if sys.modules["drjit"].detail.llvm_version()[0] >= MIN_VERSION:
             return
-        raise RunFailed(
-            "drjit was imported before radiotwin could choose its libLLVM, and has none that works; import "
-            "radiotwin.trace before drjit, mitsuba and sionna.rt" if available() else advice()
-        )
+        raise RunFailed("drjit was imported before radiotwin could choose its libLLVM, and has "
+                        "none that works; import radiotwin.trace before drjit, mitsuba and "
+                        "sionna.rt" if available() else advice())
     chosen = choose()
     if chosen is None:
         raise RunFailed(advice())

@@ -1,21 +1,27 @@
-"""What the tables of TOML files that are checked when they are read have in common."""
+"""Base classes of the tables in TOML files, which are validated when they are read."""
 
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, Strict
 
 Number = Annotated[float, Strict()]
-"""An integer will do, too, but not `true` or a text."""
+"""A finite number; an integer is accepted, `true` and texts are not."""
 
 
 class Table(BaseModel):
-    """Nothing but its own fields, no infinity, and no change once it is read."""
+    """An immutable table that accepts no unknown field and no infinity."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Origin(Table):
-    """WGS84 position of the local frame's origin; `altitude_m` is the altitude of the scene's ground datum."""
+    """Origin of the local frame on the WGS84 ellipsoid.
+
+    Attributes:
+        latitude_deg: [degrees], positive to the north.
+        longitude_deg: [degrees], positive to the east.
+        altitude_m: altitude of the scene's ground datum [m].
+    """
 
     latitude_deg: Number = Field(ge=-90, le=90)
     longitude_deg: Number = Field(ge=-180, le=180)

@@ -1,4 +1,4 @@
-"""`import radiotwin as rt`: quick, complete, and the documented lines run as they stand."""
+"""`import radiotwin as rt`: quick, complete, and the documented lines run as they are."""
 
 import ast
 import re
@@ -26,7 +26,7 @@ def test_every_name_is_there_for_people_and_for_type_checkers():
     checked = next(node for node in tree.body if isinstance(node, ast.If))
     seen = {alias.name: node.module for node in checked.body for alias in node.names}
     assert {**seen, "__version__": None}.keys() == set(rt.__all__)
-    assert all(module == f"radiotwin.{rt._WHERE[name]}" for name, module in seen.items())
+    assert all(module == f"radiotwin.{rt._MODULE_OF[name]}" for name, module in seen.items())
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         rt.nothing
 

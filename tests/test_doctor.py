@@ -1,4 +1,4 @@
-"""The diagnosis: what it lists, and that each thing that can be wrong is said with what to do."""
+"""The diagnosis: its sections, and a remedy for each problem."""
 
 import io
 import sys
@@ -23,13 +23,13 @@ def untraced(monkeypatch):
     monkeypatch.setattr(doctor, "_check_tracing", lambda diagnosis: [("one link", "traced")])
     monkeypatch.setattr(llvm, "_eligible", lambda: [llvm.Candidate(Path("/lib/libLLVM.so.19.1"), (19, 1))])
     monkeypatch.setattr(llvm, "find", llvm._eligible)
-    monkeypatch.setattr(llvm, "refusal", lambda candidate: None)
+    monkeypatch.setattr(llvm, "rejection", lambda candidate: None)
 
 
 def printed():
-    """Whether all is well, and the lines that `doctor.run` prints."""
+    """Whether all is well, and the lines that `doctor.print_diagnosis` prints."""
     output = io.StringIO()
-    healthy = doctor.run(Console(file=output, width=40)).healthy
+    healthy = doctor.print_diagnosis(Console(file=output, width=40)).healthy
     return healthy, output.getvalue().splitlines()
 
 
@@ -68,7 +68,7 @@ def test_missing_packages(untraced, monkeypatch):
 
 def test_little_memory_and_disk_is_said_but_stops_nothing(untraced, monkeypatch):
     monkeypatch.setattr(doctor, "_memory_gib", lambda: 1.5)
-    monkeypatch.setattr(doctor, "DISK_WANTED_GIB", 10**9)
+    monkeypatch.setattr(doctor, "MIN_DISK_GIB", 10**9)
     diagnosis = doctor.diagnose()
     assert diagnosis.healthy
     assert ["memory" in caution or "disk" in caution for caution in diagnosis.cautions] == [True, True]

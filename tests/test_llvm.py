@@ -1,4 +1,4 @@
-"""The search for libLLVM: on trees of made-up files, and the probe on what this machine really has."""
+"""The search for libLLVM: on trees of made-up files, and the probe on the libraries of this machine."""
 
 import os
 import subprocess
@@ -19,9 +19,9 @@ def tree(tmp_path, monkeypatch):
     monkeypatch.setattr(llvm, "_loader_files", list)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.delenv(llvm.VARIABLE, raising=False)
-    llvm.refusal.cache_clear()
+    llvm.rejection.cache_clear()
     yield folder
-    llvm.refusal.cache_clear()
+    llvm.rejection.cache_clear()
 
 
 @pytest.fixture
@@ -101,11 +101,11 @@ def test_users_own_is_the_only_choice(tree, probed, monkeypatch, tmp_path):
 def test_pass_is_remembered_until_the_file_changes(tree, probed):
     write(tree, "libLLVM-19.so")
     for _ in range(3):
-        llvm.refusal.cache_clear()  # as a new process would
+        llvm.rejection.cache_clear()  # as a new process would
         assert llvm.available()
     assert len(probed) == 1
     os.utime(tree / "libLLVM-19.so", (1, 1))
-    llvm.refusal.cache_clear()
+    llvm.rejection.cache_clear()
     assert llvm.available()
     assert len(probed) == 2
 
@@ -113,7 +113,7 @@ def test_pass_is_remembered_until_the_file_changes(tree, probed):
 def test_failure_is_not_remembered(tree, probed):
     write(tree, "libLLVM-22.so")
     for _ in range(2):
-        llvm.refusal.cache_clear()
+        llvm.rejection.cache_clear()
         assert not llvm.available()
     assert len(probed) == 2
 
@@ -125,7 +125,7 @@ def test_corrupt_memory_is_ignored(tree, probed, tmp_path, content):
     memory.parent.mkdir(parents=True)
     memory.write_bytes(content)
     assert llvm.available()
-    llvm.refusal.cache_clear()
+    llvm.rejection.cache_clear()
     assert llvm.available()
     assert len(probed) == 1  # and it was put right
 
@@ -139,7 +139,7 @@ def test_memory_that_cannot_be_written_does_no_harm(tree, probed, tmp_path):
 def test_unusable_file_is_refused(tree):
     write(tree, "libLLVM-18.so")
     (candidate,) = llvm.find()
-    assert str(tree) in llvm.refusal(candidate)  # the loader's own complaint names the file
+    assert str(tree) in llvm.rejection(candidate)  # the loader's own complaint names the file
     assert llvm.choose() is None
 
 
@@ -208,7 +208,7 @@ def test_drjit_imported_too_early_without_a_working_one():
     assert "RunFailed: tracing needs libLLVM 17 or newer" in done.stderr
 
 
-TOO_OLD = [found for found in llvm.find() if found.version and found.version[0] < llvm.MINIMUM_VERSION]
+TOO_OLD = [found for found in llvm.find() if found.version and found.version[0] < llvm.MIN_VERSION]
 
 
 @pytest.mark.parametrize("candidate", TOO_OLD or [None], ids=str)
@@ -227,12 +227,12 @@ def test_chosen_one_runs_kernels_in_a_fresh_process():
     )
     total, major = run_python(program).stdout.split()
     assert float(total) == 5050
-    assert int(major) >= llvm.MINIMUM_VERSION
+    assert int(major) >= llvm.MIN_VERSION
 
 
 @pytest.mark.llvm
-def test_library_tells_its_version():
-    """Homebrew's and Windows' files carry no number, so the library itself is asked."""
+def test_library_reports_its_version():
+    """Homebrew's and Windows' files carry no number, so the library itself reports it."""
     chosen = llvm.choose()
-    told = llvm._version_by_asking(chosen.path)
-    assert told[: len(chosen.version)] == chosen.version
+    reported = llvm._version_in_library(chosen.path)
+    assert reported[: len(chosen.version)] == chosen.version

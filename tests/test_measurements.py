@@ -80,7 +80,7 @@ def test_select_keeps_the_devices(write):
     (HEADER.replace("gain_db", "rssi_dbm") + "0,f,u,0,0,5,a,1e3\n", r"row 2, column rssi_dbm: '1e3' is no level"),
     (HEADER + "0,f,u,0,0,5,a,-80\n0,f,u,0,-2e7,5,a,-80\n",
      r"row 3, column receiver_y_m: '-2e7' is too far away; allowed are -1e\+07 to 1e\+07 m"),
-    (HEADER.replace("time_s", "gain_db") + "-1,f,u,0,0,5,a,-80\n", r"row 1: column 'gain_db' stands there twice"),
+    (HEADER.replace("time_s", "gain_db") + "-1,f,u,0,0,5,a,-80\n", r"row 1: column 'gain_db' occurs twice"),
     (HEADER + "0,f,u,0,0,5,a,-80\n0,f,u,0,0,5,a\n", r"row 3 has 7 fields, the header has 8"),
     (HEADER + "0,f,u,0,0,5,a,-80,1\n", r"row 2 has 9 fields, the header has 8"),
     (HEADER.replace(",", ";") + "0;f;u;0;0;5;a;-80,5\n", r"comma-separated, UTF-8"),
@@ -98,8 +98,8 @@ def test_bad_rows_name_file_row_and_column(write, text, message):
     ("device,x_m,y_m,z_m,role\na,1,2,3,anchr\n", r"row 2, column role: 'anchr'; allowed are"),
     ("device,x_m,y_m,z_m,role\na,,2,3,anchor\n", r"row 2: anchor 'a' has no x_m, y_m"),
     ("device,x_m,y_m,z_m,role\na,1,2,3e7,anchor\n", r"row 2, column z_m: '3e7' is too far away"),
-    ("device,x_m,y_m,x_m,role\na,1,2,3,anchor\n", r"row 1: column 'x_m' stands there twice"),
-    ("device,x_m,y_m,z_m,role\na,1,2,3,anchor\na,1,2,3,anchor\n", r"row 3, column device: 'a' stands there twice"),
+    ("device,x_m,y_m,x_m,role\na,1,2,3,anchor\n", r"row 1: column 'x_m' occurs twice"),
+    ("device,x_m,y_m,z_m,role\na,1,2,3,anchor\na,1,2,3,anchor\n", r"row 3, column device: 'a' occurs twice"),
 ])
 def test_bad_devices(write, devices, message):
     with pytest.raises(BadInput, match=message):
@@ -141,7 +141,7 @@ def test_a_parquet_file_with_one_name_twice(write, tmp_path):
     pyarrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
     write(HEADER + ROWS)
     parquet.write_table(pyarrow.table([[1.0], [2.0]], names=["gain_db", "gain_db"]), tmp_path / "m.parquet")
-    with pytest.raises(BadInput, match="column 'gain_db' stands there twice"):
+    with pytest.raises(BadInput, match="column 'gain_db' occurs twice"):
         read_measurements(tmp_path / "m.parquet")
 
 

@@ -1,24 +1,32 @@
-"""Commands that learn from measurements and judge what was learned: fit, map, compare."""
+"""The commands that learn from measurements and judge the result: fit, map, compare."""
 
 import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from radiotwin.cli.console import print_rows, result, say, show_warnings_plainly
+from radiotwin.cli.options import (
+    DeviceTable,
+    FitSeed,
+    MeasurementFile,
+    OnlyDevices,
+    SceneOption,
+    split_names,
+)
+from radiotwin.console import print_rows, result, say
 from radiotwin.errors import BadInput
 
 if TYPE_CHECKING:
+    from radiotwin.compare import Comparison
     from radiotwin.scene import Scene
+    from radiotwin.twin import TwinDevice
 
-SAME_PLACE = 1e-6  # degrees, or metres of altitude, of two origins
-MeasurementFile = Annotated[Path, typer.Argument(
-    metavar="MEASUREMENTS", help="measurements.csv, .csv.gz or .parquet; devices.csv lies beside it.")]
-SceneOption = Annotated[Path, typer.Option(help="Scene folder: the 3D map and where UAVs may fly.")]
+MAX_ORIGIN_DIFFERENCE = 1e-6  # [degrees, or metres of altitude] of one place, after rounding
 
 
 def add_commands(app: typer.Typer) -> None:
+    """Add the commands of this module to the app."""
     app.command("fit")(fit)
     app.command("map")(map_)
     app.command("compare")(compare)
@@ -29,32 +37,37 @@ def fit(
     scene: SceneOption,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the twin.")] = Path("twin"),
     model: Annotated[str, typer.Option(
-        help="segmented_nn, segmented_log_distance, log_distance, regression_kriging, or raytrace: paths over the 3D "
-             "map, also to find devices in narrow streets; takes minutes.")] = "segmented_nn",
-    devices: Annotated[Path | None, typer.Option(help="Table of devices [devices.csv beside the file].")] = None,
-    start: Annotated[Path | None, typer.Option(help="An earlier twin, to start the search from.")] = None,
-    allow_indoor: Annotated[bool, typer.Option("--allow-indoor", help="Unknown devices may be inside buildings.")
-                            ] = False,
-    seed: Annotated[int, typer.Option(min=0, help="Of the fits and the search.")] = 0,
+        help="segmented_nn, segmented_log_distance, log_distance, regression_kriging, or raytrace: "
+             "paths over the 3D map, also to find devices in narrow streets; takes minutes.")
+        ] = "segmented_nn",
+    devices: DeviceTable = None,
+    start: Annotated[Path | None, typer.Option(
+        help="An earlier twin, to start the search from.")] = None,
+    allow_indoor: Annotated[bool, typer.Option(
+        "--allow-indoor", help="Unknown devices may be inside buildings.")] = False,
+    seed: FitSeed = 0,
 ) -> None:
-    """Learn the channel from the anchors, then find the unknown devices: the twin."""
+    """Fit a twin: the channel and the unknown devices.
+
+    The channel is learnt from the anchors; then the unknown devices are located with it.
+    """
     from radiotwin.measurements import read_measurements
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin, check_twin_target, fit_twin
 
-    show_warnings_plainly()
     check_twin_target(out)
     data, world = read_measurements(measurements, devices), Scene.load(scene)
     earlier = Twin.load(start) if start else None
     twin = fit_twin(data, world, model=model, seed=seed, start=earlier, allow_indoor=allow_indoor)
     twin.save(out)
     print_rows(f"Twin {out} ({model})",
-               {"device": "left", "role": "left", "x [m]": "right", "y [m]": "right", "90 % radius [m]": "right",
-                "note": "left"},
-               [[d.device, d.role, d.x_m, d.y_m, d.credible_radius_m, _note(d)] for d in twin.devices])
+               {"device": "left", "role": "left", "x [m]": "right", "y [m]": "right",
+                "90 % radius [m]": "right", "note": "left"},
+               [[d.device, d.role, d.x_m, d.y_m, d.credible_radius_m, _note(d)]
+                for d in twin.devices])
 
 
-def _note(device) -> str:
+def _note(device: "TwinDevice") -> str:
     if not device.located:
         return "not located: the data do not say where it is"
     if device.second_mode:
@@ -64,50 +77,57 @@ def _note(device) -> str:
 
 
 def map_(
-    twin: Annotated[Path, typer.Argument(metavar="TWIN", help="Folder of a twin, as `fit` makes it, or a radio map "
-                                                              "(.nc), as `trace` makes it.")],
+    twin: Annotated[Path, typer.Argument(
+        metavar="TWIN", help="Folder of a twin, as `fit` makes it, or a radio map (.nc), as "
+                             "`trace` makes it.")],
     scene: SceneOption,
     out: Annotated[Path | None, typer.Option(
-        "--out", "-o", help="Radio map: .nc (all), .csv (a row a link), .npz (NumPy), .tif (GeoTIFF), .kmz (Google "
-                            "Earth) or .png (a picture of the lowest altitude) [TWIN.nc].")] = None,
-    devices: Annotated[str | None, typer.Option(metavar="A,B,…", help="Only these devices.")] = None,
+        "--out", "-o", help="Radio map: .nc (all), .csv (a row per link), .npz (NumPy), .tif "
+                            "(GeoTIFF), .kmz (Google Earth) or .png (a picture of the lowest "
+                            "altitude) [TWIN.nc].")] = None,
+    devices: OnlyDevices = None,
     altitudes: Annotated[str | None, typer.Option(
         metavar="Z,…", help="Only these of the lattice's altitudes [m].")] = None,
 ) -> None:
-    """Predict the gain of every device over the scene's lattice, or write a radio map in another form."""
+    """Predict a radio map, or convert one.
+
+    It holds the gain of every device over the scene's lattice.
+    """
     from radiotwin.export import EXPORTERS, check_format, select
     from radiotwin.radiomap import RadioMap
     from radiotwin.report import write_picture
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin
 
-    show_warnings_plainly()
-    exporters = EXPORTERS | {".png": write_picture}
     is_map = twin.suffix == ".nc"
     if out is None and is_map:
-        raise BadInput(f"{twin} is a radio map already; say with --out in which form it is to be written")
+        raise BadInput(f"{twin} is a radio map already; give the file to write with --out")
     out = out or twin.resolve().with_name(f"{twin.resolve().name}.nc")
+    exporters = EXPORTERS | {".png": write_picture}
     world = Scene.load(scene)
     check_format(out, world, exporters)
     radio_map = RadioMap.read(twin) if is_map else Twin.load(twin).radio_map(world)
     if is_map:
-        _check_place(twin, radio_map.dataset.attrs, world)
-    radio_map = select(radio_map, devices.split(",") if devices else None, _altitudes(altitudes))
+        _check_scene(twin, radio_map.dataset.attrs, world)
+    radio_map = select(radio_map, split_names(devices), _altitudes(altitudes))
     exporters[out.suffix](radio_map, world, out)
-    say(f"wrote {out}: {len(radio_map.devices)} devices on {radio_map.lattice.shape} positions (z, y, x)")
+    say(f"wrote {out}: {len(radio_map.devices)} devices on {radio_map.lattice.shape} positions "
+        "(z, y, x)")
 
 
-def _check_place(path: Path, attributes: dict, scene: "Scene") -> None:
-    """A map of another city would be written with this one's outlines and place on the globe."""
+def _check_scene(path: Path, attributes: dict[Any, Any], scene: "Scene") -> None:
+    """Refuse a map of another city, which would get the outlines and the origin of this one."""
     origin = scene.config.origin
     for name, value in ({} if origin is None else origin.model_dump()).items():
-        there = attributes.get(f"origin_{name}", value)
-        if abs(there - value) > SAME_PLACE:
-            raise BadInput(f"{path} is a map of another place: its origin's {name} is {there:g}, that of "
-                           f"{scene.folder} is {value:g}; give the scene that it was made for, or trace again")
+        of_map = attributes.get(f"origin_{name}", value)
+        if abs(of_map - value) > MAX_ORIGIN_DIFFERENCE:
+            raise BadInput(f"{path} is a map of another place: its origin's {name} is {of_map:g}, "
+                           f"that of {scene.folder} is {value:g}; give the scene that it was made "
+                           "for, or trace again")
     if attributes.get("scene_hash") not in (None, scene.content_hash()):
-        warnings.warn(f"{path} was made for another scene than {scene.folder}, or that has changed since: outlines, "
-                      "devices and the place on the globe are those of the scene", stacklevel=2)
+        warnings.warn(f"{path} was made for another scene than {scene.folder}, or that has changed "
+                      "since: outlines, devices and the origin are those of the scene",
+                      stacklevel=2)
 
 
 def _altitudes(text: str | None) -> list[float] | None:
@@ -122,43 +142,54 @@ def _altitudes(text: str | None) -> list[float] | None:
 def compare(
     measurements: MeasurementFile,
     scene: SceneOption,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the tables and figures.")] = Path("comparison"),
+    out: Annotated[Path, typer.Option(
+        "--out", "-o", help="Folder for the tables and figures.")] = Path("comparison"),
     truth: Annotated[str | None, typer.Option(
-        help="Judge on a whole map, too: traced (SCENE/truth.nc), segmented, or a radio map.")] = None,
-    held_out: Annotated[int, typer.Option(help="Flights, the last ones, that no model is fitted to.")] = 1,
-    devices: Annotated[Path | None, typer.Option(help="Table of devices [devices.csv beside the file].")] = None,
-    raytrace: Annotated[bool, typer.Option(
-        "--raytrace", help="Judge the model raytrace, too: paths over the 3D map. Takes minutes.")] = False,
-    also: Annotated[list[Path] | None, typer.Option(
-        help="A twin's folder, or (with --truth) a radio map, to be judged beside the models; may be repeated.")
+        help="Judge on a whole map, too: traced (SCENE/truth.nc), segmented, or a radio map.")
         ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the fits and the search.")] = 0,
+    held_out: Annotated[int, typer.Option(
+        help="Number of the last flights that are held out of the fits.")] = 1,
+    devices: DeviceTable = None,
+    raytrace: Annotated[bool, typer.Option(
+        "--raytrace", help="Compare the model raytrace, too: paths over the 3D map. Takes minutes.")
+        ] = False,
+    also: Annotated[list[Path] | None, typer.Option(
+        help="A twin's folder, or (with --truth) a radio map, to compare with the models; may be "
+             "repeated.")] = None,
+    seed: FitSeed = 0,
 ) -> None:
-    """Hold all channel models against flights they have not seen, and against the truth map where there is one."""
-    from radiotwin.cli.world import read_truth
+    """Compare all channel models on held-out flights.
+
+    With --truth they are compared with the truth map, too.
+    """
     from radiotwin.compare import DEFAULT_MODELS, compare_models, split_flights
     from radiotwin.comparison_output import judge_also, write_comparison
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
     from radiotwin.report import write_comparison_figures
     from radiotwin.scene import Scene
+    from radiotwin.survey import read_truth
 
-    show_warnings_plainly()
     require_writable(out / "compare.json")
     world = Scene.load(scene)
     train, test = split_flights(read_measurements(measurements, devices), held_out)
     truth_map = read_truth(world, truth) if truth else None
     twins, maps = judge_also(also or [], truth_map, test.flights)
     models = (*DEFAULT_MODELS, *["raytrace"] * raytrace)
-    comparison = compare_models(train, test, world, truth_map, seed=seed, models=models, twins=twins, maps=maps)
+    comparison = compare_models(train, test, world, truth_map, seed=seed, models=models,
+                                twins=twins, maps=maps)
     write_comparison(comparison, world, out)
     write_comparison_figures(comparison, world, truth_map, out)
     print_comparison(comparison)
     say(f"wrote {out}")
 
 
-def print_comparison(comparison) -> None:
-    """The tables of a comparison on the terminal."""
+def print_comparison(comparison: "Comparison") -> None:
+    """Print the tables of a comparison.
+
+    Args:
+        comparison: of models.
+    """
     result("scores", comparison.scores.to_dict("records"))
     result("locations", comparison.locations.to_dict("records"))
     for title, columns, rows in comparison.tables():

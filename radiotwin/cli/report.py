@@ -5,28 +5,34 @@ from typing import Annotated
 
 import typer
 
-from radiotwin.cli.console import say, show_warnings_plainly
+from radiotwin.console import say
 
 
 def add_commands(app: typer.Typer) -> None:
+    """Add the commands of this module to the app."""
     app.command("report")(report)
 
 
 def report(
     run: Annotated[Path, typer.Argument(
-        metavar="RUN", help="Folder that demo, fit, compare, close-loop or marl.fedqmix wrote, or a scene.")],
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="The page [RUN/report.html].")] = None,
-    scene: Annotated[Path | None, typer.Option(help="Scene folder, where the run does not hold or name one.")] = None,
+        metavar="RUN", help="Folder that demo, fit, compare, close-loop or marl.fedqmix wrote, or "
+                            "a scene.")],
+    out: Annotated[Path | None, typer.Option(
+        "--out", "-o", help="The page [RUN/report.html].")] = None,
+    scene: Annotated[Path | None, typer.Option(
+        help="Scene folder, where the run does not hold or name one.")] = None,
     truth: Annotated[str | None, typer.Option(
-        help="segmented, or the file of a radio map [SCENE/truth.nc, if it is there].")] = None,
+        help="segmented, or the file of a radio map [SCENE/truth.nc, if it exists].")] = None,
     measurements: Annotated[Path | None, typer.Option(
-        help="Measurements whose flights are shown, where the run does not hold them.")] = None,
+        help="Measurements of the flights to show, where the run does not hold them.")] = None,
 ) -> None:
-    """One HTML page of a run, which opens without a network: the city in 3D with maps, flights and devices; tables."""
+    """Write one HTML page of a run.
+
+    It shows the city in 3D with maps, flights and devices, and tables, and needs no network.
+    """
     from radiotwin.files import require_writable
     from radiotwin.report import read_run, write_report
 
-    show_warnings_plainly()
     found = read_run(run, scene, truth, measurements)
     out = out or run / "report.html"
     require_writable(out)

@@ -1,16 +1,16 @@
-"""Commands that measure in a world: trace, gains, survey."""
+"""The commands that measure in a scene: trace, gains, survey."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from radiotwin.cli.console import say, show_warnings_plainly
-from radiotwin.cli.scenes import SceneFolder
-from radiotwin.errors import BadInput
+from radiotwin.cli.options import Combining, OnlyDevices, Quality, RaySeed, SceneFolder, split_names
+from radiotwin.console import say
 
 
 def add_commands(app: typer.Typer) -> None:
+    """Add the commands of this module to the app."""
     app.command("trace")(trace)
     app.command("gains")(gains)
     app.command("survey")(survey)
@@ -20,51 +20,57 @@ def trace(
     folder: SceneFolder,
     out: Annotated[Path | None, typer.Option(
         "--out", "-o", help="Radio map [SCENE/truth.nc, with --devices truth-A-B.nc].")] = None,
-    quality: Annotated[str, typer.Option(help="fast, default or high.")] = "default",
-    solver: Annotated[str, typer.Option(help="paths (gain at points) or map (mean over lattice cells).")] = "paths",
-    combining: Annotated[str, typer.Option(help="power (sum of the paths' powers) or coherent (of their fields).")
-                         ] = "power",
-    devices: Annotated[str | None, typer.Option(metavar="A,B,…", help="Only these devices.")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the rays.")] = 1,
+    quality: Quality = "default",
+    solver: Annotated[str, typer.Option(
+        help="paths (gain at points) or map (mean over lattice cells).")] = "paths",
+    combining: Combining = "power",
+    devices: OnlyDevices = None,
+    seed: RaySeed = 1,
 ) -> None:
-    """Ray-trace the truth with Sionna RT. A killed run goes on where it was; a finished one is not done again."""
+    """Ray-trace the truth with Sionna RT.
+
+    A killed run is resumed, a finished one is reused.
+    """
     from radiotwin.scene import Scene
     from radiotwin.trace import SolverSettings, trace_map
 
-    show_warnings_plainly()
     scene = Scene.load(folder)
     settings = SolverSettings.of_quality(quality, solver=solver, combining=combining, seed=seed)
-    names = devices.split(",") if devices else None
+    names = split_names(devices)
     out = out or folder / ("-".join(["truth", *(names or [])])[:100] + ".nc")
     facts = trace_map(scene, settings, out, names).dataset.attrs
-    say(f"wrote {out}: {facts['links']} links, {facts['links_detected']} detected, {facts['links_below_sensitivity']} "
-        f"below sensitivity, {facts['links_without_path']} without a path, {facts['links_inside_building']} inside "
-        "buildings")
+    say(f"wrote {out}: {facts['links']} links, {facts['links_detected']} detected, "
+        f"{facts['links_below_sensitivity']} below sensitivity, {facts['links_without_path']} "
+        f"without a path, {facts['links_inside_building']} inside buildings")
     if "noise_floor_db" in facts:
-        say(f"numerical noise: {facts['noise_floor_db']:.2f} dB RMS against ten times the rays; nine links in ten are "
-            f"within {facts['noise_floor_p90_db']:.2f} dB")
+        say(f"numerical noise: {facts['noise_floor_db']:.2f} dB RMS against ten times the rays; "
+            f"nine links in ten are within {facts['noise_floor_p90_db']:.2f} dB")
 
 
 def gains(
     folder: SceneFolder,
     points: Annotated[Path, typer.Option(
-        help="CSV file with x_m, y_m, z_m; or latitude_deg, longitude_deg, z_m, where the scene has an origin.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Table (.csv, .csv.gz), a row a link.")] = Path("gains.csv"),
-    devices: Annotated[str | None, typer.Option(metavar="A,B,…", help="Only these devices.")] = None,
-    combining: Annotated[str, typer.Option("--sum", help="power (of the paths' powers) or coherent (of their fields).")
-                         ] = "power",
-    quality: Annotated[str, typer.Option(help="fast, default or high.")] = "default",
-    seed: Annotated[int, typer.Option(min=0, help="Of the rays.")] = 1,
+        help="CSV file with x_m, y_m, z_m; or latitude_deg, longitude_deg, z_m, where the scene "
+             "has an origin.")],
+    out: Annotated[Path, typer.Option(
+        "--out", "-o", help="Table (.csv, .csv.gz) with a row per link.")] = Path("gains.csv"),
+    devices: OnlyDevices = None,
+    combining: Annotated[str, typer.Option(
+        "--sum", help="power (of the paths' powers) or coherent (of their fields).")] = "power",
+    quality: Quality = "default",
+    seed: RaySeed = 1,
 ) -> None:
-    """Ray-trace gains at any points; an empty gain has a reason: no path, below sensitivity, …."""
+    """Ray-trace gains at any points.
+
+    An empty gain has a reason, such as no path.
+    """
     from radiotwin.scene import Scene
     from radiotwin.trace import SolverSettings, read_points, trace_points
 
-    show_warnings_plainly()
     scene = Scene.load(folder)
     settings = SolverSettings.of_quality(quality, combining=combining, seed=seed)
     points_m = read_points(points, scene.config.origin)
-    table = trace_points(scene, points_m, settings, out, devices.split(",") if devices else None)
+    table = trace_points(scene, points_m, settings, out, split_names(devices))
     reasons = table.loc[table["reason"] != "", "reason"].value_counts()
     say(f"wrote {out}: {len(table)} links, {len(table) - reasons.sum()} with a gain"
         + "".join(f", {count} {reason}" for reason, count in reasons.items()))
@@ -72,42 +78,33 @@ def gains(
 
 def survey(
     folder: SceneFolder,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Measurements (.csv, .csv.gz, .parquet); devices.csv goes "
-                                                          "beside it.")] = Path("survey/measurements.csv"),
-    truth: Annotated[str, typer.Option(help="traced (SCENE/truth.nc), segmented (statistical), or a radio map.")
-                     ] = "traced",
+    out: Annotated[Path, typer.Option(
+        "--out", "-o", help="Measurements (.csv, .csv.gz, .parquet); devices.csv is written to "
+                            "the same folder.")] = Path("survey/measurements.csv"),
+    truth: Annotated[str, typer.Option(
+        help="traced (SCENE/truth.nc), segmented (statistical), or a radio map.")] = "traced",
     flights: Annotated[int, typer.Option(help="Flights; every UAV flies each.")] = 5,
-    pattern: Annotated[str, typer.Option(help="random-waypoint, lawnmower or random-walk.")] = "random-waypoint",
+    pattern: Annotated[str, typer.Option(
+        help="random-waypoint, lawnmower or random-walk.")] = "random-waypoint",
     noise_db: Annotated[float | None, typer.Option(
-        help="Standard deviation of the receivers' error [1; 0 for --truth segmented, whose law has its own].")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of paths and noise.")] = 0,
+        help="Standard deviation of the receivers' error [1; 0 for --truth segmented, which has "
+             "shadowing of its own].")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of paths and noise.")] = 0,
 ) -> None:
-    """Fly the scene's UAVs through a truth map and write what they measure."""
+    """Fly the scene's UAVs through a truth map.
+
+    Their measurements are written, with a table of the devices.
+    """
     from radiotwin.scene import Scene
-    from radiotwin.survey import fly_survey
+    from radiotwin.survey import fly_survey, read_truth
 
     scene = Scene.load(folder)
     if noise_db is None:
         noise_db = 0.0 if truth == "segmented" else 1.0
-    measurements = fly_survey(scene, read_truth(scene, truth), flights=flights, pattern=pattern, seed=seed,
-                              noise_db=noise_db)
+    measurements = fly_survey(scene, read_truth(scene, truth), flights=flights, pattern=pattern,
+                              seed=seed, noise_db=noise_db)
     measurements.write(out)
     missed = int(measurements.table["gain_db"].isna().sum())
     say(f"wrote {out}: {len(measurements.flights)} flights, {len(measurements.table)} links to "
-        f"{len(measurements.devices)} devices ({int(measurements.is_anchor.sum())} anchors), {missed} not detected")
-
-
-def read_truth(scene, truth: str):
-    """The radio map that `--truth` names."""
-    from radiotwin.radiomap import RadioMap
-    from radiotwin.survey import segmented_truth
-
-    if truth == "segmented":
-        return segmented_truth(scene)
-    if truth == "traced":
-        path = scene.folder / "truth.nc"
-        if not path.is_file():
-            raise BadInput(f"{path} does not exist; run `radiotwin trace {scene.folder}` first, or use "
-                           "--truth segmented")
-        return RadioMap.read(path)
-    return RadioMap.read(truth)
+        f"{len(measurements.devices)} devices ({int(measurements.is_anchor.sum())} anchors), "
+        f"{missed} not detected")

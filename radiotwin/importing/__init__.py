@@ -1,4 +1,4 @@
-"""Anybody's measurements -> the project's two tables, with a report of what was kept and what was not."""
+"""Import of measurements from tables of any layout, with a report of what was kept and left out."""
 
 from radiotwin.importing.run import import_file
 from radiotwin.importing.settings import Settings

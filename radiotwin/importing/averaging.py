@@ -1,88 +1,113 @@
 """Local means over fast fading.
 
-The phase of the paths turns within half a wavelength, and with it the level; shadowing changes over tens of metres. A
-mean over 20 to 40 wavelengths removes the first and keeps the second (W. C. Y. Lee, "Estimate of local average power
-of a mobile radio signal", IEEE Trans. Veh. Technol. 34(1), 1985), and 36 to 50 readings bring it within 1 dB.
+The phases of the paths, and with them the level, change within half a wavelength; shadowing
+changes over tens of metres. A mean over 20 to 40 wavelengths removes the first and keeps the
+second, and 36 to 50 readings bring it within 1 dB (W. C. Y. Lee, "Estimate of local average power
+of a mobile radio signal", IEEE Trans. Veh. Technol. 34(1), 1985).
 """
+
+from typing import Literal
 
 import numpy as np
 import pandas as pd
 from scipy.constants import speed_of_light
 
-WAVELENGTHS = (20, 40)
-TRACK = ["receiver", "device", "flight"]
+WAVELENGTHS = (20, 40)  # Lee 1985
 
 
-def average(links: pd.DataFrame, length_m: float, how: str) -> pd.DataFrame:
-    """One row for each bin of `length_m` along the way of each (receiver, device, flight).
+def average(links: pd.DataFrame, length_m: float,
+            method: Literal["power", "median"]) -> pd.DataFrame:
+    """Average links over bins along the track of each (receiver, device, flight).
 
-    The way is walked in the order of time, or of the file where a track has no times. `how` is `power`, the mean of the
-    linear power, or `median`. A reading that was not detected counts as the least of all, as zero power in the mean;
-    where more than half were, so is the bin. With at most half of them below the limit that is off by 3 dB at worst.
-    Positions and times are means, headings circular ones; `quality` is the number of readings.
+    A track is followed in the order of time, or of the file where it has no times. A reading that
+    was not detected counts as zero power in the mean and as the smallest value in the median; a bin
+    of which more than half were not detected is not detected. With at most half of them below the
+    limit of detection, the mean is off by at most 3 dB.
+
+    Args:
+        links: as of `build_links`, with receiver positions.
+        length_m: length of the bins [m].
+        method: `power`, the mean of the linear power, or `median`.
+
+    Returns:
+        one row per bin: levels by `method`, means of positions and times, circular means of
+        headings, and the number of readings in `quality`.
     """
     links = links.reset_index(drop=True)
-    track = links.groupby(TRACK, sort=False).ngroup().to_numpy()
-    links, track = _walk(links, track)
-    bin_of, first = _bins(links, track, length_m)
-    count = np.bincount(bin_of)
-    means = {name: _mean(links[name].to_numpy(dtype=float), bin_of, len(count)) for name in links
+    track = links.groupby(["receiver", "device", "flight"], sort=False).ngroup().to_numpy()
+    links, track = _ordered(links, track)
+    bin_index, first = _bins(links, track, length_m)
+    count = np.bincount(bin_index)
+    means = {name: _mean(links[name].to_numpy(dtype=float), bin_index, len(count))
+             for name in links
              if links[name].dtype.kind == "f" and name not in ("level_db", "heading_deg")}
     if "heading_deg" in links:
-        radians = np.radians(links["heading_deg"].to_numpy())
-        means["heading_deg"] = np.degrees(np.arctan2(_mean(np.sin(radians), bin_of, len(count)),
-                                                     _mean(np.cos(radians), bin_of, len(count)))) % 360
-    means["level_db"] = _level(links["level_db"].to_numpy(), bin_of, count, how)
-    return links.iloc[first].reset_index(drop=True).assign(**means, quality=count.astype(float))
+        heading_rad = np.radians(links["heading_deg"].to_numpy())
+        east, north = (_mean(part, bin_index, len(count))
+                       for part in (np.sin(heading_rad), np.cos(heading_rad)))
+        means["heading_deg"] = np.degrees(np.arctan2(east, north)) % 360
+    means["level_db"] = _level(links["level_db"].to_numpy(), bin_index, count, method)
+    bins = links.iloc[first].reset_index(drop=True)
+    return bins.assign(**means, quality=count.astype(float))
 
 
 def in_wavelengths(length_m: float, frequency_hz: float) -> float:
-    """A length in wavelengths."""
+    """Convert a length [m] to wavelengths.
+
+    Args:
+        length_m: [m].
+        frequency_hz: [Hz].
+    """
     return length_m * frequency_hz / speed_of_light
 
 
-def _walk(links: pd.DataFrame, track: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
-    """Tracks one after the other, each in the order of its way."""
-    when = np.zeros(len(links))
+def _ordered(links: pd.DataFrame, track: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
+    """Sort links by track, and within a track by time where all of its times are known."""
+    time_s = np.zeros(len(links))
     if "time_s" in links:
-        when = links["time_s"].to_numpy(dtype=float)
-        gaps = np.bincount(track, weights=np.isnan(when)) > 0
-        when = np.where(gaps[track], 0.0, when)
-    order = np.lexsort((np.arange(len(links)), when, track))
+        time_s = links["time_s"].to_numpy(dtype=float)
+        incomplete = np.bincount(track, weights=np.isnan(time_s)) > 0
+        time_s = np.where(incomplete[track], 0.0, time_s)
+    order = np.lexsort((np.arange(len(links)), time_s, track))
     return links.iloc[order].reset_index(drop=True), track[order]
 
 
-def _bins(links: pd.DataFrame, track: np.ndarray, length_m: float) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) number of each row's bin, rising, and the first row of each bin."""
-    place_m = links[["receiver_x_m", "receiver_y_m", "receiver_z_m"]].fillna(0.0).to_numpy()
-    step_m = np.linalg.norm(np.diff(place_m, axis=0, prepend=place_m[:1]), axis=1)
+def _bins(links: pd.DataFrame, track: np.ndarray,
+          length_m: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bin of each row, (n,) ascending, and the first row of each bin."""
+    columns = ["receiver_x_m", "receiver_y_m", "receiver_z_m"]
+    position_m = links[columns].fillna(0.0).to_numpy()
+    step_m = np.linalg.norm(np.diff(position_m, axis=0, prepend=position_m[:1]), axis=1)
     starts = np.diff(track, prepend=-1) != 0
     step_m[starts] = 0.0
-    way_m = np.cumsum(step_m)
-    way_m -= way_m[starts][np.cumsum(starts) - 1]
-    cell = np.floor(way_m / length_m)
+    along_m = np.cumsum(step_m)
+    along_m -= along_m[starts][np.cumsum(starts) - 1]
+    cell = np.floor(along_m / length_m)
     new = starts | (np.diff(cell, prepend=-1) != 0)
     return np.cumsum(new) - 1, np.flatnonzero(new)
 
 
-def _mean(values: np.ndarray, bin_of: np.ndarray, bins: int) -> np.ndarray:
-    """(bins,) means of what is known; NaN where nothing is."""
+def _mean(values: np.ndarray, bin_index: np.ndarray, bins: int) -> np.ndarray:
+    """Return the means of the known values, (bins,); NaN where none is known."""
     known = ~np.isnan(values)
     if not known.any():
         return np.full(bins, np.nan)
-    offset = values[known][0]  # epoch seconds would lose their decimals in a sum
-    total = np.bincount(bin_of[known], weights=values[known] - offset, minlength=bins)
-    count = np.bincount(bin_of[known], minlength=bins)
+    offset = values[known][0]  # a sum of epoch seconds would have no decimals left
+    total = np.bincount(bin_index[known], weights=values[known] - offset, minlength=bins)
+    count = np.bincount(bin_index[known], minlength=bins)
     return np.where(count > 0, total / np.maximum(count, 1) + offset, np.nan)
 
 
-def _level(level_db: np.ndarray, bin_of: np.ndarray, count: np.ndarray, how: str) -> np.ndarray:
-    blank = np.isnan(level_db)
-    if how == "power":
-        power = np.where(blank, 0.0, 10 ** (np.nan_to_num(level_db) / 10))
+def _level(level_db: np.ndarray, bin_index: np.ndarray, count: np.ndarray,
+           method: str) -> np.ndarray:
+    """Return the level of each bin [dB], (bins,); NaN = not detected."""
+    missed = np.isnan(level_db)
+    if method == "power":
+        power = np.where(missed, 0.0, 10 ** (np.nan_to_num(level_db) / 10))
         with np.errstate(divide="ignore"):
-            result = 10 * np.log10(np.bincount(bin_of, weights=power) / count)
+            result = 10 * np.log10(np.bincount(bin_index, weights=power) / count)
     else:
-        result = pd.Series(np.where(blank, -np.inf, level_db)).groupby(bin_of).median().to_numpy()
-    too_weak = np.bincount(bin_of, weights=blank) > count / 2
-    return np.where(too_weak | ~np.isfinite(result), np.nan, result)
+        finite = pd.Series(np.where(missed, -np.inf, level_db))
+        result = finite.groupby(bin_index).median().to_numpy()
+    mostly_missed = np.bincount(bin_index, weights=missed) > count / 2
+    return np.where(mostly_missed | ~np.isfinite(result), np.nan, result)

@@ -1,4 +1,4 @@
-"""WGS84 or a projected system -> the local frame: x east, y north, z up, in metres."""
+"""Conversion of WGS84 or projected positions to the local frame: x east, y north, z up [m]."""
 
 from dataclasses import dataclass
 
@@ -10,13 +10,13 @@ from radiotwin.geodesy import to_local
 from radiotwin.importing.settings import POSITION
 from radiotwin.tables import Origin
 
-MARGIN_DEG = 1.0  # around the area for which a projected system is made
-DECIMALS = 7  # of a found origin [degrees]: a centimetre
+AREA_MARGIN_DEG = 1.0  # accepted outside the area for which a projected system is defined
+ORIGIN_DECIMALS = 7  # of a computed origin [degrees]: 1 cm
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The local frame about an origin (see `radiotwin.geodesy`); heights stay heights.
+    """The local frame about an origin (see `radiotwin.geodesy`); heights are left as they are.
 
     Attributes:
         origin: None where all positions are local already.
@@ -25,46 +25,67 @@ class Frame:
     origin: Origin | None
 
     def local_m(self, positions: pd.DataFrame) -> np.ndarray:
-        """(n, 3) x, y, z of positions with columns of `POSITION`; NaN where unknown."""
-        x_m, y_m = positions["x"].to_numpy(dtype=float), positions["y"].to_numpy(dtype=float)
+        """Convert positions to the local frame.
+
+        Args:
+            positions: columns of `POSITION` [degrees, m], n rows.
+
+        Returns:
+            x, y, z [m], (n, 3); NaN where unknown.
+        """
+        x_m = positions["x"].to_numpy(dtype=float)
+        y_m = positions["y"].to_numpy(dtype=float)
         ground_m = 0.0 if self.origin is None else self.origin.altitude_m
-        above_m = positions["height"].fillna(positions["z"]).fillna(positions["altitude"] - ground_m)
+        z_m = positions["height"].fillna(positions["z"]).fillna(positions["altitude"] - ground_m)
         if self.origin is not None:
             known = positions[["latitude", "longitude"]].notna().all(axis=1).to_numpy()
             x_m, y_m = x_m.copy(), y_m.copy()
-            x_m[known], y_m[known] = to_local(self.origin, positions["longitude"][known].to_numpy(dtype=float),
-                                              positions["latitude"][known].to_numpy(dtype=float))
-        return np.column_stack([x_m, y_m, above_m.to_numpy(dtype=float)])
+            x_m[known], y_m[known] = to_local(self.origin, positions["longitude"][known],
+                                              positions["latitude"][known])
+        return np.column_stack([x_m, y_m, z_m.to_numpy(dtype=float)])
 
 
 def find_frame(declared: Origin | None, receivers: pd.DataFrame, devices: pd.DataFrame) -> Frame:
-    """The frame about the declared origin, or about the median of the receivers, on altitude zero.
+    """Return the frame about the declared origin, or about the median of the receivers.
+
+    Args:
+        declared: origin from the settings.
+        receivers: positions with columns of `POSITION`.
+        devices: the same; their median is the origin where no receiver has a latitude.
 
     Raises:
-        BadInput: some positions are local and some geographic, and nothing says how they lie to each other.
+        BadInput: some positions are local and some geographic, and no origin relates them.
     """
     if declared is not None:
         return Frame(declared)
     both = pd.concat([receivers, devices])
     geographic, local = both["latitude"].notna().any(), both["x"].notna().any()
     if geographic and local:
-        raise BadInput("some positions are latitude and longitude, others are local x and y; give the origin of the "
-                       "local frame: --origin LATITUDE,LONGITUDE,ALTITUDE, or the crs of x and y")
+        raise BadInput("some positions are latitude and longitude, others are local x and y; give "
+                       "the origin of the local frame: --origin LATITUDE,LONGITUDE,ALTITUDE, or "
+                       "the crs of x and y")
     if not geographic:
         return Frame(None)
     known = receivers if receivers["latitude"].notna().any() else devices
     first = known["longitude"].dropna().iloc[0]
-    east = (known["longitude"] - first + 180) % 360 - 180  # a median across the date line, too
+    east = (known["longitude"] - first + 180) % 360 - 180  # so that the date line does no harm
     longitude = (first + east.median() + 180) % 360 - 180
-    return Frame(Origin(latitude_deg=round(float(known["latitude"].median()), DECIMALS),
-                        longitude_deg=round(float(longitude), DECIMALS)))
+    return Frame(Origin(latitude_deg=round(float(known["latitude"].median()), ORIGIN_DECIMALS),
+                        longitude_deg=round(float(longitude), ORIGIN_DECIMALS)))
 
 
 def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
-    """`positions` with all of `POSITION`; x and y in the system `crs` [its unit] have become latitude and longitude.
+    """Convert projected x, y to latitude and longitude.
+
+    Args:
+        positions: any columns of `POSITION`; x, y in the unit of `crs`.
+        crs: projected reference system, as PROJ knows it; None leaves x, y as they are.
+
+    Returns:
+        all columns of `POSITION`.
 
     Raises:
-        BadInput: unknown system, or x, y outside of it.
+        BadInput: unknown or not projected system, or x, y far outside its area of use.
     """
     positions = positions.reindex(columns=list(POSITION)).astype(float)
     if crs is None:
@@ -75,23 +96,26 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
     try:
         system = CRS(crs)
     except CRSError as error:
-        raise BadInput(f"crs {crs!r} is unknown; allowed is what PROJ knows, such as EPSG:32633 (UTM 33 N): {error}"
-                       ) from None
+        raise BadInput(f"crs {crs!r} is unknown; allowed is what PROJ knows, such as EPSG:32633 "
+                       f"(UTM 33 N): {error}") from None
     if not system.is_projected:
-        raise BadInput(f"crs {crs} is {system.type_name}, not a projected one with x and y; degrees go into latitude "
-                       "and longitude")
+        raise BadInput(f"crs {crs} is {system.type_name}, not a projected one with x and y; "
+                       "degrees go into latitude and longitude")
     transformer = Transformer.from_crs(system, "EPSG:4326", always_xy=True)
     known = positions["x"].notna() & positions["y"].notna()
-    longitude, latitude = transformer.transform(positions["x"][known].to_numpy(), positions["y"][known].to_numpy())
+    x, y = positions["x"][known].to_numpy(), positions["y"][known].to_numpy()
+    longitude, latitude = transformer.transform(x, y)
     area = system.area_of_use
     if area is not None:
-        east = (longitude - area.west + MARGIN_DEG) % 360  # the area may lie across the date line
-        inside = (east <= (area.east - area.west) % 360 + 2 * MARGIN_DEG) | (area.east - area.west >= 360)
-        inside &= (latitude >= area.south - MARGIN_DEG) & (latitude <= area.north + MARGIN_DEG)
+        width = area.east - area.west
+        east = (longitude - area.west + AREA_MARGIN_DEG) % 360  # it may cross the date line
+        inside = (east <= width % 360 + 2 * AREA_MARGIN_DEG) | (width >= 360)
+        inside &= latitude >= area.south - AREA_MARGIN_DEG
+        inside &= latitude <= area.north + AREA_MARGIN_DEG
         if not inside.all():
             i = int(np.argmin(inside))
-            raise BadInput(f"x, y = {positions['x'][known].iloc[i]:g}, {positions['y'][known].iloc[i]:g} is latitude "
-                           f"{latitude[i]:.3f}, longitude {longitude[i]:.3f}, far outside of the area of {crs}; is it "
-                           "another system, or are x and y swapped?")
+            raise BadInput(f"x, y = {x[i]:g}, {y[i]:g} is latitude {latitude[i]:.3f}, longitude "
+                           f"{longitude[i]:.3f}, far outside of the area of {crs}; is it another "
+                           "system, or are x and y swapped?")
     positions.loc[known, "longitude"], positions.loc[known, "latitude"] = longitude, latitude
     return positions.assign(x=np.nan, y=np.nan)

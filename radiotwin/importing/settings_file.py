@@ -2,10 +2,12 @@
 
 import os
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import tomli_w
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.settings import Columns, Settings, Wide
@@ -13,61 +15,88 @@ from radiotwin.tables import Origin
 
 
 def parse_columns(text: str) -> dict[str, str]:
-    """`latitude=lat,longitude=lon` as a dict; raises BadInput."""
-    pairs = {}
+    """Parse pairs of the command line.
+
+    Args:
+        text: such as `latitude=lat,longitude=lon`.
+
+    Raises:
+        BadInput: not pairs, or a name that is repeated.
+    """
+    pairs: dict[str, str] = {}
     for part in text.split(","):
         name, equals, value = (piece.strip() for piece in part.partition("="))
         if not (name and equals and value) or name in pairs:
-            raise BadInput(f"{part!r} in {text!r} is not a new NAME=COLUMN; for example latitude=lat,longitude=lon, or "
-                           "a file NAME.toml")
+            raise BadInput(f"{part!r} in {text!r} is not a new NAME=COLUMN; for example "
+                           "latitude=lat,longitude=lon, or a file NAME.toml")
         pairs[name] = value
     return pairs
 
 
-def read_settings(path: Path | str | None, given: dict) -> Settings:
-    """Settings of a TOML file (tables named in it lie relative to it), overruled by those `given`; raises BadInput."""
-    data = {}
+def read_settings(path: Path | str | None, given: Mapping[str, Any]) -> Settings:
+    """Read settings.
+
+    Args:
+        path: TOML file, in which the paths of tables are relative to it; None for no file.
+        given: fields of `Settings`, which replace those of the file.
+
+    Raises:
+        BadInput: not readable, not TOML, or values that are not allowed.
+    """
+    data: dict[str, Any] = {}
     if path is not None:
         path = Path(path)
         try:
             data = tomllib.loads(path.read_text("utf-8"))
         except OSError as error:
-            raise BadInput(f"{path} cannot be read: {error.strerror}; --columns takes a TOML file or pairs such as "
-                           "latitude=lat,longitude=lon") from None
+            raise BadInput(f"{path} cannot be read: {error.strerror}; --columns takes a TOML file "
+                           "or pairs such as latitude=lat,longitude=lon") from None
         except ValueError as error:
             raise BadInput(f"{path} is not TOML: {error}") from None
         for table in ("devices", "receivers"):
             if isinstance(data.get(table), str):
                 data[table] = str(path.parent / data[table])
     try:
-        return Settings.model_validate(data | given)
+        return Settings.model_validate(data | dict(given))
     except ValidationError as error:
-        lines = {_key(problem): _explain(problem, path) for problem in reversed(error.errors())}
+        # Pydantic reports each type of a union that it tried; the first report of a key is kept.
+        lines = {_key(problem): _message(problem, path) for problem in reversed(error.errors())}
         raise BadInput("\n".join(reversed(lines.values()))) from None
 
 
-def _key(problem: dict) -> str:
-    """`wide.0.level`; pydantic adds which of several types it has tried."""
-    names = {*Settings.model_fields, *Columns.model_fields, *Wide.model_fields, *Origin.model_fields}
+def _key(problem: Mapping[str, Any]) -> str:
+    """Return the key of a problem, such as `wide.0.level`, without the types that were tried."""
+    names = {*Settings.model_fields, *Columns.model_fields, *Wide.model_fields,
+             *Origin.model_fields}
+    extra = problem["type"] == "extra_forbidden"
     return ".".join(str(part) for part in problem["loc"]
-                    if isinstance(part, int) or part in names or problem["type"] == "extra_forbidden")
+                    if isinstance(part, int) or part in names or extra)
 
 
-def _explain(problem: dict, path: Path | None) -> str:
+def _message(problem: Mapping[str, Any], path: Path | None) -> str:
     key = _key(problem)
     reason = problem["msg"].removeprefix("Value error, ")
+    table = problem["loc"][0] if problem["loc"] else ""
     if problem["type"] == "extra_forbidden":
-        table = Columns if problem["loc"][0] == "columns" else Wide if problem["loc"][0] == "wide" else Settings
-        reason = f"unknown; allowed are {', '.join(table.model_fields)}"
-    elif problem["type"] == "string_type" and problem["loc"][0] in ("columns", "wide"):
-        reason = f'{problem["input"]!r}: give the name of a column, or "always {problem["input"]}" for a constant'
+        models: dict[Any, type[BaseModel]] = {"columns": Columns, "wide": Wide}
+        allowed = models.get(table, Settings).model_fields
+        reason = f"unknown; allowed are {', '.join(allowed)}"
+    elif problem["type"] == "string_type" and table in ("columns", "wide"):
+        reason = (f'{problem["input"]!r}: give the name of a column, or "always '
+                  f'{problem["input"]}" for a constant')
     elif problem["type"] != "value_error":
         reason = f"{problem['input']!r}: {reason}"
     return ": ".join(filter(None, [str(path or "the options"), key, reason]))
 
 
 def write_settings(settings: Settings, path: Path, folder: Path) -> None:
-    """Write `path`; the tables' paths become relative to `folder`, where the file will lie."""
+    """Write settings as TOML.
+
+    Args:
+        settings: those that differ from the defaults are written.
+        path: of the file.
+        folder: where the file will be in the end; the paths of tables become relative to it.
+    """
     data = settings.model_dump(exclude_none=True, exclude_defaults=True)
     for table in ("devices", "receivers"):
         if table in data:

@@ -13,19 +13,21 @@ from pathlib import Path
 
 import pytest
 
-from radiotwin.cli import console, main
+from radiotwin import console
+from radiotwin.cli import main
 
 COMMAND = Path(sys.executable).with_name("radiotwin")
 COLUMNS = 100
 
 
 @contextlib.contextmanager
-def as_in_a_process_of_its_own(words: list[str], cwd: Path) -> Iterator[None]:
-    """What the command changes of the whole process is put back."""
-    argv, folder, interrupt, show = sys.argv, Path.cwd(), signal.getsignal(signal.SIGINT), warnings.showwarning
+def as_in_a_process_of_its_own(arguments: list[str], cwd: Path) -> Iterator[None]:
+    """Restore the state of the process that a command changes."""
+    argv, folder, show = sys.argv, Path.cwd(), warnings.showwarning
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     width = console.console.width
     try:
-        sys.argv, console.console.width = ["radiotwin", *words], COLUMNS
+        sys.argv, console.console.width = ["radiotwin", *arguments], COLUMNS
         os.chdir(cwd)
         with warnings.catch_warnings():  # whatever was shown once would not be shown again
             warnings.simplefilter("default")
@@ -33,28 +35,29 @@ def as_in_a_process_of_its_own(words: list[str], cwd: Path) -> Iterator[None]:
     finally:
         os.chdir(folder)
         sys.argv, console.console.width, warnings.showwarning = argv, width, show
-        signal.signal(signal.SIGINT, interrupt)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")
 def run():
-    """Run the command on a line of words in a folder."""
-    def run(words: str, cwd: Path) -> subprocess.CompletedProcess:
+    """Run the command with a line of arguments in a folder."""
+    def run(arguments: str, cwd: Path) -> subprocess.CompletedProcess:
         out, error, status = io.StringIO(), io.StringIO(), 0
-        with as_in_a_process_of_its_own(shlex.split(words), cwd), contextlib.redirect_stdout(out), \
+        with as_in_a_process_of_its_own(shlex.split(arguments), cwd), contextlib.redirect_stdout(out), \
                 contextlib.redirect_stderr(error):
             try:
                 main()
             except SystemExit as end:
                 status = end.code or 0
-        return subprocess.CompletedProcess(words, status, out.getvalue(), error.getvalue())
+        return subprocess.CompletedProcess(arguments, status, out.getvalue(), error.getvalue())
     return run
 
 
 @pytest.fixture(scope="session")
 def run_installed():
     """The same with the command as it is installed: seconds more for each."""
-    def run_installed(words: str, cwd: Path) -> subprocess.CompletedProcess:
-        return subprocess.run([str(COMMAND), *shlex.split(words)], cwd=cwd, capture_output=True, text=True,
+    def run_installed(arguments: str, cwd: Path) -> subprocess.CompletedProcess:
+        return subprocess.run([str(COMMAND), *shlex.split(arguments)], cwd=cwd, capture_output=True, text=True,
                               timeout=300, env=os.environ | {"COLUMNS": str(COLUMNS)})
     return run_installed

@@ -24,9 +24,9 @@ def here(good, tmp_path):
     return tmp_path
 
 
-def refuse(run, words, folder, *parts):
+def refuse(run, arguments, folder, *parts):
     before = sorted(path.relative_to(folder) for path in folder.rglob("*"))
-    result = run(words, cwd=folder)
+    result = run(arguments, cwd=folder)
     assert result.returncode == 2, (result.returncode, result.stderr)
     assert "Traceback" not in result.stderr
     for part in parts:
@@ -102,7 +102,7 @@ def test_a_device_inside_a_building(run, here):
     refuse(run, "survey scene --truth segmented -o s.csv", here, "scene.toml", "device 'd3'", "inside a building")
 
 
-@pytest.mark.parametrize(("words", "parts"), [
+@pytest.mark.parametrize(("arguments", "parts"), [
     ("fit no.csv --scene scene -o twin", ["no.csv does not exist"]),
     ("fit measurements.csv --scene nowhere -o twin", ["nowhere is not a folder"]),
     ("fit measurements.csv --scene scene --model magic -o twin", ["'magic' is unknown; allowed are"]),
@@ -121,5 +121,5 @@ def test_a_device_inside_a_building(run, here):
     ("trace scene --quality best", ["quality 'best' is unknown; allowed are"]),
     ("trace scene --devices d99", ["d99"]),
 ])
-def test_options_that_cannot_be(run, here, words, parts):
-    refuse(run, words, here, *parts)
+def test_options_that_cannot_be(run, here, arguments, parts):
+    refuse(run, arguments, here, *parts)

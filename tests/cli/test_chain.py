@@ -12,14 +12,14 @@ import xarray as xr
 def chain(run, tmp_path_factory):
     """Folder in which build-scene, survey, fit, map and compare have run."""
     folder = tmp_path_factory.mktemp("chain")
-    for words in (
+    for arguments in (
         "build-scene preset:small -o scene",
         "survey scene --truth segmented --flights 4 -o survey/measurements.csv.gz",
         "fit survey/measurements.csv.gz --scene scene -o twin",
         "map twin --scene scene -o twin.nc",
         "compare survey/measurements.csv.gz --scene scene --truth segmented --also twin --also twin.nc -o comparison",
     ):
-        result = run(words, cwd=folder)
+        result = run(arguments, cwd=folder)
         assert result.returncode == 0, result.stderr
     return folder
 
@@ -92,12 +92,12 @@ def test_a_twin_by_paths_is_made_and_used_as_any_other(chain, run):
     (chain / "few").mkdir()
     devices[devices["device"].isin(["d0", "d2", "d5"])].to_csv(chain / "few" / "devices.csv", index=False)
     survey[survey["device"].isin(["d0", "d2", "d5"])].to_csv(chain / "few" / "measurements.csv", index=False)
-    for words, says in (
+    for arguments, says in (
         ("fit few/measurements.csv --scene scene --model raytrace -o by-paths", "by-paths (raytrace)"),
         ("map by-paths --scene scene -o by-paths.nc", "3 devices"),
         ("compare few/measurements.csv --scene scene --raytrace --also by-paths -o few/comparison", "by-paths"),
     ):
-        result = run(words, cwd=chain)
+        result = run(arguments, cwd=chain)
         assert result.returncode == 0 and says in result.stdout + result.stderr, result.stderr
     with xr.open_dataset(chain / "by-paths.nc", engine="h5netcdf") as dataset:
         assert dataset.attrs["source"] == "twin:raytrace"

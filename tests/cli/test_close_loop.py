@@ -52,19 +52,19 @@ def test_a_file_and_a_table_of_devices_are_enough(run, tmp_path):
     assert not re.search(r'(?:src|href)="(?!data:)', page)  # nothing from a network
 
 
-@pytest.mark.parametrize("words, parts", [
+@pytest.mark.parametrize("arguments, parts", [
     ("--base oracle", ["oracle", "twin, raytrace, log-distance"]),
     ("--base raytrace", ["raytrace", "--scene"]),
     ("--scene nowhere", ["nowhere"])])
-def test_bad_input_is_one_message(run, tmp_path, words, parts):
+def test_bad_input_is_one_message(run, tmp_path, arguments, parts):
     write(tmp_path)
-    done = run(f"close-loop measurements.csv --out result {words}", tmp_path)
+    done = run(f"close-loop measurements.csv --out result {arguments}", tmp_path)
     assert done.returncode == 2 and "Traceback" not in done.stderr
     assert all(part in done.stderr for part in parts), done.stderr
     assert not (tmp_path / "result").exists()
 
 
 def test_report_of_nothing_is_bad_input(run, tmp_path):
-    for words, part in (("report nowhere", "is not a folder"), ("report .", "holds nothing to show")):
-        done = run(words, tmp_path)
+    for arguments, part in (("report nowhere", "is not a folder"), ("report .", "holds nothing to show")):
+        done = run(arguments, tmp_path)
         assert done.returncode == 2 and part in done.stderr and not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""`radiotwin close-loop` on thin, odd and wrong data: a result that says what is odd, or one clear message."""
+"""`radiotwin close-loop` on sparse, implausible and wrong data: a result with notes, or one clear message."""
 
 import json
 import shutil
@@ -39,12 +39,12 @@ def close_loop(run, tmp_path, monkeypatch):
     monkeypatch.setattr("radiotwin.report.style.DPI", 30)
     monkeypatch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", lambda *_: {})
 
-    def close_loop(links, devices, words="", prepare=None):
+    def close_loop(links, devices, arguments="", prepare=None):
         links.to_csv(tmp_path / "measurements.csv", index=False)
         devices.to_csv(tmp_path / "devices.csv", index=False)
         if prepare:
             prepare(tmp_path)
-        done = run(f"close-loop measurements.csv --out result {words}", tmp_path)
+        done = run(f"close-loop measurements.csv --out result {arguments}", tmp_path)
         return done.returncode, done.stdout, done.stderr
     return close_loop
 
@@ -58,7 +58,7 @@ def in_the_city(scene):
 
 
 def went_on(folder, done, *parts):
-    """Status 0, all files whole, and every part is told: in a remark, which is printed, too, or as the reason why an
+    """Status 0, all files whole, and every part is reported: in a note, which is printed, too, or as the reason why an
     effect was not looked for."""
     status, out, err = done
     assert status == 0, err
@@ -66,9 +66,9 @@ def went_on(folder, done, *parts):
     assert set(WHOLE) <= set(names) and not any(name.startswith(".") for name in names)
     report = json.loads((folder / "result" / "closeloop.json").read_text())
     assert all(f"note: {remark}" in out for remark in report["remarks"])
-    told = report["remarks"] + [f"{candidate['name']} {candidate['reason']}" for candidate in report["candidates"]]
+    notes = report["remarks"] + [f"{candidate['name']} {candidate['reason']}" for candidate in report["candidates"]]
     for part in parts:
-        assert any(part in each for each in told), (part, told)
+        assert any(part in each for each in notes), (part, notes)
     return report
 
 
@@ -204,8 +204,8 @@ WRONG = {
     "a device that is not declared": (lambda links, devices: (links, devices[1:]),
                                       ["row 2, column device", "'d0' is not in devices.csv", "add it there"]),
     "a device declared twice": (lambda links, devices: (links, pd.concat([devices, devices[:1]])),
-                                ["devices.csv: row 6", "'d0' stands there twice", "one row"]),
-    "an anchor without a place": (put("x_m", "", [0], 1), ["devices.csv: row 2", "anchor 'd0' has no x_m", "fill"]),
+                                ["devices.csv: row 6", "'d0' occurs twice", "one row"]),
+    "an anchor without a position": (put("x_m", "", [0], 1), ["devices.csv: row 2", "anchor 'd0' has no x_m", "fill"]),
     "no anchor": (put("role", "unknown", table=1), ["at least 60", "without a scene", "cannot be located"]),
     "a frequency in megahertz": (put("frequency_hz", 2400, table=1), ["frequency_hz", "'2400'", "the unit is Hz"]),
     "no frequency at all": (put("frequency_hz", 0, table=1), ["frequency_hz", "'0' is no frequency", "allowed"]),
@@ -257,7 +257,7 @@ def test_what_else_is_in_the_output_folder_stays(close_loop, tmp_path):
 
 
 IN_THE_CITY = {
-    "nothing odd": (lambda links, devices, hidden: (links, devices), []),
+    "nothing implausible": (lambda links, devices, hidden: (links, devices), []),
     "all links with line of sight": (lambda links, devices, hidden: (links[~hidden], devices), []),
     "receivers in buildings": (lambda links, devices, hidden: (links.assign(receiver_z_m=2.0), devices),
                                ["links have their receiver inside a building", "one frame and unit?"]),

@@ -1,4 +1,4 @@
-"""What every command has: --quiet, --json where there are tables, no colours in pipes, seeds, completion."""
+"""Options of every command: --quiet, --json where there are tables, seeds; no colours in pipes, completion."""
 
 import inspect
 import json
@@ -12,14 +12,14 @@ import typer
 from typer.testing import CliRunner
 
 from radiotwin.cli import app
-from radiotwin.cli.console import print_rows, say
-from radiotwin.cli.output import TABLES, add_output_options
+from radiotwin.command import TABLES, add_output_options
+from radiotwin.console import print_rows, say
 
 COMMAND = Path(sys.executable).with_name("radiotwin")
 AT_RANDOM = ("build-scene", "trace", "survey", "fit", "compare", "close-loop", "demo")
 
 
-def invoke(*words):
+def invoke(*arguments):
     """A command of a small app that prints a message and a table, or ends with a finding."""
     small = typer.Typer()
 
@@ -35,7 +35,7 @@ def invoke(*words):
         say("wrote it")
 
     add_output_options(small)
-    return CliRunner().invoke(small, words)
+    return CliRunner().invoke(small, arguments)
 
 
 def test_tables_and_messages_as_json():
@@ -80,19 +80,20 @@ def test_bad_input_is_no_json(run, tmp_path):
     assert done.returncode == 2 and done.stdout == "" and "does not exist" in done.stderr
 
 
-@pytest.mark.parametrize("words, expected", [("radiotwin clo", "close-loop"),
+@pytest.mark.parametrize("arguments, expected", [("radiotwin clo", "close-loop"),
                                              ("radiotwin fit --allow", "--allow-indoor")])
-def test_the_shell_completes(words, expected):
+def test_the_shell_completes(arguments, expected):
     result = subprocess.run([str(COMMAND)], capture_output=True, text=True, env=os.environ | {
-        "_RADIOTWIN_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(len(words.split()) - 1)})
+        "_RADIOTWIN_COMPLETE": "complete_bash", "COMP_WORDS": arguments, "COMP_CWORD": str(len(arguments.split()) - 1)})
     assert expected in result.stdout.split()
 
 
 def test_planning_has_the_same_options(small_scene, tmp_path):
-    words = ["--scene", str(small_scene.folder), "--truth", "segmented", "--algorithm", "random", "--twin",
+    arguments = ["--scene", str(small_scene.folder), "--truth", "segmented", "--algorithm", "random", "--twin",
              "log-distance", "--real-episodes", "1", "--planner-iterations", "50", "--flights", "2", "--json", "--out",
              "run"]
-    done = subprocess.run([sys.executable, "-m", "marl.fedqmix", *words], cwd=tmp_path, capture_output=True, text=True)
+    done = subprocess.run([sys.executable, "-m", "marl.fedqmix", *arguments], cwd=tmp_path, capture_output=True,
+                          text=True)
     assert done.returncode == 0, done.stderr
     rows = json.loads(done.stdout)["tables"][0]["rows"]
     assert [row["method"] for row in rows] == ["random", "planner", "greedy"]

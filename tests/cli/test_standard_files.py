@@ -1,4 +1,4 @@
-"""What leaves the package, through the real command line: scenes, maps, gains at points; and bad requests."""
+"""Exports through the real command line: scenes, maps, gains at points; and bad requests."""
 
 import shutil
 
@@ -47,15 +47,15 @@ def test_a_name_that_is_not_ascii(run, folder):
 
 def test_a_map_of_another_scene_is_warned_of_and_one_of_another_place_is_refused(run, folder):
     radio_map = RadioMap.read(folder / "map.nc")
-    for hash_, latitude_deg, status, words in (
+    for hash_, latitude_deg, status, arguments in (
             (Scene.load(folder / "scene").content_hash(), 47.5, 0, ""),
             ("another", 47.5, 0, "was made for another scene than scene"),
             ("another", 40.0, 2, "latitude_deg is 40, that of scene is 47.5")):
         radio_map.dataset.attrs |= {"scene_hash": hash_, "origin_latitude_deg": latitude_deg}
         radio_map.write(folder / "other.nc")
         result = run("map other.nc --scene scene -o other.tif", cwd=folder)
-        assert result.returncode == status and words in " ".join(result.stderr.split()), result.stderr
-        assert bool(result.stderr.strip()) == bool(words) and (folder / "other.tif").exists() == (status == 0)
+        assert result.returncode == status and arguments in " ".join(result.stderr.split()), result.stderr
+        assert bool(result.stderr.strip()) == bool(arguments) and (folder / "other.tif").exists() == (status == 0)
         (folder / "other.tif").unlink(missing_ok=True)
 
 
@@ -79,7 +79,7 @@ def test_gains_at_points(run, folder):
 
 BAD = {
     "export-scene scene -o city.stl": "unknown format '.stl'", "export-scene scene -o scene": "holds preview.png",
-    "export-scene none -o out": "none is not a folder", "map map.nc --scene scene": "say with --out in which form",
+    "export-scene none -o out": "none is not a folder", "map map.nc --scene scene": "give the file to write with --out",
     "map map.nc --scene scene -o a.xls": "unknown format '.xls'",
     "map map.nc --scene scene -o a.tif --devices d9": "device 'd9' is not in the map",
     "map map.nc --scene scene -o a.tif --altitudes 61": "altitude 61 m is not in the map",
@@ -95,12 +95,12 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("words", BAD)
-def test_bad_requests(run, folder, words):
+@pytest.mark.parametrize("arguments", BAD)
+def test_bad_requests(run, folder, arguments):
     import re
 
     (folder / "p.csv").write_text("x_m,y_m,z_m\n1,2,3\n")
     before = sorted(folder.rglob("*"))
-    result = run(words, cwd=folder)
-    assert result.returncode == 2 and re.search(BAD[words], result.stderr), result.stderr
+    result = run(arguments, cwd=folder)
+    assert result.returncode == 2 and re.search(BAD[arguments], result.stderr), result.stderr
     assert result.stderr.count("radiotwin:") == 1 and sorted(folder.rglob("*")) == before

@@ -40,10 +40,10 @@ def test_east_is_the_circle_of_the_prime_vertical(latitude):
 
 
 def test_heights_are_kept_above_the_declared_ground():
-    places = pd.concat([positions(latitude=48.2, longitude=11.5, altitude=540.0),
-                        positions(latitude=48.1, longitude=11.5, height=7.0),
-                        positions(latitude=48.1, longitude=11.5)])
-    np.testing.assert_array_equal(frame(48.1, 11.5, 519.0).local_m(places)[:, 2], [21.0, 7.0, np.nan])
+    mixed = pd.concat([positions(latitude=48.2, longitude=11.5, altitude=540.0),
+                       positions(latitude=48.1, longitude=11.5, height=7.0),
+                       positions(latitude=48.1, longitude=11.5)])
+    np.testing.assert_array_equal(frame(48.1, 11.5, 519.0).local_m(mixed)[:, 2], [21.0, 7.0, np.nan])
 
 
 def test_the_origin_is_the_median_of_the_receivers():

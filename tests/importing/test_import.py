@@ -1,4 +1,4 @@
-"""Rows -> links: mapping, places, filters, and the account of what was left out."""
+"""From rows to links: mapping, positions, filters, and counts of what was left out."""
 
 import numpy as np
 import pytest
@@ -36,14 +36,14 @@ def test_constants_and_all_other_columns(bring_in, local):
     assert any("since 1970" in text for text in result.report["warnings"])
 
 
-def test_places_of_devices_from_columns(bring_in, local):
+def test_positions_of_devices_from_columns(bring_in, local):
     text = "device,x,y,level,dx,dy,dz\na,1,2,-80,30,40,5\nb,1,2,-80,,,\na,9,9,-80,30,40,5\n"
     result = bring_in(text, length_unit="m", columns=local | {"device_x": "dx", "device_y": "dy", "device_z": "dz"})
     assert result.devices.set_index("device").loc["a"].tolist() == [30, 40, 5, "anchor"]
     assert result.devices["role"].tolist() == ["anchor", "unknown"] and result.devices["x_m"].isna().tolist() == [0, 1]
 
 
-def test_places_of_devices_from_a_table(bring_in, local, tmp_path):
+def test_positions_of_devices_from_a_table(bring_in, local, tmp_path):
     (tmp_path / "sites.csv").write_text("device,x_ft,y_ft,z_m,frequency_hz,azimuth_deg\n"
                                         "b,100,0,24,9e8,120\nc,1,1,1,9e8,0\n")
     result = bring_in(HEAD + "a,0,0,-80\nb,0,0,-81\n", columns=local, length_unit="m",
@@ -60,7 +60,7 @@ def test_a_moving_device_is_named_by_its_position(bring_in, local):
     result = bring_in(text, columns=by_position, length_unit="m")
     assert list(result.table["device"]) == ["p1", "p2", "p1"] and reasons(result) == {"no device": 1}
     assert result.measurements.device_m[:, :2].tolist() == [[30, 40], [50, 60]] and result.measurements.is_anchor.all()
-    with pytest.raises(BadInput, match=r"device '_' stands at places 20 m apart.*by position"):
+    with pytest.raises(BadInput, match=r"device '_' has positions 20 m apart.*by position"):
         bring_in(text, columns=by_position | {"device": "device"}, length_unit="m")
 
 
@@ -76,7 +76,7 @@ def test_a_column_for_each_device(bring_in, tmp_path):
 
 
 def test_a_column_for_each_receiver(bring_in, tmp_path):
-    """Two fixed ones with places in a table, listed by name; one that moves and has columns of its own."""
+    """Two fixed ones with positions in a table, listed by name; one that moves and has columns of its own."""
     (tmp_path / "fixed.csv").write_text("receiver,x,y\nroof,100,0\n")
     result = bring_in("roof,yard,bus_l,bus_x,bus_y,id\n-70,-75,-80,7,8,d\n", length_unit="m", columns={"device": "id"},
                       receivers=str(tmp_path / "fixed.csv"), wide=[
@@ -87,7 +87,7 @@ def test_a_column_for_each_receiver(bring_in, tmp_path):
     assert reasons(result) == {"no position of receiver yard": 1}
 
 
-def test_a_height_in_the_file_holds_for_places_of_a_table(bring_in, tmp_path):
+def test_a_height_in_the_file_holds_for_positions_of_a_table(bring_in, tmp_path):
     (tmp_path / "fixed.csv").write_text("receiver,latitude,longitude\nroof,48,11\n")
     result = bring_in("who,l,id\nroof,-70,d\n", length_unit="m", receivers=str(tmp_path / "fixed.csv"), columns={
         "receiver": "who", "level": "l", "device": "id", "height": "always 12"})
@@ -107,7 +107,7 @@ def test_filters(bring_in, local, tmp_path):
             "a,301,0,0,-41\na,302,0,0,none\n")
     result = bring_in(text, columns=local | {"z": "z"}, length_unit="m", min_distance_m=51.0, max_distance_m=1000.0,
                       min_level=-90.0, max_level=-50.0, not_detected=["empty"], devices=str(tmp_path / "sites.csv"))
-    assert list(result.table["receiver_x_m"]) == [300, 1, 302]  # a device without a place and a blank level pass
+    assert list(result.table["receiver_x_m"]) == [300, 1, 302]  # a device without a position and a blank level pass
     assert reasons(result) == {"nearer than 51.0 m": 1, "further than 1000.0 m": 1, "level below -90.0": 1,
                                "level above -50.0": 1}
     near = bring_in(text, columns=local | {"z": "z"}, length_unit="m", min_distance_m=49.0, not_detected=["empty"],
@@ -131,18 +131,18 @@ def test_local_means_say_how_many_readings(bring_in, local):
     assert any("17 wavelengths; 20 to 40 (Lee 1985) are 6.0 to 12.0 m" in text for text in result.report["warnings"])
 
 
-@pytest.mark.parametrize(("text", "given", "words"), [
+@pytest.mark.parametrize(("text", "given", "message"), [
     ("a,0,0,-80\nb,300000,0,-80\n", {}, "300 km apart"),
     ("a,0,0,none\na,0,1,none\na,0,2,-80\n", {"not_detected": ["empty"]}, "67% of the levels are not detected"),
-    ("".join(f"a,{i},0,{-90 - i % 5}\n" for i in range(30)), {}, "20% of the levels are -94, the least"),
+    ("".join(f"a,{i},0,{-90 - i % 5}\n" for i in range(30)), {}, "20% of the levels are -94, the smallest"),
     ("a,0,0,-80\n", {}, "1 of 1 devices have no position"),
 ])
-def test_what_looks_odd_is_said(bring_in, local, text, given, words):
+def test_implausible_data_give_a_warning(bring_in, local, text, given, message):
     result = bring_in(HEAD + text, columns=local, length_unit="m", **given)
-    assert any(words in note for note in result.report["warnings"])
+    assert any(message in note for note in result.report["warnings"])
 
 
-def test_odd_heights_headings_and_swapped_sites(bring_in, tmp_path):
+def test_implausible_heights_headings_and_swapped_sites(bring_in, tmp_path):
     (tmp_path / "sites.csv").write_text("device,latitude,longitude\na,11.5,48.1\n")
     rows = "".join(f"a,48.1,11.5,{z},{0.2 * i},-{80 + i}\n" for i, z in enumerate([1400] * 25))
     columns = {"device": "d", "latitude": "la", "longitude": "lo", "altitude": "z", "heading": "h", "level": "l"}
@@ -201,12 +201,12 @@ def test_degrees_that_are_none(bring_in, text, message):
 
 @pytest.mark.parametrize(("table", "message"), [
     ("name,x,y\na,1,2\n", r"column 'device'.*is missing"),
-    ("device,x,y\na,1,2\na,1,2\n", "row 3, column device: 'a' stands there twice"),
+    ("device,x,y\na,1,2\na,1,2\n", "row 3, column device: 'a' occurs twice"),
     ("device,height\na,1\n", "there is no position"),
     ("device,latitude,longitude\na,95,2\n", "row 2, column latitude: '95' is no latitude"),
     ("device,x,y,frequency_hz\na,1,2,2.4\n", "row 2, column frequency_hz: '2.4' is no frequency"),
 ])
-def test_tables_of_places_that_cannot_be_used(bring_in, local, tmp_path, table, message):
+def test_tables_of_positions_that_cannot_be_used(bring_in, local, tmp_path, table, message):
     (tmp_path / "sites.csv").write_text(table)
     with pytest.raises(BadInput, match=message):
         bring_in(HEAD + "a,0,0,-80\n", columns=local, length_unit="m", devices=str(tmp_path / "sites.csv"))

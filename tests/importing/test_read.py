@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.read import read_source
+from radiotwin.importing.source import read_source
 
 TEXT = "device,x,y,level\na,0,0,-80\nb,3,4,-90\n"
 

@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.read import Source
-from radiotwin.importing.times import day, seconds
+from radiotwin.importing.source import Source
+from radiotwin.importing.times import calendar_days, seconds
 
 
 def read(values, form, zone=None):
@@ -41,8 +41,8 @@ def test_winter_has_another_offset():
 
 def test_the_day_is_that_of_the_zone():
     late = datetime(2022, 7, 7, 3, tzinfo=UTC).timestamp()
-    assert list(day(np.array([late, np.nan]), "America/Denver")) == ["2022-07-06", ""]
-    assert list(day(np.array([late]), None)) == ["2022-07-07"]
+    assert list(calendar_days(np.array([late, np.nan]), "America/Denver")) == ["2022-07-06", ""]
+    assert list(calendar_days(np.array([late]), None)) == ["2022-07-07"]
 
 
 def test_times_of_parquet_need_a_zone_or_have_one():
@@ -61,7 +61,7 @@ def test_times_of_parquet_need_a_zone_or_have_one():
     (["2022-07-06 12:00"], "ISO 8601", "../etc/passwd", "is unknown"),
     (["1"], "epoch s", "denver", "'denver' is unknown.*America/Denver"),
     (["2022-07-06 12:00", "soon"], "ISO 8601", "UTC", "row 3, column t: 'soon' is no time"),
-    (["2022"], "%Q", "UTC", "'%Q' is no format of strftime"),
+    (["2022"], "%Q", "UTC", "'%Q' is not a strftime format"),
     (["1657108800", "1657108800250"], "epoch s", None, "row 3.*'1657108800250' lies outside of the years 1900 to 2200"),
     (["9999-12-31"], "ISO 8601", "UTC", "row 2.*'9999-12-31' lies outside"),
     (["soon"], "epoch s", None, "row 2, column t: 'soon' is not a number"),

@@ -1,0 +1,113 @@
+"""Positions of receivers and devices: from the file's own columns, then from tables."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from radiotwin.errors import BadInput
+from radiotwin.importing.frame import Frame, find_frame, to_geographic
+from radiotwin.importing.position_table import read_positions
+from radiotwin.importing.settings import POSITION, Settings
+from radiotwin.importing.source import Source
+from radiotwin.importing.tally import Tally
+from radiotwin.measurements import DEVICE_OPTIONAL, MAX_COORDINATE_M
+
+MOVING_M = 1.0  # a device whose positions differ by more than this is not at rest
+
+
+@dataclass(frozen=True)
+class PositionedLinks:
+    """Links whose receivers have positions.
+
+    Attributes:
+        links: with `receiver_x_m, receiver_y_m, receiver_z_m`.
+        devices: as in `devices.csv`: those of the links, in the order of their first ones.
+        device_m: position of each link's device [m], (n, 3); NaN where unknown.
+        frame: of all positions.
+    """
+
+    links: pd.DataFrame
+    devices: pd.DataFrame
+    device_m: np.ndarray
+    frame: Frame
+
+
+def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
+                  tally: Tally) -> PositionedLinks:
+    """Find the positions of receivers and devices in one local frame.
+
+    Args:
+        source: the file, for messages.
+        links: as of `build_links`.
+        settings: tables, crs and origin.
+        tally: counts the links whose receiver has no position.
+
+    Raises:
+        BadInput: a table that cannot be used, a position far from the origin, or a moving device.
+    """
+    tables = {name: None if path is None else read_positions(path, name, settings)
+              for name, path in (("receiver", settings.receivers), ("device", settings.devices))}
+    receivers = _positions(links, "", tables["receiver"], links["receiver"], settings.crs)
+    devices = _positions(links, "device_", tables["device"], links["device"], settings.crs)
+    frame = find_frame(settings.origin, receivers, devices)
+    receiver_m, device_m = frame.local_m(receivers), frame.local_m(devices)
+    _check_near(source, links, receiver_m, "receiver")
+    _check_near(source, links, device_m, "device")
+    links = links.assign(**{f"receiver_{axis}_m": receiver_m[:, i] for i, axis in enumerate("xyz")})
+    unknown = np.isnan(receiver_m[:, :2]).any(axis=1)
+    names = links["receiver"][unknown]
+    for name, rows in names.groupby(names, sort=False):
+        tally.count(f"no position of receiver {name}", "", len(rows), source.where(rows.index[0]))
+    links, device_m = links[~unknown], device_m[~unknown]
+    table = _device_table(source, links, device_m, tables["device"])
+    return PositionedLinks(links, table, device_m, frame)
+
+
+def _check_near(source: Source, links: pd.DataFrame, position_m: np.ndarray, end: str) -> None:
+    far = (np.abs(position_m) > MAX_COORDINATE_M).any(axis=1)
+    if far.any():
+        row = int(np.argmax(far))
+        raise BadInput(f"{source.path}: {source.where(links.index[row])}: the {end} lies "
+                       f"{np.nanmax(np.abs(position_m[row])) / 1000:.0f} km from the origin "
+                       f"({far.sum()} such rows); are position, unit and origin right?")
+
+
+def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, names: pd.Series,
+               crs: str | None) -> pd.DataFrame:
+    """Return the columns of `POSITION`: from the file, else from the table, else NaN."""
+    own = {name: links[prefix + name] for name in POSITION if prefix + name in links}
+    positions = to_geographic(pd.DataFrame(own, index=links.index), crs)
+    if table is None:
+        return positions
+    values = positions.to_numpy(copy=True)
+    horizontal = [POSITION.index("latitude"), POSITION.index("x")]
+    unknown = np.isnan(values[:, horizontal]).all(axis=1)
+    declared = table[list(POSITION)].reindex(names[unknown]).to_numpy()
+    values[unknown] = np.where(np.isnan(values[unknown]), declared, values[unknown])
+    return pd.DataFrame(values, index=links.index, columns=positions.columns)
+
+
+def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
+                  table: pd.DataFrame | None) -> pd.DataFrame:
+    """Return the devices of the links as in `devices.csv`."""
+    by_device = pd.DataFrame(device_m, columns=["x_m", "y_m", "z_m"], index=links.index).groupby(
+        links["device"].to_numpy(), sort=False)
+    range_m = by_device.max() - by_device.min()
+    moving = range_m.index[(range_m > MOVING_M).any(axis=1)]
+    if len(moving):
+        raise BadInput(f"{source.path}: device {moving[0]!r} has positions "
+                       f"{range_m.loc[moving[0]].max():.0f} m apart ({len(moving)} such devices); "
+                       "a device has one position: name it device = \"by position\", or leave its "
+                       "position out to have it found")
+    devices = by_device.median()
+    devices["role"] = np.where(devices[["x_m", "y_m"]].notna().all(axis=1), "anchor", "unknown")
+    devices.loc[devices["role"] == "unknown", ["x_m", "y_m"]] = np.nan
+    for name in DEVICE_OPTIONAL:
+        if table is not None and name in table:
+            devices[name] = table[name].reindex(devices.index)
+    if "frequency_hz" in links:
+        own_hz = links.groupby("device", sort=False)["frequency_hz"].median()
+        devices["frequency_hz"] = own_hz.fillna(devices["frequency_hz"]) \
+            if "frequency_hz" in devices else own_hz
+    return devices.rename_axis("device").reset_index()

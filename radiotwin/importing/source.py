@@ -1,0 +1,177 @@
+"""A file of measurements as a table whose cells can be named in a message."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from radiotwin.cells import read_cells
+from radiotwin.errors import BadInput
+
+EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
+"""Texts, in lower case, of cells without a value."""
+ALWAYS = "always "
+"""Prefix of a constant in place of a column's name."""
+FORMATS = (".csv", ".parquet", ".geojson", ".json")
+
+
+@dataclass(frozen=True)
+class Source:
+    """A table whose index is the position of each row in the file.
+
+    Attributes:
+        path: of the file.
+        table: cells as in the file.
+        where: index -> `row 7`, as the file's user counts.
+    """
+
+    path: Path
+    table: pd.DataFrame
+    where: Callable[[int], str]
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def cells(self, spec: str, purpose: str) -> pd.Series:
+        """Return the cells of a column, or a constant.
+
+        Args:
+            spec: name of a column, or `always VALUE`.
+            purpose: what they are needed for, for the message.
+
+        Raises:
+            BadInput: no such column.
+        """
+        if spec.startswith(ALWAYS):
+            return pd.Series(spec.removeprefix(ALWAYS), index=self.table.index)
+        if spec not in self.table:
+            raise BadInput(f"{self.path}: column {spec!r} ({purpose}) is missing; the file has "
+                           f"{', '.join(map(str, self.table.columns))}. Correct the mapping")
+        return self.table[spec]
+
+    def text(self, spec: str, purpose: str) -> pd.Series:
+        """Return the cells as stripped texts, `""` where empty.
+
+        Args:
+            spec: name of a column, or `always VALUE`.
+            purpose: what they are needed for, for the message.
+
+        Raises:
+            BadInput: no such column.
+        """
+        return as_text(self.cells(spec, purpose))
+
+    def numbers(self, spec: str, purpose: str) -> np.ndarray:
+        """Return the cells as numbers, (n,); NaN where empty.
+
+        Args:
+            spec: name of a column, or `always VALUE`.
+            purpose: what they are needed for, for the message.
+
+        Raises:
+            BadInput: no such column, a text, or a number that is not finite.
+        """
+        cells = self.cells(spec, purpose)
+        if cells.dtype.kind in "fiu":
+            numbers = cells.to_numpy(dtype=float, na_value=np.nan)
+        else:
+            text = as_text(cells)
+            parsed = pd.to_numeric(text, errors="coerce")
+            self.refuse(spec, text, parsed.isna() & (text != ""), "is not a number")
+            numbers = parsed.to_numpy(dtype=float)
+        self.refuse(spec, cells, np.isinf(numbers), "is not finite")
+        return numbers
+
+    def refuse(self, spec: str, cells: pd.Series, bad: ArrayLike, reason: str) -> None:
+        """Raise BadInput about the first bad cell of a column, if there is one.
+
+        Args:
+            spec: the column.
+            cells: (n,) with the index of the table.
+            bad: (n,) bool.
+            reason: end of the message, after the cell's text.
+
+        Raises:
+            BadInput: names file, row and column.
+        """
+        rows = np.flatnonzero(np.asarray(bad, dtype=bool))
+        if len(rows):
+            more = f" ({len(rows)} such rows)" if len(rows) > 1 else ""
+            raise BadInput(f"{self.path}: {self.where(cells.index[rows[0]])}, column {spec}: "
+                           f"{str(cells.iloc[rows[0]])!r} {reason}{more}")
+
+
+def as_text(cells: pd.Series) -> pd.Series:
+    """Convert cells to stripped texts.
+
+    Args:
+        cells: (n,) of any type.
+
+    Returns:
+        texts, (n,): `""` for every spelling of an empty cell, whole numbers without a point.
+    """
+    if cells.dtype.kind == "f":
+        whole = (cells == cells.round()) & (cells.abs() < 2.0**53)  # exact in double precision
+        if (cells.isna() | whole).all():  # an integer column with gaps
+            cells = cells.astype("Int64")
+    text = cells.astype(str).str.strip()
+    return text.mask(cells.isna() | text.str.lower().isin(EMPTY), "")
+
+
+def read_source(path: Path | str) -> Source:
+    """Open a file of measurements.
+
+    Args:
+        path: `.csv`, `.csv.gz`, `.parquet`, or `.geojson` of points.
+
+    Raises:
+        BadInput: another format, unreadable, or without rows.
+    """
+    path = Path(path)
+    if path.suffix not in FORMATS and path.suffixes[-2:] != [".csv", ".gz"]:
+        raise BadInput(f"{path}: unknown format; allowed are .csv.gz, {', '.join(FORMATS)}")
+    if path.suffix in (".geojson", ".json"):
+        source = Source(path, _read_geojson(path), lambda index: f"feature {index + 1}")
+    else:
+        first = 1 if path.suffix == ".parquet" else 2
+        source = Source(path, read_cells(path), lambda index: f"row {index + first}")
+    if not len(source):
+        raise BadInput(f"{path}: has no rows; it needs at least one measurement")
+    return source
+
+
+def _read_geojson(path: Path) -> pd.DataFrame:
+    """Return one row per point: longitude, latitude, altitude (RFC 7946, 3.1.1) and properties."""
+    try:
+        data = json.loads(path.read_text("utf-8"))
+    except OSError as error:
+        raise BadInput(f"{path} cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise BadInput(f"{path} is not GeoJSON: {error}") from None
+    features = data.get("features") if isinstance(data, dict) else None
+    if not isinstance(features, list):
+        raise BadInput(f"{path} is not a GeoJSON FeatureCollection; allowed is one of points")
+    crs = str(data.get("crs") or "CRS84")
+    if not ("CRS84" in crs or "4326" in crs):
+        raise BadInput(f"{path}: its crs is {crs}; allowed is WGS84, the only one of GeoJSON since "
+                       "RFC 7946")
+    return pd.DataFrame([_point(path, number, feature)
+                         for number, feature in enumerate(features, start=1)])
+
+
+def _point(path: Path, number: int, feature: object) -> dict[str, object]:
+    """Return the properties and coordinates of a GeoJSON feature."""
+    geometry = feature.get("geometry") if isinstance(feature, dict) else None
+    kind = geometry.get("type") if isinstance(geometry, dict) else None
+    coordinates = geometry.get("coordinates") if geometry and kind == "Point" else None
+    if (not isinstance(coordinates, list) or len(coordinates) not in (2, 3)
+            or not all(isinstance(value, int | float) for value in coordinates)):
+        raise BadInput(f"{path}: feature {number} is {kind or 'without a geometry'}; allowed are "
+                       "points with two or three coordinates: leave the others out")
+    properties = feature.get("properties") if isinstance(feature, dict) else None
+    return ((properties if isinstance(properties, dict) else {})
+            | dict(zip(("longitude", "latitude", "altitude"), coordinates)))
