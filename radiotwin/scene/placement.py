@@ -247,8 +247,9 @@ def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: Ci
         altitude_m = lattice.altitudes_m[number % len(lattice.altitudes_m)]
         points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, altitude_m)])[nearest]
         free = np.ones(len(points), dtype=bool)
-        for offset_m in offsets_m if buildings is not None else ():
-            free &= ~buildings.inside(points + offset_m)
+        if buildings is not None:
+            for offset_m in offsets_m:
+                free &= ~buildings.inside(points + offset_m)
         if not free.any():
             raise BadInput(f"at {altitude_m:g} m every lattice position is inside a building; "
                            "choose higher altitudes")

@@ -1,6 +1,7 @@
 """A picture of a scene from above."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
@@ -91,15 +92,17 @@ def draw_devices(axes: Axes, scene: Scene) -> None:
         axes: Axes in metres.
         scene: Scene that declares them.
     """
-    outline = {"edgecolors": "white", "linewidths": 0.9, "zorder": 3, "clip_on": False}
+    outline: dict[str, Any] = {"edgecolors": "white", "linewidths": 0.9, "zorder": 3,
+                               "clip_on": False}
     for role, marker, size, colour, label in (
             ("anchor", "^", 110, "#d1495b", "anchor"),
             ("unknown", "*", 170, "#f08a00", "device to be found")):
         points = np.array([(device.x_m, device.y_m) for device in scene.config.devices
                            if device.role == role]).reshape(-1, 2)
         if len(points):
-            axes.scatter(*points.T, marker=marker, s=size, color=colour, label=label, **outline)
+            axes.scatter(points[:, 0], points[:, 1], marker=marker, s=size, color=colour,
+                         label=label, **outline)
     starts = np.array([(uav.start_x_m, uav.start_y_m) for uav in scene.config.uavs]).reshape(-1, 2)
     if len(starts):
-        axes.scatter(*starts.T, marker="x", s=80, color="black", linewidths=2.2,
+        axes.scatter(starts[:, 0], starts[:, 1], marker="x", s=80, color="black", linewidths=2.2,
                      label="UAV start", zorder=3)
