@@ -55,7 +55,7 @@ def measure(folder: Path, settings: SolverSettings, receivers: int, queue) -> No
     solver = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings)
     solver.solve(scene.device_m[0], points_m[: settings.batch_receivers])
     wall_s, cpu = time.perf_counter(), os.times()
-    gain_db = np.stack([np.concatenate(list(solver.gains(device_m, points_m))) for device_m in scene.device_m])
+    gain_db = np.stack([solver.gains(device_m, points_m) for device_m in scene.device_m])
     wall_s, cpu_s = time.perf_counter() - wall_s, sum(os.times()[:2]) - sum(cpu[:2])
     # A batch that is not full costs what a full one does; speeds are of full ones.
     solved = len(scene.device_m) * len(solver.batches(receivers)) * settings.batch_receivers

@@ -20,8 +20,8 @@ from radiotwin.scene import Scene
 from radiotwin.scene.build import check_target
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import SceneConfig, write_config
-from radiotwin.scene.material_mapping import unique_name
 from radiotwin.scene.materials import itu_material, traceable
+from radiotwin.scene.names import unique_name
 from radiotwin.scene.ply import read_ply, write_ply
 from radiotwin.scene.preview import draw_preview
 from radiotwin.scene.writer import CityShape, write_city

@@ -21,9 +21,9 @@ from radiotwin.footprints.solids import Prism, find_overlaps, make_prisms
 from radiotwin.geodesy import to_local
 from radiotwin.scene import checks
 from radiotwin.scene.build import BuildOptions, Declared, check_target, finish_scene
-from radiotwin.scene.importer import RESERVED_NAMES, ImportedCity
-from radiotwin.scene.material_mapping import safe_name, unique_name
+from radiotwin.scene.importer import ImportedCity
 from radiotwin.scene.materials import Material, itu_material
+from radiotwin.scene.names import RESERVED_NAMES, safe_name, unique_name
 from radiotwin.scene.placement import choose_extent
 from radiotwin.scene.problems import Problem, listed
 from radiotwin.scene.report import BuildReport

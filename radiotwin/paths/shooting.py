@@ -45,7 +45,7 @@ def sphere(count: int) -> np.ndarray:
 def first_facets(city: CityMap, facets: Facets, origin_m: np.ndarray, direction: np.ndarray):
     """What rays meet first: distance [m] and facet (row of `Surfaces`; -1: nothing, or a face from behind)."""
     ground = len(facets)
-    distance_m, face, cosine = city._first_hits(origin_m, origin_m + FAR_M * direction)
+    distance_m, face, cosine = city.first_hits(origin_m, origin_m + FAR_M * direction)
     facet = np.where(face >= 0, facets.of_face[face], -1)
     facet[(face >= 0) & (cosine >= 0)] = -1
     # The ground has no end, though the city's mesh of it may have, or there may be none.

@@ -1,7 +1,7 @@
 """Any Mitsuba or Sionna RT city into a checked scene folder that needs nothing outside itself."""
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,7 +14,13 @@ from radiotwin.files import atomic_folder
 from radiotwin.geodesy import local_crs
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.config import Extent, LatticeConfig, SceneConfig, parse_config, write_config
+from radiotwin.scene.config import (
+    Extent,
+    LatticeConfig,
+    SceneConfig,
+    parse_config,
+    write_config,
+)
 from radiotwin.scene.importer import ImportedCity, import_city
 from radiotwin.scene.material_mapping import settle
 from radiotwin.scene.materials import constants
@@ -35,24 +41,25 @@ from radiotwin.scene.sources import find_source, scene_name
 from radiotwin.scene.writer import CityShape, write_city
 from radiotwin.tables import Origin
 
-SCENE_FILES = {"scene.toml", "city.xml", "meshes", "preview.png", "buildings.csv"}
+SCENE_FILES = frozenset({"scene.toml", "city.xml", "meshes", "preview.png", "buildings.csv"})
 
 
 @dataclass(frozen=True)
 class BuildOptions:
-    """How to read a city, and what to add to it.
+    """Options for reading a city and adding to it.
 
     Attributes:
-        frequency_hz: of the scene's radio [Hz].
-        materials: name of a material in the file -> ITU material to take for it.
-        scale: factor that turns the file's unit into metres; None: metres, with a warning where it looks
-            otherwise.
-        up: axis of the file that points up, "x", "y" or "z"; None: z, with an error where it looks otherwise.
-        bbox: (x_min, y_min, x_max, y_max) [m] in the file's frame, after `scale` and `up`: only shapes that
-            reach into it are kept, and it becomes the extent.
-        devices: how many to place on free ground.
-        uavs: how many to place near the middle.
-        seed: of the placement.
+        frequency_hz: Frequency of the scene's radio [Hz].
+        materials: Name of a material in the file -> ITU material to use for it.
+        scale: Factor from the file's unit to metres; None: metres, with a warning if it seems to
+            be another.
+        up: Axis of the file that points up, "x", "y" or "z"; None: z, with an error if it seems to
+            be another.
+        bbox: (x_min, y_min, x_max, y_max) [m] in the file's frame, after `scale` and `up`: only
+            shapes that reach into it are kept, and it becomes the extent.
+        devices: Number of devices to place on free ground.
+        uavs: Number of UAVs to place near the middle.
+        seed: Seed of the placement.
     """
 
     frequency_hz: float = 2.4e9
@@ -65,76 +72,73 @@ class BuildOptions:
     seed: int = 0
 
     def check(self) -> None:
-        """Raise BadInput for a value that cannot be."""
+        """Raise BadInput for an impossible value."""
         if self.scale is not None and not 0 < self.scale < float("inf"):
-            raise BadInput(f"scale {self.scale:g} is not possible; give a positive factor (feet: 0.3048)")
+            raise BadInput(f"scale {self.scale:g} is not possible; give a positive factor (feet: "
+                           "0.3048)")
         if self.up not in (None, "x", "y", "z"):
             raise BadInput(f"up axis {self.up!r} is not possible; give x, y or z")
         if self.devices < 0 or self.uavs < 0:
-            raise BadInput(f"{min(self.devices, self.uavs)} devices or UAVs are not possible; give 0 or more")
+            raise BadInput(f"{min(self.devices, self.uavs)} devices or UAVs are not possible; give "
+                           "0 or more")
         if self.bbox is not None:
             x_min, y_min, x_max, y_max = self.bbox
             if not (np.isfinite(self.bbox).all() and x_min < x_max and y_min < y_max):
-                raise BadInput(
-                    f"bbox {self.bbox} is not possible; give x_min,y_min,x_max,y_max in metres, the "
-                    "minimum below the maximum"
-                )
+                raise BadInput(f"bbox {self.bbox} is not possible; give x_min,y_min,x_max,y_max in "
+                               "metres, the minimum below the maximum")
 
 
-def build_scene(
-    source: Path | str,
-    out_folder: Path | str,
-    options: BuildOptions = BuildOptions(),
-    check_only: bool = False,
-) -> BuildReport:
-    """Read a city, check it, put right what can be, and write a scene folder.
+def build_scene(source: Path | str, out_folder: Path | str, options: BuildOptions = BuildOptions(),
+                check_only: bool = False) -> BuildReport:
+    """Read a city, check it, correct what can be corrected, and write a scene folder.
 
     Args:
-        source: path of a Mitsuba or Sionna RT XML file, or `sionna:NAME`.
-        out_folder: scene folder to write; a scene that is already in it is replaced.
-        options: see there.
-        check_only: write nothing, and return errors in the report instead of raising them.
+        source: Path of a Mitsuba or Sionna RT XML file, or `sionna:NAME`.
+        out_folder: Scene folder to write; a scene that is already in it is replaced.
+        options: How to read the city, and what to add to it.
+        check_only: Write nothing, and return errors in the report instead of raising them.
 
     Returns:
         The report; its `tracing_would_fail` says whether an error was found.
 
     Raises:
-        BadInput: the source cannot be read; an option is impossible; or tracing would fail (unless
+        BadInput: The source cannot be read; an option is impossible; or tracing would fail (unless
             `check_only`).
     """
     out_folder = Path(out_folder)
     options.check()
     path = find_source(source)
     if not check_only:
-        check_target(out_folder)
-        if path.resolve().is_relative_to(out_folder.resolve()):
-            raise BadInput(f"{source} lies in {out_folder}, which the new scene would replace; choose another output "
-                           "folder")
+        check_target(out_folder, source=path)
     city = import_city(path, options.materials or {}, options.scale, options.up, options.bbox)
     errors = [problem.message for problem in city.problems if problem.severity == "error"]
     if errors and not check_only:
         raise BadInput("\n".join([f"{source}: tracing would fail:", *errors]))
     if errors:
-        return _report_on_errors(str(source), city, options.frequency_hz)
+        triangles = 0 if city.surfaces is None else len(city.surfaces.faces)
+        return BuildReport(str(source), None, options.frequency_hz, len(city.names), triangles,
+                           problems=_by_severity(city.problems))
     extent = None
     if options.bbox is not None:
-        x_min, y_min, x_max, y_max = (float(v) for v in np.array(options.bbox) + np.tile(city.moved_m[:2], 2))
+        corners = np.array(options.bbox) + np.tile(city.moved_m[:2], 2)
+        x_min, y_min, x_max, y_max = corners.tolist()
         extent = Extent(x_min_m=x_min, x_max_m=x_max, y_min_m=y_min, y_max_m=y_max)
-    known = _provenance(city, str(source), options)
-    declared = Declared(str(source), scene_name(source), extent, None, known)
+    declared = Declared(str(source), scene_name(source), extent, None,
+                        _provenance(city, str(source), options))
     return finish_scene(city, declared, out_folder, options, check_only)
 
 
 @dataclass(frozen=True)
 class Declared:
-    """What a scene says besides its geometry.
+    """Declarations of a scene besides its geometry.
 
     Attributes:
-        source, name: where the city comes from, and what it is called.
-        extent: of the lattice; None: chosen around the buildings.
+        source: Origin of the city.
+        name: Name of the scene.
+        extent: Extent of the lattice; None: chosen around the buildings.
         origin: WGS84 position of the frame's origin, where it is known.
-        provenance: for `scene.toml`.
-        facts: more lines for the report.
+        provenance: Entries for `scene.toml`.
+        facts: More lines for the report.
     """
 
     source: str
@@ -145,23 +149,20 @@ class Declared:
     facts: tuple[tuple[str, str], ...] = ()
 
 
-def finish_scene(
-    city: ImportedCity,
-    declared: Declared,
-    out_folder: Path,
-    options: BuildOptions,
-    check_only: bool,
-    buildings: pd.DataFrame | None = None,
-) -> BuildReport:
+def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, options: BuildOptions,
+                 check_only: bool, buildings: pd.DataFrame | None = None) -> BuildReport:
     """Write the scene folder of a city without errors, and report on it.
 
     Args:
-        city: in the scene's frame; its problems grow.
-        declared: see there.
-        out_folder: scene folder to write; a scene that is already in it is replaced.
-        options: frequency, devices, UAVs and seed.
-        check_only: write nothing.
-        buildings: a table of them, for `buildings.csv`.
+        city: City in the scene's frame; its list of problems grows.
+        declared: Declarations besides the geometry.
+        out_folder: Scene folder to write; a scene that is already in it is replaced.
+        options: Frequency, devices, UAVs and seed.
+        check_only: Write nothing.
+        buildings: Table for `buildings.csv`.
+
+    Raises:
+        BadInput: No room for devices or UAVs, an impossible value, or the folder cannot be written.
     """
     shapes, material_problems = _city_shapes(city, options.frequency_hz)
     city.problems.extend(material_problems)
@@ -176,47 +177,31 @@ def finish_scene(
     return _report(city, shapes, plan, declared, None if check_only else out_folder)
 
 
-def check_target(folder: Path) -> None:
-    """Raise BadInput when the folder holds anything but a scene, so that nothing else is overwritten."""
-    if not folder.is_dir():
-        return
-    foreign = sorted({path.name for path in folder.iterdir()} - SCENE_FILES)
+def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | None = None) -> None:
+    """Raise BadInput if writing the folder would erase something else.
+
+    Args:
+        folder: Folder to write.
+        allowed: Names that it may hold.
+        source: File that must not lie in it.
+    """
+    foreign = sorted({path.name for path in folder.iterdir()} - allowed) if folder.is_dir() else []
     if foreign:
-        raise BadInput(
-            f"{folder} holds {', '.join(foreign[:5])}, which a new scene would erase; move it away or choose "
-            "another output folder"
-        )
+        raise BadInput(f"{folder} holds {', '.join(foreign[:5])}, which the new content would "
+                       "erase; move it away or choose another output folder")
+    if source is not None and source.resolve().is_relative_to(folder.resolve()):
+        raise BadInput(f"{source} lies in {folder}, which the new scene would replace; choose "
+                       "another output folder")
 
 
-def _report_on_errors(source: str, city: ImportedCity, frequency_hz: float) -> BuildReport:
-    """Report without extent, heights and materials, which mean nothing before the errors are put right."""
-    triangles = 0 if city.surfaces is None else len(city.surfaces.faces)
-    return BuildReport(
-        source,
-        None,
-        frequency_hz,
-        len(city.names),
-        triangles,
-        (0.0, 0.0, 0.0, 0.0),
-        0.0,
-        "",
-        0.0,
-        (),
-        0,
-        0,
-        (),
-        _by_severity(city.problems),
-    )
-
-
-def _city_shapes(city: ImportedCity, frequency_hz: float) -> tuple[list[CityShape], list[Problem]]:
+def _city_shapes(city: ImportedCity, frequency_hz: float
+                 ) -> tuple[list[CityShape], list[Problem]]:
     assert city.surfaces is not None  # without an error among the problems
     materials = [material for material in city.materials if material is not None]
     written, problems = settle(materials, frequency_hz, {name.lower() for name in city.names})
-    shapes = [
-        CityShape(name, trimesh.Trimesh(vertices, faces, process=False), written[material])
-        for name, material, (vertices, faces) in zip(city.names, materials, city.surfaces.meshes())
-    ]
+    shapes = [CityShape(name, trimesh.Trimesh(vertices, faces, process=False), written[material])
+              for name, material, (vertices, faces)
+              in zip(city.names, materials, city.surfaces.meshes())]
     return shapes, problems
 
 
@@ -236,29 +221,27 @@ def _plan(city: ImportedCity, declared: Declared, options: BuildOptions) -> _Pla
         extent = choose_extent(bounds)
     else:
         bounds, extent = declared.extent.bounds, declared.extent
-    buildings = CityMap(surfaces.vertices, surfaces.faces[solid]) if solid.any() else None
-    ground = CityMap(surfaces.vertices, surfaces.faces[city.ground]) if city.ground.any() else None
+    buildings, ground = (CityMap(surfaces.vertices, surfaces.faces[faces]) if faces.any() else None
+                         for faces in (solid, city.ground))
     tops_m, heights_m = building_tops(surfaces, solid, ground)
     highest = int(heights_m.argmax())
-    lattice = LatticeConfig(step_m=choose_step(bounds), altitudes_m=choose_altitudes(tops_m[heights_m > 0]))
+    lattice = LatticeConfig(step_m=choose_step(bounds),
+                            altitudes_m=choose_altitudes(tops_m[heights_m > 0]))
     grid = BuiltGrid.over(extent, buildings)
     config = {
         "name": declared.name,
         "radio": {"frequency_hz": options.frequency_hz},
         "extent": extent,
         "lattice": lattice,
-        "devices": place_devices(options.devices, grid, ground, np.random.default_rng(options.seed)),
+        "devices": place_devices(options.devices, grid, ground,
+                                 np.random.default_rng(options.seed)),
         "uavs": place_uavs(options.uavs, extent, lattice, buildings),
         "provenance": declared.provenance,
     }
     if declared.origin is not None:
         config |= {"origin": declared.origin, "crs": local_crs(declared.origin)}
-    return _Plan(
-        parse_config(config, Path("scene.toml")),
-        grid.fraction,
-        float(heights_m[highest]),
-        city.names[highest] if solid.any() else "",
-    )
+    return _Plan(parse_config(config, Path("scene.toml")), grid.fraction,
+                 float(heights_m[highest]), city.names[highest] if solid.any() else "")
 
 
 def _provenance(city: ImportedCity, source: str, options: BuildOptions) -> dict[str, str]:
@@ -272,40 +255,23 @@ def _provenance(city: ImportedCity, source: str, options: BuildOptions) -> dict[
     return known
 
 
-def _kind(name: str, itu: str | None) -> str:
-    if itu is None:
-        return "own constants"
-    return "ITU" if itu == name else f"ITU {itu}"
-
-
-def _report(
-    city: ImportedCity, shapes: list[CityShape], plan: _Plan, declared: Declared, folder: Path | None
-) -> BuildReport:
-    frequency_hz = plan.config.radio.frequency_hz
-    uses = []
+def _report(city: ImportedCity, shapes: list[CityShape], plan: _Plan, declared: Declared,
+            folder: Path | None) -> BuildReport:
+    config, uses = plan.config, []
     as_declared = dict(zip((shape.material for shape in shapes), city.materials))
     for material, count in Counter(shape.material for shape in shapes).most_common():
         before = as_declared[material]
         assert before is not None
-        kind = _kind(material.name, before.itu)
-        uses.append(MaterialUse(material.name, kind, count, *constants(before, frequency_hz)))
+        kind = ("own constants" if before.itu is None else
+                "ITU" if before.itu == material.name else f"ITU {before.itu}")
+        uses.append(MaterialUse(material.name, kind, count,
+                                *constants(before, config.radio.frequency_hz)))
     return BuildReport(
-        declared.source,
-        folder,
-        frequency_hz,
-        len(shapes),
-        sum(len(shape.mesh.faces) for shape in shapes),
-        plan.config.extent.bounds,
-        plan.tallest_m,
-        plan.tallest,
-        plan.built_fraction,
-        tuple(plan.config.lattice.altitudes_m),
-        len(plan.config.devices),
-        len(plan.config.uavs),
-        tuple(uses),
-        _by_severity(city.problems),
-        declared.facts,
-    )
+        declared.source, folder, config.radio.frequency_hz, len(shapes),
+        sum(len(shape.mesh.faces) for shape in shapes), config.extent.bounds,
+        plan.tallest_m, plan.tallest, plan.built_fraction, tuple(config.lattice.altitudes_m),
+        len(config.devices), len(config.uavs), tuple(uses), _by_severity(city.problems),
+        declared.facts)
 
 
 def _by_severity(problems: list[Problem]) -> tuple[Problem, ...]:

@@ -1,19 +1,26 @@
-"""`scene.toml`: what a scene declares besides its geometry, checked when it is read."""
+"""`scene.toml`: the declarations of a scene besides its geometry, checked when it is read."""
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tomli_w
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 from radiotwin.geodesy import local_crs
 from radiotwin.tables import Number, Origin, Table
 
-SCHEMA = "radiotwin.scene/1"
-MOST_POSITIONS = 10_000_000
+ANTENNA_HEIGHT_M = 1.5  # of a device above the ground [m]: a person, a meter, a low pole
+_MAX_POSITIONS = 10_000_000  # of a lattice: 80 MB of gains per device
 Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.+-]+$")]
 
 
@@ -29,16 +36,17 @@ class RadioConfig(Table):
 
     @field_validator("frequency_hz")
     @classmethod
-    def _in_the_models_range(cls, frequency_hz):
+    def _in_the_models_range(cls, frequency_hz: float) -> float:
         if not 1e6 <= frequency_hz <= 450e9:
             raise ValueError("allowed is 1e6 Hz to 450e9 Hz (1 MHz to 450 GHz); the unit is Hz")
         return frequency_hz
 
     @model_validator(mode="after")
-    def _something_is_detected(self):
+    def _something_is_detected(self) -> "RadioConfig":
         if self.sensitivity_dbm >= self.tx_power_dbm:
-            raise ValueError(f"sensitivity_dbm = {self.sensitivity_dbm:g} must lie below tx_power_dbm = "
-                             f"{self.tx_power_dbm:g}, or nothing is ever detected")
+            raise ValueError(
+                f"sensitivity_dbm = {self.sensitivity_dbm:g} must lie below tx_power_dbm = "
+                f"{self.tx_power_dbm:g}, or nothing is ever detected")
         return self
 
 
@@ -51,52 +59,55 @@ class Extent(Table):
     y_max_m: Number
 
     @model_validator(mode="after")
-    def _not_empty(self):
+    def _not_empty(self) -> "Extent":
         if self.x_max_m <= self.x_min_m or self.y_max_m <= self.y_min_m:
             raise ValueError("x_max_m and y_max_m must be greater than x_min_m and y_min_m")
         return self
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
-        """(x_min, x_max, y_min, y_max) [m]"""
+        """(x_min, x_max, y_min, y_max) [m]."""
         return self.x_min_m, self.x_max_m, self.y_min_m, self.y_max_m
 
 
 class LatticeConfig(Table):
+    """Step and altitudes of the lattice over the extent."""
+
     step_m: Number = Field(20.0, gt=0)
     altitudes_m: list[Annotated[Number, Field(gt=0)]] = Field(min_length=1)
 
     @field_validator("altitudes_m")
     @classmethod
-    def _unique(cls, altitudes_m):
+    def _unique(cls, altitudes_m: list[float]) -> list[float]:
         for altitude_m in altitudes_m:
             if altitudes_m.count(altitude_m) > 1:
-                raise ValueError(f"{altitude_m:g} stands there twice; every altitude must be unique")
+                raise ValueError(f"{altitude_m:g} is listed twice; every altitude must be unique")
         return altitudes_m
 
 
 class DeviceConfig(Table):
-    """The true position of a device; `role` says whether a survey may tell it."""
+    """True position of a device; a survey reports that of anchors only."""
 
     device: Name
     x_m: Number
     y_m: Number
-    z_m: Number = Field(1.5, gt=0)
+    z_m: Number = Field(ANTENNA_HEIGHT_M, gt=0)
     role: Literal["anchor", "unknown"] = "unknown"
     antenna: str | None = Field(None, description="file in the scene folder; None: isotropic")
-    azimuth_deg: Number | None = Field(None, ge=-360, le=360, description="clockwise from north [0]")
-    tilt_deg: Number | None = Field(None, ge=-90, le=90, description="above zero the antenna looks up [0]")
+    azimuth_deg: Number | None = Field(None, ge=-360, le=360,
+                                       description="clockwise from north [0]")
+    tilt_deg: Number | None = Field(None, ge=-90, le=90, description="upwards is positive [0]")
 
     @model_validator(mode="after")
-    def _isotropic_looks_nowhere(self):
+    def _isotropic_has_no_direction(self) -> "DeviceConfig":
         if self.antenna is None and (self.azimuth_deg is not None or self.tilt_deg is not None):
-            raise ValueError("azimuth_deg and tilt_deg belong to an antenna; name its file: antenna = "
-                             '"antennas/NAME.msi"')
+            raise ValueError("azimuth_deg and tilt_deg belong to an antenna; name its file: "
+                             'antenna = "antennas/NAME.msi"')
         return self
 
 
 class UavConfig(Table):
-    """A UAV flies at one altitude, from its start to its terminal, on `battery` units (move 1, hover 0.5)."""
+    """A UAV: one altitude, from start to terminal, on `battery` units (move 1, hover 0.5)."""
 
     uav: Name
     altitude_m: Number = Field(gt=0)
@@ -109,6 +120,8 @@ class UavConfig(Table):
 
 
 class MissionConfig(Table):
+    """The data-harvesting mission of Chen et al. 2023."""
+
     data_units: Number = Field(16_000.0, gt=0, description="data waiting at each device")
     rate_scale: Number = Field(100.0, gt=0, description="data units per slot and bit/s/Hz")
     slot_s: Number = Field(2.0, gt=0, description="duration of one move or hover")
@@ -123,32 +136,33 @@ class SceneConfig(Table):
     extent: Extent
     lattice: LatticeConfig
     origin: Origin | None = None
-    crs: str | None = Field(None, description="of the local frame in the words of PROJ, for other programs")
+    crs: str | None = Field(None, description="PROJ string of the local frame, for other programs")
     devices: list[DeviceConfig] = []
     uavs: list[UavConfig] = []
     mission: MissionConfig = MissionConfig()
     provenance: dict[str, str] = {}
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, populate_by_name=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False,
+                              populate_by_name=True)
 
     @model_validator(mode="after")
-    def _consistent(self):
-        for kind, names in (("device", [d.device for d in self.devices]), ("uav", [u.uav for u in self.uavs])):
+    def _consistent(self) -> "SceneConfig":
+        for kind, names in (("device", [device.device for device in self.devices]),
+                            ("uav", [uav.uav for uav in self.uavs])):
             double = {name for name in names if names.count(name) > 1}
             if double:
-                raise ValueError(f"{kind} {sorted(double)[0]!r} is declared twice; every name must be unique")
+                raise ValueError(f"{kind} {sorted(double)[0]!r} is declared twice; every name must "
+                                 "be unique")
         if self.crs is not None and (self.origin is None or self.crs != local_crs(self.origin)):
-            raise ValueError("crs is not that of the local frame about [origin]; remove it, or write "
-                             + (f"crs = \"{local_crs(self.origin)}\"" if self.origin else "an [origin]"))
+            remedy = f'crs = "{local_crs(self.origin)}"' if self.origin else "an [origin]"
+            raise ValueError("crs is not that of the local frame about [origin]; remove it, or "
+                             f"write {remedy}")
         self._check_size()
         if len({uav.antenna for uav in self.uavs}) > 1:
-            raise ValueError("uavs have different antennas; one radio map serves all of them, so give all the same")
+            raise ValueError("uavs have different antennas; one radio map serves all of them, so "
+                             "give all the same")
         for device in self.devices:
-            x_min_m, x_max_m, y_min_m, y_max_m = self.extent.bounds
-            if not (x_min_m <= device.x_m <= x_max_m and y_min_m <= device.y_m <= y_max_m):
-                raise ValueError(f"device {device.device!r} at ({device.x_m:g}, {device.y_m:g}) m lies outside the "
-                                 f"extent (x {x_min_m:g} to {x_max_m:g} m, y {y_min_m:g} to {y_max_m:g} m); move it "
-                                 "or widen the extent")
+            self._check_in_extent(device)
         for uav in self.uavs:
             if uav.altitude_m not in self.lattice.altitudes_m:
                 raise ValueError(f"uav {uav.uav!r}: altitude_m = {uav.altitude_m:g} is not one of "
@@ -159,21 +173,32 @@ class SceneConfig(Table):
 
     def _check_size(self) -> None:
         x_min_m, x_max_m, y_min_m, y_max_m = self.extent.bounds
-        width_m, depth_m, altitudes = x_max_m - x_min_m, y_max_m - y_min_m, len(self.lattice.altitudes_m)
-        positions = (width_m / self.lattice.step_m + 1) * (depth_m / self.lattice.step_m + 1) * altitudes
-        if positions > MOST_POSITIONS:
-            raise ValueError(f"lattice.step_m = {self.lattice.step_m:g} over an extent of {width_m:g} x {depth_m:g} m "
-                             f"and {altitudes} altitudes makes {positions:.3g} positions; allowed are "
-                             f"{MOST_POSITIONS:,}: widen the step or narrow the extent")
+        step_m, altitudes = self.lattice.step_m, len(self.lattice.altitudes_m)
+        width_m, depth_m = x_max_m - x_min_m, y_max_m - y_min_m
+        positions = (width_m / step_m + 1) * (depth_m / step_m + 1) * altitudes
+        if positions > _MAX_POSITIONS:
+            raise ValueError(
+                f"lattice.step_m = {step_m:g} over an extent of {width_m:g} x {depth_m:g} m and "
+                f"{altitudes} altitudes makes {positions:.3g} positions; allowed are "
+                f"{_MAX_POSITIONS:,}: widen the step or narrow the extent")
+
+    def _check_in_extent(self, device: DeviceConfig) -> None:
+        x_min_m, x_max_m, y_min_m, y_max_m = self.extent.bounds
+        if not (x_min_m <= device.x_m <= x_max_m and y_min_m <= device.y_m <= y_max_m):
+            raise ValueError(
+                f"device {device.device!r} at ({device.x_m:g}, {device.y_m:g}) m lies outside the "
+                f"extent (x {x_min_m:g} to {x_max_m:g} m, y {y_min_m:g} to {y_max_m:g} m); move it "
+                "or widen the extent")
 
     def _check_on_lattice(self, uav: UavConfig, end: str) -> None:
+        step_m = self.lattice.step_m
         for axis, low, high in (("x", self.extent.x_min_m, self.extent.x_max_m),
                                 ("y", self.extent.y_min_m, self.extent.y_max_m)):
             value = getattr(uav, f"{end}_{axis}_m")
-            steps = (value - low) / self.lattice.step_m
-            if not low <= value <= high or abs(steps - round(steps)) * self.lattice.step_m > 0.01:
-                raise ValueError(f"uav {uav.uav!r}: {end}_{axis}_m = {value:g} is not on the lattice "
-                                 f"({low:g} to {high:g} m in steps of {self.lattice.step_m:g} m)")
+            steps = (value - low) / step_m
+            if not low <= value <= high or abs(steps - round(steps)) * step_m > 0.01:
+                raise ValueError(f"uav {uav.uav!r}: {end}_{axis}_m = {value:g} is not on the "
+                                 f"lattice ({low:g} to {high:g} m in steps of {step_m:g} m)")
 
     @property
     def gain_limit_db(self) -> float:
@@ -187,8 +212,7 @@ def _explain(path: Path, error: ValidationError) -> str:
         key = ".".join(str(part) for part in problem["loc"]) or "scene"
         reason = problem["msg"].removeprefix("Value error, ")
         if problem["type"] == "extra_forbidden":
-            reason = "unknown key; remove it or correct its name"
-            lines.append(f"{path}: {key}: {reason}")
+            lines.append(f"{path}: {key}: unknown key; remove it or correct its name")
         elif problem["type"] == "missing":
             lines.append(f"{path}: {key}: missing; add it")
         elif isinstance(problem["input"], dict | BaseModel):
@@ -198,15 +222,15 @@ def _explain(path: Path, error: ValidationError) -> str:
     return "\n".join(lines)
 
 
-def parse_config(data: dict, path: Path | str) -> SceneConfig:
+def parse_config(data: dict[str, Any], path: Path | str) -> SceneConfig:
     """Check the content of a scene file.
 
     Args:
-        data: nested tables as TOML gives them.
-        path: named in messages only.
+        data: Nested tables as TOML gives them.
+        path: File named in messages.
 
     Raises:
-        BadInput: names file, key, value and what is allowed.
+        BadInput: An unknown key or an impossible value; names file, key, value and what is allowed.
     """
     try:
         return SceneConfig.model_validate(data)
@@ -217,14 +241,18 @@ def parse_config(data: dict, path: Path | str) -> SceneConfig:
 def read_config(path: Path | str) -> SceneConfig:
     """Read and check `scene.toml`.
 
+    Args:
+        path: The file.
+
     Raises:
-        BadInput: no such file, not TOML, an unknown key or an impossible value.
+        BadInput: No such file, not TOML, an unknown key or an impossible value.
     """
     path = Path(path)
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
-        raise BadInput(f"{path} does not exist; `radiotwin build-scene` makes a scene folder") from None
+        raise BadInput(f"{path} does not exist; `radiotwin build-scene` makes a scene "
+                       "folder") from None
     except (OSError, UnicodeDecodeError) as error:
         raise BadInput(f"{path} cannot be read: {error}") from None
     except tomllib.TOMLDecodeError as error:
@@ -233,14 +261,19 @@ def read_config(path: Path | str) -> SceneConfig:
 
 
 def write_config(config: SceneConfig, path: Path | str) -> None:
-    """Write `scene.toml`; every number that a later step uses is in it, defaults included.
+    """Write `scene.toml` with every number that a later step uses, defaults included.
 
-    Devices and UAVs are tables of their own, which tomli_w would fold into one array: so another `[[devices]]` table
-    can be appended by hand.
+    Devices and UAVs become `[[devices]]` and `[[uavs]]` tables, which tomli_w would fold into one
+    array: so another table can be appended by hand.
+
+    Args:
+        config: Content of the file.
+        path: File to write.
     """
     data = config.model_dump(by_alias=True, exclude_none=True)
     lists = {name: data.pop(name) for name in ("uavs", "devices")}
     parts = [tomli_w.dumps(data)]
-    parts += [f"[[{name}]]\n{tomli_w.dumps(table)}" for name, tables in lists.items() for table in tables]
+    parts += [f"[[{name}]]\n{tomli_w.dumps(table)}" for name, tables in lists.items()
+              for table in tables]
     with atomic_path(path) as temporary:
         temporary.write_text("\n".join(parts), encoding="utf-8")

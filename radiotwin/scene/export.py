@@ -9,61 +9,46 @@ import trimesh
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, atomic_path
 from radiotwin.scene import Scene
-from radiotwin.scene.material_mapping import map_materials
+from radiotwin.scene.build import check_target
 from radiotwin.scene.materials import Material
-from radiotwin.scene.meshes import load_shape
-from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
+from radiotwin.scene.reader import read_city
 from radiotwin.scene.writer import CityShape, write_city
 
-FOLDER_FILES = {"city.xml", "meshes", "devices.csv"}
-MODEL_SUFFIXES = (".glb", ".gltf", ".obj")
-Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=float)  # glTF 2.0, section 3.4
-COLOURS = {"concrete": (178, 178, 178), "brick": (170, 90, 70), "wood": (160, 120, 75), "glass": (150, 195, 215),
-           "metal": (120, 125, 135), "marble": (215, 205, 190), "asphalt_concrete": (95, 95, 95),
-           "wet_ground": (100, 85, 60), "medium_dry_ground": (140, 120, 85), "very_dry_ground": (190, 170, 120)}
-OTHER_COLOUR = (165, 165, 165)
-
-
-def scene_shapes(scene: Scene) -> list[CityShape]:
-    """The shapes of a scene's city, with their materials, in the order of `city.xml`.
-
-    Raises:
-        BadInput: a mesh or material that cannot be read.
-    """
-    declared = read_mitsuba_xml(scene.xml_path)
-    materials, problems = map_materials(declared.shapes, declared.materials, {})
-    if any(problem.severity == "error" for problem in problems):
-        raise BadInput("\n".join(problem.message for problem in problems if problem.severity == "error"))
-    shapes = []
-    for shape, material in zip(declared.shapes, materials):
-        assert material is not None  # without an error among the problems
-        raw = load_shape(shape)
-        mesh = trimesh.Trimesh(raw.vertices, raw.faces, process=False)
-        shapes.append(CityShape(shape.name.removeprefix("mesh-"), mesh, material))
-    return shapes
+_MODEL_SUFFIXES = (".glb", ".gltf", ".obj")
+# Axes of glTF 2.0 (section 3.4): y up
+Y_UP = np.array([[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]], dtype=float)
+# RGB of ITU materials, as they look
+_COLOURS = {"concrete": (178, 178, 178), "brick": (170, 90, 70), "wood": (160, 120, 75),
+            "glass": (150, 195, 215), "metal": (120, 125, 135), "marble": (215, 205, 190),
+            "asphalt_concrete": (95, 95, 95), "wet_ground": (100, 85, 60),
+            "medium_dry_ground": (140, 120, 85), "very_dry_ground": (190, 170, 120)}
 
 
 def export_scene(scene: Scene, out: Path | str) -> None:
-    """Write a scene's city in the form that the name of the output says.
+    """Write a scene's city in the form that the name of the output implies.
 
-    A folder: `city.xml` and `meshes/*.ply`, which `sionna.rt.load_scene` loads, and `devices.csv`. `NAME.glb` or
-    `NAME.gltf`: glTF 2.0, y up, with everything in one file. `NAME.obj`: with z up, and its materials in `NAME.mtl`.
+    A folder: `city.xml` and `meshes/*.ply`, which `sionna.rt.load_scene` loads, and `devices.csv`.
+    `NAME.glb` or `NAME.gltf`: glTF 2.0, y up, with everything in one file. `NAME.obj`: z up, with
+    its materials in `NAME.mtl`.
+
+    Args:
+        scene: The scene.
+        out: Folder or file to write.
 
     Raises:
-        BadInput: an unknown suffix, a folder that holds something else, or an output that cannot be written.
+        BadInput: An unknown suffix, a folder that holds something else, or an output that cannot be
+            written.
     """
     out = Path(out)
-    if out.suffix.lower() in MODEL_SUFFIXES:
-        shapes = scene_shapes(scene)
-        (_write_obj if out.suffix.lower() == ".obj" else _write_gltf)(shapes, out)
+    if out.suffix.lower() in _MODEL_SUFFIXES:
+        write = _write_obj if out.suffix.lower() == ".obj" else _write_gltf
+        write(read_city(scene.xml_path), out)
         return
     if out.suffix:
         raise BadInput(f"{out}: unknown format {out.suffix!r}; allowed are a folder (XML and PLY), "
-                       f"{', '.join('NAME' + suffix for suffix in MODEL_SUFFIXES)}")
-    foreign = sorted({path.name for path in out.iterdir()} - FOLDER_FILES) if out.is_dir() else []
-    if foreign:
-        raise BadInput(f"{out} holds {', '.join(foreign[:5])}, which the export would erase; choose another folder")
-    shapes = scene_shapes(scene)
+                       f"{', '.join('NAME' + suffix for suffix in _MODEL_SUFFIXES)}")
+    check_target(out, {"city.xml", "meshes", "devices.csv"})
+    shapes = read_city(scene.xml_path)
     with atomic_folder(out) as folder:
         write_city(folder, shapes)
         devices = pd.DataFrame([device.model_dump() for device in scene.config.devices],
@@ -71,17 +56,18 @@ def export_scene(scene: Scene, out: Path | str) -> None:
         devices.to_csv(folder / "devices.csv", index=False)
 
 
+def _colour(material: Material) -> tuple[int, int, int]:
+    itu = material.itu or material.name.removesuffix("-fixed").removeprefix("own-")
+    return _COLOURS.get(itu, (165, 165, 165))
+
+
 def _coloured(shape: CityShape) -> trimesh.Trimesh:
     mesh = shape.mesh.copy()
-    colour = [*COLOURS.get(_itu(shape.material), OTHER_COLOUR), 255]
     material = trimesh.visual.material.PBRMaterial(
-        name=shape.material.name, baseColorFactor=colour, metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True)
+        name=shape.material.name, baseColorFactor=[*_colour(shape.material), 255],
+        metallicFactor=0.0, roughnessFactor=0.9, doubleSided=True)
     mesh.visual = trimesh.visual.TextureVisuals(material=material)
     return mesh
-
-
-def _itu(material: Material) -> str:
-    return material.itu or material.name.removesuffix("-fixed").removeprefix("own-")
 
 
 def _write_gltf(shapes: list[CityShape], path: Path) -> None:
@@ -93,22 +79,24 @@ def _write_gltf(shapes: list[CityShape], path: Path) -> None:
     if path.suffix.lower() == ".glb":
         data = trimesh.exchange.gltf.export_glb(model, include_normals=False)
     else:
-        data = trimesh.exchange.gltf.export_gltf(model, include_normals=False, embed_buffers=True)["model.gltf"]
+        data = trimesh.exchange.gltf.export_gltf(model, include_normals=False,
+                                                 embed_buffers=True)["model.gltf"]
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
 
 
 def _write_obj(shapes: list[CityShape], path: Path) -> None:
-    """One object a shape. Single precision needs nine digits."""
+    """Write one object per shape; single precision needs nine digits."""
     lines, first = [f"mtllib {path.stem}.mtl"], 1
     for shape in shapes:
         lines += [f"o {shape.name}", f"usemtl {shape.material.name}"]
         lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in shape.mesh.vertices]
         lines += [f"f {a} {b} {c}" for a, b, c in shape.mesh.faces + first]
         first += len(shape.mesh.vertices)
-    colours = {shape.material.name: COLOURS.get(_itu(shape.material), OTHER_COLOUR) for shape in shapes}
+    colours = {shape.material.name: _colour(shape.material) for shape in shapes}
     library = [line for name, rgb in colours.items()
-               for line in (f"newmtl {name}", "Kd " + " ".join(f"{value / 255:.3f}" for value in rgb), "")]
+               for line in (f"newmtl {name}",
+                            "Kd " + " ".join(f"{value / 255:.3f}" for value in rgb), "")]
     with atomic_path(path.with_suffix(".mtl")) as temporary:
         temporary.write_text("\n".join(library) + "\n", encoding="utf-8")
     with atomic_path(path) as temporary:

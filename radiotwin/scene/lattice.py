@@ -1,5 +1,6 @@
 """The lattice of positions that UAVs fly on and radio maps are made on."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,9 +14,9 @@ class Lattice:
     """Regular positions in the scene's frame.
 
     Attributes:
-        x_m: (nx,) east coordinates, ascending.
-        y_m: (ny,) north coordinates, ascending.
-        z_m: (nz,) altitudes above the ground datum, ascending.
+        x_m: (nx,) east coordinates, ascending [m].
+        y_m: (ny,) north coordinates, ascending [m].
+        z_m: (nz,) altitudes above the ground datum, ascending [m].
     """
 
     x_m: np.ndarray
@@ -24,16 +25,25 @@ class Lattice:
 
     @classmethod
     def over(cls, x_min_m: float, x_max_m: float, y_min_m: float, y_max_m: float, step_m: float,
-             altitudes_m) -> "Lattice":
-        """Lattice from the south-west corner in steps of `step_m`, both borders included where they fit."""
-        nx, ny = (int(np.floor((high - low) / step_m + 1e-9)) + 1 for low, high in
-                  ((x_min_m, x_max_m), (y_min_m, y_max_m)))
+             altitudes_m: Sequence[float]) -> "Lattice":
+        """Make a lattice from the south-west corner on.
+
+        Args:
+            x_min_m: West border [m].
+            x_max_m: East border, included where the step fits [m].
+            y_min_m: South border [m].
+            y_max_m: North border, included where the step fits [m].
+            step_m: Horizontal distance of neighbours [m].
+            altitudes_m: Altitudes in any order [m].
+        """
+        nx, ny = (int(np.floor((high - low) / step_m + 1e-9)) + 1
+                  for low, high in ((x_min_m, x_max_m), (y_min_m, y_max_m)))
         return cls(x_min_m + step_m * np.arange(nx), y_min_m + step_m * np.arange(ny),
                    np.array(sorted(altitudes_m), dtype=float))
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """(nz, ny, nx)"""
+        """Number of positions along z, y and x."""
         return len(self.z_m), len(self.y_m), len(self.x_m)
 
     @property
@@ -44,18 +54,21 @@ class Lattice:
 
     @cached_property
     def positions_m(self) -> np.ndarray:
-        """(nz * ny * nx, 3) positions, in the order of a (z, y, x) array."""
+        """(nz * ny * nx, 3) positions, in the order of a (z, y, x) array [m]."""
         z, y, x = np.meshgrid(self.z_m, self.y_m, self.x_m, indexing="ij")
         return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
 
     def index_of(self, positions_m: np.ndarray) -> np.ndarray:
-        """Flat (z, y, x) index of each position.
+        """Return the flat (z, y, x) index of each position.
 
         Args:
-            positions_m: (n, 3) positions that lie on the lattice to within 1 cm.
+            positions_m: (n, 3) positions that lie on the lattice to within 1 cm [m].
+
+        Returns:
+            (n,) indices into `positions_m` of the lattice.
 
         Raises:
-            BadInput: a position is not on the lattice.
+            BadInput: A position is not on the lattice.
         """
         index = []
         for axis, values in zip((2, 1, 0), (self.z_m, self.y_m, self.x_m)):
@@ -63,7 +76,8 @@ class Lattice:
             off = np.abs(values[nearest] - positions_m[:, axis]) > 0.01
             if off.any():
                 position = positions_m[np.flatnonzero(off)[0]]
-                raise BadInput(f"position {tuple(position)} m is not on the lattice "
-                               f"(axis {'xyz'[axis]}: {values[0]:g} to {values[-1]:g} m, {len(values)} values)")
+                raise BadInput(
+                    f"position {tuple(position)} m is not on the lattice (axis {'xyz'[axis]}: "
+                    f"{values[0]:g} to {values[-1]:g} m, {len(values)} values)")
             index.append(nearest)
         return np.ravel_multi_index(tuple(index), self.shape)

@@ -1,13 +1,14 @@
 """Radio materials: Recommendation ITU-R P.2040, and materials with constants of their own."""
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 from radiotwin.errors import BadInput
 
-# ITU-R P.2040-4, Table 3: material -> ranges (lowest GHz, highest GHz, a, b, c, d), where with f in GHz
+# ITU-R P.2040-4, Table 3: material -> ranges (lowest GHz, highest GHz, a, b, c, d); with f in GHz
 #   relative permittivity = a f^b
 #   conductivity [S/m]    = c f^d     (section 2.1.4)
-# Where ranges overlap, the first one listed counts, as in Sionna RT.
+# Where ranges overlap, the first one listed is used, as in Sionna RT.
 ITU_TABLE: dict[str, tuple[tuple[float, float, float, float, float, float], ...]] = {
     "vacuum": ((0.001, 100, 1.0, 0, 0, 0),),
     "concrete": ((1, 100, 5.24, 0, 0.0462, 0.7822), (110, 330, 5.17, 0, 0.0145, 1.09)),
@@ -60,22 +61,23 @@ ITU_TABLE: dict[str, tuple[tuple[float, float, float, float, float, float], ...]
     "wet_ground": ((1, 10, 30.0, -0.4, 0.15, 1.3),),
 }
 
-# Sionna RT evaluates every ITU material at this frequency while it loads a file, before the scene's is set.
-SIONNA_LOAD_FREQUENCY_HZ = 3.5e9
+# Sionna RT evaluates every ITU material at this frequency while it loads a file, before the scene's
+# own frequency is set.
+_SIONNA_LOAD_FREQUENCY_HZ = 3.5e9
 
 
 @dataclass(frozen=True)
 class Material:
-    """What a surface is made of.
+    """Radio properties of a surface.
 
     Attributes:
-        name: used in files; letters, digits, `_` and `-`.
-        itu: a key of `ITU_TABLE`, or None for a material with its own constants.
-        relative_permittivity: real part, at least 1; None for an ITU material.
+        name: Used in files; letters, digits, `_` and `-`.
+        itu: Key of `ITU_TABLE`, or None for a material with its own constants.
+        relative_permittivity: Real part, at least 1; None for an ITU material.
         conductivity_s_per_m: None where `relative_permittivity` is.
-        thickness_m: of the slab that a wall or roof is taken for.
+        thickness_m: Thickness of the slab that models a wall or roof.
         scattering_coefficient: 0 (mirror) to 1 (all power scattered).
-        xpd_coefficient: share of scattered power that changes polarisation, 0 to 1.
+        xpd_coefficient: Share of scattered power that changes polarisation, 0 to 1.
     """
 
     name: str
@@ -88,7 +90,7 @@ class Material:
 
 
 def itu_name(text: str) -> str | None:
-    """Key of `ITU_TABLE` that a name like `itu-metal` or `brick` stands for, or None.
+    """Return the key of `ITU_TABLE` for a name like `itu-metal` or `brick`, or None.
 
     >>> itu_name("mat-itu_wet_ground")
     'wet_ground'
@@ -99,15 +101,15 @@ def itu_name(text: str) -> str | None:
     return name if name in ITU_TABLE else None
 
 
-def itu_material(text: str, **settings) -> Material:
-    """Material of the ITU table, named after its type.
+def itu_material(text: str, **settings: Any) -> Material:
+    """Return a material of the ITU table, named after its type.
 
     Args:
         text: `concrete`, `itu_concrete`, ...
-        settings: other fields of `Material`.
+        settings: Other fields of `Material`.
 
     Raises:
-        BadInput: not in the table.
+        BadInput: Not in the table.
     """
     itu = itu_name(text)
     if itu is None:
@@ -116,30 +118,31 @@ def itu_material(text: str, **settings) -> Material:
 
 
 def permittivity(name: str, frequency_hz: float) -> tuple[float, float, bool]:
-    """Constants of an ITU material (ITU-R P.2040-4, section 2.1.4).
+    """Return the constants of an ITU material (ITU-R P.2040-4, section 2.1.4).
 
-    Outside the frequency ranges of its fit, the material is taken at the nearest end of the nearest range:
-    the power laws are not extrapolated, since the measurements behind them say nothing there.
+    Outside the frequency ranges of its fit, the nearest end of the nearest range is used: the power
+    laws are not extrapolated, as no measurements support them there.
 
     Args:
         name: `concrete`, `itu_concrete`, ...
-        frequency_hz: frequency [Hz].
+        frequency_hz: Frequency [Hz].
 
     Returns:
-        Relative permittivity (real part), conductivity [S/m], and whether the frequency is in a range.
+        Relative permittivity (real part), conductivity [S/m], and whether the frequency is in a
+        range.
 
     Raises:
-        BadInput: no such material, or the frequency is not positive.
+        BadInput: No such material, or the frequency is not positive.
     """
     if not frequency_hz > 0:
-        raise BadInput(f"frequency {frequency_hz:g} Hz is not possible; give a positive frequency in hertz")
+        raise BadInput(f"frequency {frequency_hz:g} Hz is not possible; give a positive frequency "
+                       "in hertz")
     frequency_ghz = frequency_hz / 1e9
     ranges = ITU_TABLE[itu_material(name).itu or ""]  # an ITU material has a name
     in_range = next((row for row in ranges if row[0] <= frequency_ghz <= row[1]), None)
     if in_range is None:
-        nearest_ghz, row = min(
-            ((end, row) for row in ranges for end in row[:2]), key=lambda pair: abs(pair[0] - frequency_ghz)
-        )
+        nearest_ghz, row = min(((end, row) for row in ranges for end in row[:2]),
+                               key=lambda pair: abs(pair[0] - frequency_ghz))
         return *_power_laws(row, nearest_ghz), False
     return *_power_laws(in_range, frequency_ghz), True
 
@@ -150,32 +153,43 @@ def _power_laws(row: tuple[float, ...], frequency_ghz: float) -> tuple[float, fl
 
 
 def ranges_text(name: str) -> str:
-    """The frequency ranges of an ITU material, for messages: `1-100 GHz, 110-330 GHz`."""
+    """Return the frequency ranges of an ITU material as `1-100 GHz, 110-330 GHz`."""
     return ", ".join(f"{low:g}-{high:g} GHz" for low, high, *_ in ITU_TABLE[name])
 
 
 def constants(material: Material, frequency_hz: float) -> tuple[float, float, bool]:
-    """Relative permittivity and conductivity [S/m] of any material, and whether ITU covers the frequency."""
+    """Return the constants of any material.
+
+    Args:
+        material: With or without an ITU type.
+        frequency_hz: Frequency [Hz].
+
+    Returns:
+        Relative permittivity, conductivity [S/m], and whether ITU covers the frequency (True for a
+        material with its own constants).
+    """
     if material.itu is not None:
         return permittivity(material.itu, frequency_hz)
-    return material.relative_permittivity, material.conductivity_s_per_m, True  # type: ignore[return-value]  # given without ITU
+    assert material.relative_permittivity is not None
+    assert material.conductivity_s_per_m is not None
+    return material.relative_permittivity, material.conductivity_s_per_m, True
 
 
 def traceable(material: Material, frequency_hz: float) -> Material:
-    """The material in a form that Sionna RT accepts at this frequency.
+    """Return the material in a form that Sionna RT accepts at a frequency.
 
-    Sionna RT stops on an ITU material outside its ranges, at the scene's frequency or at the 3.5 GHz it loads
-    with. Such a material is returned with the constants that `permittivity` gives, named `<name>-fixed`.
+    Sionna RT stops on an ITU material outside its ranges, at the scene's frequency or at the
+    3.5 GHz that it loads with. Such a material is returned with the constants that `permittivity`
+    gives, named `<name>-fixed`; any other is returned as it is.
+
+    Args:
+        material: Any material.
+        frequency_hz: Frequency of the scene [Hz].
     """
     if material.itu is None:
         return material
-    relative_permittivity, conductivity, in_range = permittivity(material.itu, frequency_hz)
-    if in_range and permittivity(material.itu, SIONNA_LOAD_FREQUENCY_HZ)[2]:
+    epsilon, conductivity, in_range = permittivity(material.itu, frequency_hz)
+    if in_range and permittivity(material.itu, _SIONNA_LOAD_FREQUENCY_HZ)[2]:
         return material
-    return replace(
-        material,
-        name=f"{material.name}-fixed",
-        itu=None,
-        relative_permittivity=relative_permittivity,
-        conductivity_s_per_m=conductivity,
-    )
+    return replace(material, name=f"{material.name}-fixed", itu=None,
+                   relative_permittivity=epsilon, conductivity_s_per_m=conductivity)

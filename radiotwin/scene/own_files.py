@@ -1,26 +1,26 @@
-"""Files that a scene names: only those in its own folder are read, whatever the scene says."""
+"""The rule that a scene reads only files in its own folder."""
 
 from pathlib import Path
 
 from radiotwin.errors import BadInput
 
 
-def require_within(folder: Path, path: Path, place: str) -> Path:
-    """The path, if it is in the folder, links followed.
+def require_within(folder: Path, path: Path, source: str) -> Path:
+    """Return the path if it lies in the folder once links are followed.
 
     Args:
-        folder: of the scene.
-        path: of a file that it names.
-        place: where it is named, for the message.
+        folder: Folder of the scene.
+        path: File that the scene names.
+        source: File, and line if known, that names it, for the message.
 
     Raises:
-        BadInput: it leads out of the folder, by `..`, by its root, or by a symbolic link.
+        BadInput: The path leaves the folder by `..`, by its root, or by a symbolic link.
     """
     try:
         inside = path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # links in a circle, a name that no file can have
+    except (OSError, RuntimeError, ValueError):  # circular links, a name that no file can have
         inside = False
     if not inside:
-        raise BadInput(f"{place}: {path} leads out of {folder}; a scene may name files in its own folder only: copy "
-                       "the file there")
+        raise BadInput(f"{source}: {path} leads out of {folder}; a scene may name files in its own "
+                       "folder only: copy the file there")
     return path

@@ -1,4 +1,4 @@
-"""Where things go in a city that declares none: extent, altitudes, devices, UAVs."""
+"""Extent, altitudes, devices and UAVs for a city that declares none."""
 
 from dataclasses import dataclass
 
@@ -7,22 +7,27 @@ from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.config import DeviceConfig, Extent, LatticeConfig, UavConfig
+from radiotwin.scene.config import (
+    ANTENNA_HEIGHT_M,
+    DeviceConfig,
+    Extent,
+    LatticeConfig,
+    UavConfig,
+)
+from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.surfaces import Surfaces
 
-ANTENNA_HEIGHT_M = 1.5
-CLEARANCE_M = 10.0
-UAV_CLEARANCE_M = 2.0
-GRID_CELLS = 2_000_000
-MARGIN_ABOVE_ROOFS_M = 10.0
+_DEVICE_CLEARANCE_M = 10.0  # free ground around a device [m]
+_UAV_CLEARANCE_M = 2.0  # free air beside the start of a UAV [m]
+_MAX_CELLS = 2_000_000  # of a `BuiltGrid`
 
 
 @dataclass(frozen=True, eq=False)
 class BuiltGrid:
-    """Which cells of the extent's plane are under a building.
+    """Cells of the extent's plane that are under a building.
 
     Attributes:
-        x_m, y_m: (nx,), (ny,) centres of cells.
+        x_m, y_m: (nx,), (ny,) centres of cells [m].
         built: (ny, nx) bool.
     """
 
@@ -32,24 +37,28 @@ class BuiltGrid:
 
     @classmethod
     def over(cls, extent: Extent, buildings: CityMap | None) -> "BuiltGrid":
-        """Grid with cells of 1 m, or larger where the extent would need more than 2 million."""
+        """Make a grid with cells of 1 m, larger where that would need more than 2 million.
+
+        Args:
+            extent: Area of the grid.
+            buildings: 3D map of the buildings alone; None: there are none.
+        """
         x_min, x_max, y_min, y_max = extent.bounds
-        cell_m = max(
-            min(1.0, (x_max - x_min) / 50, (y_max - y_min) / 50),
-            np.sqrt((x_max - x_min) * (y_max - y_min) / GRID_CELLS),
-        )
+        width, depth = x_max - x_min, y_max - y_min
+        cell_m = max(min(1.0, width / 50, depth / 50), np.sqrt(width * depth / _MAX_CELLS))
         x_m = np.arange(x_min + cell_m / 2, x_max, cell_m)
         y_m = np.arange(y_min + cell_m / 2, y_max, cell_m)
         if buildings is None:
             return cls(x_m, y_m, np.zeros((len(y_m), len(x_m)), dtype=bool))
         x, y = np.meshgrid(x_m, y_m)
-        below, above = buildings.vertices[:, 2].min() - 1.0, buildings.vertices[:, 2].max() + 1.0
-        low = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, above)])
-        high = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, below)])
+        z = buildings.vertices[:, 2]
+        low = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z.max() + 1.0)])
+        high = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z.min() - 1.0)])
         return cls(x_m, y_m, ~buildings.line_of_sight(low, high).reshape(x.shape))
 
     @property
     def cell_m(self) -> float:
+        """Side of a cell [m]."""
         return float(self.x_m[1] - self.x_m[0])
 
     @property
@@ -58,19 +67,22 @@ class BuiltGrid:
         return float(self.built.mean())
 
     def clearance_m(self) -> np.ndarray:
-        """(ny, nx) distance from each cell to the nearest building or border of the extent."""
+        """Return the (ny, nx) distance to the nearest building or border of the extent [m]."""
         return distance_transform_edt(np.pad(~self.built, 1))[1:-1, 1:-1] * self.cell_m
 
     def density(self) -> np.ndarray:
-        """(ny, nx) share of the square of 200 m around each cell that is under buildings."""
-        return uniform_filter(self.built.astype(np.float32), size=int(200.0 / self.cell_m), mode="constant")
+        """Return the (ny, nx) share under buildings of the 200 m square around each cell."""
+        return uniform_filter(self.built.astype(np.float32), size=int(200.0 / self.cell_m),
+                              mode="constant")
 
 
 def building_bounds(surfaces: Surfaces, solid: np.ndarray) -> tuple[float, float, float, float]:
-    """Horizontal bounding box of the buildings; of everything where the buildings are but a line or nothing.
+    """Return the horizontal bounding box of the buildings.
+
+    Where the buildings are but a line or nothing, it is that of the whole city.
 
     Args:
-        surfaces: of the city.
+        surfaces: The city.
         solid: (f,) bool, faces that are not ground.
 
     Returns:
@@ -88,46 +100,49 @@ def building_bounds(surfaces: Surfaces, solid: np.ndarray) -> tuple[float, float
     return float(x - half_x), float(x + half_x), float(y - half_y), float(y + half_y)
 
 
-def building_tops(
-    surfaces: Surfaces, solid: np.ndarray, ground: CityMap | None
-) -> tuple[np.ndarray, np.ndarray]:
-    """Highest point of each shape above the datum, and above the ground below its middle.
+def building_tops(surfaces: Surfaces, solid: np.ndarray, ground: CityMap | None
+                  ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the highest point of each shape above the datum, and above the ground below it.
 
     Args:
-        surfaces: of the city.
+        surfaces: The city.
         solid: (f,) bool, faces that are not ground; a shape without them counts 0.
         ground: 3D map of the ground alone.
 
     Returns:
-        (shapes,) tops [m], (shapes,) heights [m].
+        (shapes,) tops [m], (shapes,) heights above the ground below the shape's middle [m].
     """
     _, high = surfaces.face_bounds()
     tops_m = np.zeros(surfaces.shapes)
     np.maximum.at(tops_m, surfaces.shape[solid], high[solid, 2])
     weight = surfaces.areas * solid
     area = np.maximum(np.bincount(surfaces.shape, weight, surfaces.shapes), 1e-12)
-    x_m, y_m = (
-        np.bincount(surfaces.shape, weight * surfaces.centres[:, axis], surfaces.shapes) / area
-        for axis in (0, 1)
-    )
+    x_m, y_m = (np.bincount(surfaces.shape, weight * surfaces.centres[:, axis], surfaces.shapes)
+                / area for axis in (0, 1))
     below_m = np.zeros(surfaces.shapes) if ground is None else ground.height_at(x_m, y_m)
     return tops_m, np.where(tops_m > 0, np.maximum(tops_m - below_m, 0.0), 0.0)
 
 
 def choose_extent(bounds: tuple[float, float, float, float]) -> Extent:
-    """Bounds moved outwards to whole steps of the lattice, so that both borders lie on it."""
+    """Move bounds outwards to whole steps of the lattice, so that both borders lie on it.
+
+    Args:
+        bounds: (x_min, x_max, y_min, y_max) [m].
+    """
     step_m = choose_step(bounds)
     x_min, x_max, y_min, y_max = bounds
-    return Extent(
-        x_min_m=np.floor(x_min / step_m) * step_m,
-        x_max_m=np.ceil(x_max / step_m) * step_m,
-        y_min_m=np.floor(y_min / step_m) * step_m,
-        y_max_m=np.ceil(y_max / step_m) * step_m,
-    )
+    return Extent(x_min_m=np.floor(x_min / step_m) * step_m,
+                  x_max_m=np.ceil(x_max / step_m) * step_m,
+                  y_min_m=np.floor(y_min / step_m) * step_m,
+                  y_max_m=np.ceil(y_max / step_m) * step_m)
 
 
 def choose_step(bounds: tuple[float, float, float, float]) -> float:
-    """20 m, or the next smaller of 10, 5, 2, 1, ... that gives five steps across the narrower side."""
+    """Return 20 m, or the next of 10, 5, 2, 1, ... that fits five times into the narrower side.
+
+    Args:
+        bounds: (x_min, x_max, y_min, y_max) [m].
+    """
     x_min, x_max, y_min, y_max = bounds
     for exponent in range(1, -6, -1):
         for digit in (2, 1, 0.5):
@@ -137,44 +152,49 @@ def choose_step(bounds: tuple[float, float, float, float]) -> float:
 
 
 def choose_altitudes(heights_m: np.ndarray) -> list[float]:
-    """Three altitudes from 10 m above 95 % of the roofs upwards, 5 m apart.
+    """Return three altitudes from 10 m above 95 % of the roofs upwards, 5 m apart [m].
 
-    Low enough that streets next to tall buildings stay without line of sight, high enough that few lattice
-    positions lie inside a building.
+    They are low enough that streets next to tall buildings stay without line of sight, and high
+    enough that few lattice positions lie inside a building.
 
     Args:
-        heights_m: (n,) tops of the buildings above the ground datum; may be empty.
+        heights_m: (n,) tops of the buildings above the ground datum [m]; may be empty.
     """
     top_m = float(np.percentile(heights_m, 95)) if len(heights_m) else 0.0
-    lowest_m = max(30.0, 5.0 * np.ceil((top_m + MARGIN_ABOVE_ROOFS_M) / 5.0))
+    lowest_m = max(30.0, 5.0 * np.ceil((top_m + 10.0) / 5.0))
     return [lowest_m, lowest_m + 5.0, lowest_m + 10.0]
 
 
-def place_devices(
-    count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.random.Generator
-) -> list[DeviceConfig]:
-    """Devices on free ground, 10 m clear of buildings, spread out; three of them, or 30 %, are anchors.
+def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.random.Generator
+                  ) -> list[DeviceConfig]:
+    """Place devices on free ground, 10 m clear of buildings; three, or 30 %, are anchors.
 
-    Positions are drawn one by one at random, preferably where much is built within 100 m around, each at
-    least some distance from all before; the distance shrinks until all find a place.
+    Positions are drawn one by one at random, preferably where much is built within 100 m around,
+    each at some distance from all before; the distance shrinks until there is room for all.
+
+    Args:
+        count: Number of devices.
+        grid: Buildings in the extent.
+        ground: 3D map of the ground alone; None: flat at the datum.
+        rng: Source of the positions.
 
     Raises:
-        BadInput: there is no free ground for so many.
+        BadInput: There is not enough free ground.
     """
     if count == 0:
         return []
-    rows, columns = np.nonzero(grid.clearance_m() >= CLEARANCE_M)
+    rows, columns = np.nonzero(grid.clearance_m() >= _DEVICE_CLEARANCE_M)
     if len(rows) < count:
-        raise BadInput(
-            f"{count} devices were asked for, but there is not enough ground {CLEARANCE_M:g} m clear of "
-            "buildings; ask for fewer, or declare them in scene.toml"
-        )
+        raise BadInput(f"{count} devices were asked for, but there is not enough ground "
+                       f"{_DEVICE_CLEARANCE_M:g} m clear of buildings; ask for fewer, or declare "
+                       "them in scene.toml")
     free = np.column_stack([grid.x_m[columns], grid.y_m[rows]])
     weight = grid.density()[rows, columns] + 0.01
     apart_m = 0.7 * np.sqrt(grid.built.size / count) * grid.cell_m
     chosen: list[np.ndarray] = []
     while len(chosen) < count:
-        for index in rng.choice(len(free), min(len(free), 1000), replace=False, p=weight / weight.sum()):
+        drawn = rng.choice(len(free), min(len(free), 1000), replace=False, p=weight / weight.sum())
+        for index in drawn:
             if all(np.hypot(*(free[index] - other)) >= apart_m for other in chosen):
                 chosen.append(free[index])
                 if len(chosen) == count:
@@ -183,20 +203,14 @@ def place_devices(
     positions = np.round(np.array(chosen), 1).reshape(-1, 2)
     bottom_m = np.zeros(count) if ground is None else ground.height_at(*positions.T)
     anchors = _spread_out(positions, min(count, max(3, round(0.3 * count))))
-    return [
-        DeviceConfig(
-            device=f"device{number + 1:02d}",
-            x_m=float(x),
-            y_m=float(y),
-            z_m=round(float(bottom) + ANTENNA_HEIGHT_M, 2),
-            role="anchor" if number in anchors else "unknown",
-        )
-        for number, ((x, y), bottom) in enumerate(zip(positions, bottom_m))
-    ]
+    return [DeviceConfig(device=f"device{number + 1:02d}", x_m=float(x), y_m=float(y),
+                         z_m=round(float(bottom) + ANTENNA_HEIGHT_M, 2),
+                         role="anchor" if number in anchors else "unknown")
+            for number, ((x, y), bottom) in enumerate(zip(positions, bottom_m))]
 
 
 def _spread_out(positions: np.ndarray, count: int) -> set[int]:
-    """Indices of `count` positions, each the farthest from those before; the first is in the middle."""
+    """Choose `count` positions, from the middle on each the farthest from those before."""
     chosen = [int(np.linalg.norm(positions - positions.mean(axis=0), axis=1).argmin())]
     while len(chosen) < count:
         gaps = np.linalg.norm(positions[:, None] - positions[None, chosen], axis=2).min(axis=1)
@@ -204,46 +218,42 @@ def _spread_out(positions: np.ndarray, count: int) -> set[int]:
     return set(chosen)
 
 
-def place_uavs(
-    count: int, extent: Extent, lattice: LatticeConfig, buildings: CityMap | None
-) -> list[UavConfig]:
-    """UAVs that start and end at the free lattice position nearest to the middle, at one altitude each.
+def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: CityMap | None
+               ) -> list[UavConfig]:
+    """Place UAVs at the free lattice position nearest to the middle, at one altitude each.
+
+    They end where they start, with a battery for 80 % of the moves along two sides of the extent,
+    at least 20.
+
+    Args:
+        count: Number of UAVs.
+        extent: Area of the lattice.
+        lattice: Its step and altitudes, which the UAVs take in turn.
+        buildings: 3D map of the buildings alone; None: there are none.
 
     Raises:
-        BadInput: no lattice position is free at an altitude.
+        BadInput: No lattice position is free at an altitude.
     """
     x_min, x_max, y_min, y_max = extent.bounds
-    nx, ny = (
-        int(np.floor((high - low) / lattice.step_m + 1e-9)) + 1
-        for low, high in ((x_min, x_max), (y_min, y_max))
-    )
-    x, y = np.meshgrid(x_min + lattice.step_m * np.arange(nx), y_min + lattice.step_m * np.arange(ny))
-    nearest = np.argsort(np.hypot(x - (x_min + x_max) / 2, y - (y_min + y_max) / 2).ravel(), kind="stable")[
-        :10_000
-    ]
-    battery = max(20.0, float(round(0.8 * (nx + ny))))
+    positions = Lattice.over(*extent.bounds, lattice.step_m, lattice.altitudes_m)
+    x, y = np.meshgrid(positions.x_m, positions.y_m)
+    distance_m = np.hypot(x - (x_min + x_max) / 2, y - (y_min + y_max) / 2)
+    nearest = np.argsort(distance_m.ravel(), kind="stable")[:10_000]
+    battery = max(20.0, float(round(0.8 * sum(x.shape))))
+    offsets_m = _UAV_CLEARANCE_M * np.array(
+        [[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
     uavs = []
     for number in range(count):
         altitude_m = lattice.altitudes_m[number % len(lattice.altitudes_m)]
         points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, altitude_m)])[nearest]
         free = np.ones(len(points), dtype=bool)
-        for aside in UAV_CLEARANCE_M * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]):
-            if buildings is not None:
-                free &= ~buildings.inside(points + aside)
+        if buildings is not None:
+            for offset_m in offsets_m:
+                free &= ~buildings.inside(points + offset_m)
         if not free.any():
-            raise BadInput(
-                f"at {altitude_m:g} m every lattice position is inside a building; choose higher altitudes"
-            )
-        start_x_m, start_y_m, _ = (float(value) for value in points[free.argmax()])
-        uavs.append(
-            UavConfig(
-                uav=f"uav{number + 1}",
-                altitude_m=altitude_m,
-                start_x_m=start_x_m,
-                start_y_m=start_y_m,
-                terminal_x_m=start_x_m,
-                terminal_y_m=start_y_m,
-                battery=battery,
-            )
-        )
+            raise BadInput(f"at {altitude_m:g} m every lattice position is inside a building; "
+                           "choose higher altitudes")
+        x_m, y_m, _ = (float(value) for value in points[free.argmax()])
+        uavs.append(UavConfig(uav=f"uav{number + 1}", altitude_m=altitude_m, start_x_m=x_m,
+                              start_y_m=y_m, terminal_x_m=x_m, terminal_y_m=y_m, battery=battery))
     return uavs

@@ -1,7 +1,7 @@
-"""PLY files: polygons read from the ASCII and binary forms, triangles written as binary.
+"""PLY files: read polygons from the ASCII and binary forms, write triangles as binary.
 
-trimesh reads PLY too, but takes a truncated ASCII file or a face that names a missing vertex without a word,
-and refuses binary files that mix triangles with quadrilaterals.
+trimesh reads PLY, too, but silently accepts a truncated ASCII file or a face that names a missing
+vertex, and refuses binary files that mix triangles with quadrilaterals.
 """
 
 import struct
@@ -12,24 +12,11 @@ import numpy as np
 
 from radiotwin.errors import BadInput
 
-_TYPES = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
+_TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
+          "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
+          "float": "f4", "float32": "f4", "double": "f8", "float64": "f8"}
+_STRUCT_CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f",
+                 "f8": "d"}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 
@@ -37,18 +24,18 @@ _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 class _Element:
     name: str
     count: int
-    properties: list[tuple[str, str, str | None]] = field(
-        default_factory=list
-    )  # name, type, type of list length
+    # Name, type, and type of the list's length (None: not a list)
+    properties: list[tuple[str, str, str | None]] = field(default_factory=list)
 
     def dtype(self, order: str, lengths: dict[str, int]) -> np.dtype:
-        """Of one row whose lists have the given lengths."""
+        """Return the type of one row whose lists have the given lengths."""
         fields: list[tuple] = []
         for name, kind, length_kind in self.properties:
             if length_kind is None:
                 fields.append((name, order + kind))
             else:
-                fields += [(f"{name} length", order + length_kind), (name, order + kind, (lengths[name],))]
+                fields += [(f"{name} length", order + length_kind),
+                           (name, order + kind, (lengths[name],))]
         return np.dtype(fields)
 
 
@@ -56,55 +43,49 @@ def read_ply(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
     """Read vertices and polygons.
 
     Args:
-        path: file to read.
+        path: PLY file.
 
     Returns:
-        (v, 3) vertices, and one (n, k) array of vertex indices for each number of corners k that occurs.
+        (v, 3) vertices, and an (n, k) array of vertex indices for each number of corners k.
 
     Raises:
-        BadInput: no such file, not a PLY file, truncated, or without vertices or faces as its header should
-            declare them.
+        BadInput: No such file, not a PLY file, truncated, or a header without vertices or faces.
     """
     try:
-        if path.exists() and not path.is_file():  # a pipe would be waited for without end
+        if path.exists() and not path.is_file():  # reading a pipe would block
             raise OSError(0, "it is not an ordinary file")
         data = path.read_bytes()
     except OSError as error:
         raise BadInput(f"{path} cannot be read: {error.strerror}; export the mesh again") from None
     order, elements, start = _read_header(path, data)
-    columns = (
-        _read_ascii(path, data[start:], elements)
-        if order == ""
-        else _read_binary(path, data, start, order, elements)
-    )
+    columns = (_read_ascii(path, data[start:], elements) if order == "" else
+               _read_binary(path, data, start, order, elements))
     try:
-        vertices = np.stack([np.asarray(columns["vertex", axis], dtype=float) for axis in "xyz"], axis=1)
+        vertices = np.stack([np.asarray(columns["vertex", axis], dtype=float) for axis in "xyz"],
+                            axis=1)
     except KeyError as missing:
-        raise BadInput(
-            f"{path}: the PLY header declares no vertex {missing.args[0][1]}; export the mesh again"
-        ) from None
+        raise BadInput(f"{path}: the PLY header declares no vertex {missing.args[0][1]}; export "
+                       "the mesh again") from None
     polygons = columns.get(("face", "vertex_indices"), columns.get(("face", "vertex_index")))
     if polygons is None:
-        raise BadInput(f"{path}: the PLY header declares no face vertex_indices; export the mesh with faces")
+        raise BadInput(f"{path}: the PLY header declares no face vertex_indices; export the mesh "
+                       "with faces")
     return vertices, _by_corners(polygons)
 
 
-def _by_corners(polygons) -> list[np.ndarray]:
+def _by_corners(polygons: np.ndarray | list) -> list[np.ndarray]:
     if isinstance(polygons, np.ndarray):
         return [polygons.astype(np.int64)]
     corners = np.array([len(polygon) for polygon in polygons])
-    return [
-        np.array([polygons[row] for row in np.flatnonzero(corners == k)], dtype=np.int64)
-        for k in np.unique(corners)
-    ]
+    return [np.array([polygons[row] for row in np.flatnonzero(corners == k)], dtype=np.int64)
+            for k in np.unique(corners)]
 
 
 def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
     end = data.find(b"end_header")
     if not data.startswith(b"ply") or end < 0:
-        raise BadInput(
-            f"{path} is not a PLY file, or it was cut off within its header; export the mesh again"
-        )
+        raise BadInput(f"{path} is not a PLY file, or it was cut off within its header; export "
+                       "the mesh again")
     start = data.find(b"\n", end) + 1 or len(data)
     order, elements = None, []
     for number, line in enumerate(data[:end].decode("latin-1").splitlines(), start=1):
@@ -124,13 +105,12 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
                 case _:
                     raise ValueError
         except (KeyError, IndexError, ValueError):
-            raise BadInput(
-                f"{path}, line {number}: {line.strip()[:60]!r} is not a PLY header line; "
-                "export the mesh again"
-            ) from None
+            raise BadInput(f"{path}, line {number}: {line.strip()[:60]!r} is not a PLY header "
+                           "line; export the mesh again") from None
     if order is None:
         raise BadInput(f"{path}: the PLY header has no format line; export the mesh again")
-    # Every row takes at least a byte: what a header promises is held against the file before anything is reserved
+    # Every row takes at least a byte: compare the header's counts with the file's size before any
+    # memory is reserved
     for element in elements:
         if element.count and not element.properties or element.count > len(data) - start:
             raise _truncated(path, element, 0)
@@ -138,10 +118,9 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
 
 
 def _truncated(path: Path, element: _Element, row: int) -> BadInput:
-    return BadInput(
-        f"{path} is truncated: its header promises {element.count} rows of '{element.name}', "
-        f"the file ends in row {row + 1}; copy or export the mesh again"
-    )
+    return BadInput(f"{path} is truncated: its header promises {element.count} rows of "
+                    f"'{element.name}', the file ends in row {row + 1}; copy or export the mesh "
+                    "again")
 
 
 def _read_ascii(path: Path, data: bytes, elements: list[_Element]) -> dict:
@@ -173,32 +152,33 @@ def _read_ascii(path: Path, data: bytes, elements: list[_Element]) -> dict:
             except IndexError:
                 raise _truncated(path, element, number) from None
             except ValueError:
-                raise BadInput(
-                    f"{path}: row {number + 1} of '{element.name}' has a text where a number should "
-                    f"be: {' '.join(words)[:60]!r}; export the mesh again"
-                ) from None
+                raise BadInput(f"{path}: row {number + 1} of '{element.name}' has a text where a "
+                               f"number should be: {' '.join(words)[:60]!r}; export the mesh "
+                               "again") from None
     return columns
 
 
-def _read_binary(path: Path, data: bytes, start: int, order: str, elements: list[_Element]) -> dict:
+def _read_binary(path: Path, data: bytes, start: int, order: str, elements: list[_Element]
+                 ) -> dict:
     columns: dict[str, dict] = {}
     for element in elements:
-        found, start = _read_uniform(data, start, order, element) or _read_ragged(
-            path, data, start, order, element
-        )
+        found, start = (_read_uniform(data, start, order, element)
+                        or _read_ragged(path, data, start, order, element))
         columns |= {(element.name, name): values for name, values in found.items()}
     return columns
 
 
-def _read_uniform(data: bytes, start: int, order: str, element: _Element) -> tuple[dict, int] | None:
-    """All rows at once, where every row's lists are as long as the first row's; else None."""
+def _read_uniform(data: bytes, start: int, order: str, element: _Element
+                  ) -> tuple[dict, int] | None:
+    """Read all rows at once if every row's lists are as long as the first row's; else None."""
     lengths, at = {}, start
     for name, kind, length_kind in element.properties:
         size = np.dtype(kind).itemsize
         if length_kind is not None:
-            length = np.frombuffer(data[at : at + np.dtype(length_kind).itemsize], order + length_kind)
+            length_size = np.dtype(length_kind).itemsize
+            length = np.frombuffer(data[at : at + length_size], order + length_kind)
             lengths[name] = int(length[0]) if len(length) else 0
-            at += np.dtype(length_kind).itemsize + size * lengths[name]
+            at += length_size + size * lengths[name]
         else:
             at += size
         if at > len(data) or min(lengths.values(), default=0) < 0:
@@ -209,21 +189,23 @@ def _read_uniform(data: bytes, start: int, order: str, element: _Element) -> tup
     rows = np.frombuffer(data, dtype, count=element.count, offset=start)
     if any((rows[f"{name} length"] != length).any() for name, length in lengths.items()):
         return None
-    return {name: rows[name] for name, *_ in element.properties}, start + dtype.itemsize * element.count
+    end = start + dtype.itemsize * element.count
+    return {name: rows[name] for name, *_ in element.properties}, end
 
 
-def _read_ragged(path: Path, data: bytes, at: int, order: str, element: _Element) -> tuple[dict, int]:
-    codes = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
+def _read_ragged(path: Path, data: bytes, at: int, order: str, element: _Element
+                 ) -> tuple[dict, int]:
+    """Read row by row."""
     found: dict[str, list] = {name: [] for name, *_ in element.properties}
     for row in range(element.count):
         try:
             for name, kind, length_kind in element.properties:
                 length = 1
                 if length_kind is not None:
-                    (length,) = struct.unpack_from(order + codes[length_kind], data, at)
-                    at += struct.calcsize(codes[length_kind])
-                values = struct.unpack_from(f"{order}{length}{codes[kind]}", data, at)
-                at += struct.calcsize(f"{order}{length}{codes[kind]}")
+                    (length,) = struct.unpack_from(order + _STRUCT_CODES[length_kind], data, at)
+                    at += struct.calcsize(_STRUCT_CODES[length_kind])
+                values = struct.unpack_from(f"{order}{length}{_STRUCT_CODES[kind]}", data, at)
+                at += struct.calcsize(f"{order}{length}{_STRUCT_CODES[kind]}")
                 found[name].append(values if length_kind is not None else values[0])
         except struct.error:
             raise _truncated(path, element, row) from None
@@ -234,13 +216,14 @@ def write_ply(path: Path, vertices_m: np.ndarray, faces: np.ndarray) -> None:
     """Write triangles as a binary little-endian PLY file; equal meshes give equal bytes.
 
     Args:
-        path: file to write.
-        vertices_m: (v, 3) positions, stored in single precision.
+        path: File to write.
+        vertices_m: (v, 3) positions [m], stored in single precision.
         faces: (f, 3) indices of vertices.
     """
     header = (
         "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(vertices_m)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element vertex {len(vertices_m)}\n"
+        "property float x\nproperty float y\nproperty float z\n"
         f"element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
     rows = np.empty(len(faces), dtype=[("count", "u1"), ("index", "<i4", 3)])

@@ -1,4 +1,4 @@
-"""The scenes that ship: two after the maps of Chen et al. 2023, and a small one for the demonstration."""
+"""Built-in scenes: two after the maps of Chen et al. 2023, and a small one for demonstration."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,6 +9,8 @@ import trimesh
 
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder
+from radiotwin.scene import Scene
+from radiotwin.scene.build import BuildOptions, build_scene, check_target
 from radiotwin.scene.config import (
     DeviceConfig,
     Extent,
@@ -19,25 +21,34 @@ from radiotwin.scene.config import (
     write_config,
 )
 from radiotwin.scene.generator import CityParameters, building_meshes, draw_buildings
-from radiotwin.scene.materials import Material
+from radiotwin.scene.materials import itu_material
+from radiotwin.scene.preview import draw_preview
+from radiotwin.scene.report import BuildReport
 from radiotwin.scene.writer import CityShape, write_city
-
-ANTENNA_HEIGHT_M = 1.5
-GROUND_MARGIN_M = 100.0
 
 
 @dataclass(frozen=True)
 class Preset:
-    """A generated city and the mission in it; devices as (x_m, y_m, is_anchor)."""
+    """A generated city and the mission in it.
+
+    Attributes:
+        city: Parameters of the city.
+        devices: (x_m, y_m, is_anchor) of each device.
+        start_m, terminal_m: (x, y) where all UAVs start and end [m].
+        battery: Battery units of each UAV.
+        data_units: Data at each device.
+        altitudes_m: Altitudes of the lattice, with one UAV at each [m].
+        seed: Seed of the city.
+    """
 
     city: CityParameters
-    seed: int
     devices: list[tuple[float, float, bool]]
     start_m: tuple[float, float]
     terminal_m: tuple[float, float]
     battery: float
     data_units: float
-    altitudes_m: tuple[float, ...]  # one UAV at each
+    altitudes_m: tuple[float, ...]
+    seed: int = 0
 
 
 def _devices(text: str) -> list[tuple[float, float, bool]]:
@@ -51,46 +62,53 @@ def _devices(text: str) -> list[tuple[float, float, bool]]:
 
 PRESETS = {
     "rbm": Preset(
-        CityParameters(600, 800, avenue_width_m=60, avenue_spacing_m=200, street_width_m=20, block_mean_m=100,
-                       block_min_m=80, side_min_m=50, mean_height_m=15, first_block_m=(-169, -34)),
-        seed=0,
-        devices=_devices("(20,200) (60,320)* (60,760) (120,600) (200,80) (320,120)* (320,760) (460,720) (460,200) "
-                         "(580,520)*"),
-        start_m=(320, 460), terminal_m=(320, 460), battery=60, data_units=16_000, altitudes_m=(55, 60, 65)),
+        CityParameters(600, 800, avenue_width_m=60, avenue_spacing_m=200, street_width_m=20,
+                       block_mean_m=100, block_min_m=80, side_min_m=50, mean_height_m=15,
+                       first_block_m=(-169, -34)),
+        _devices("(20,200) (60,320)* (60,760) (120,600) (200,80) (320,120)* (320,760) (460,720) "
+                 "(460,200) (580,520)*"),
+        start_m=(320, 460), terminal_m=(320, 460), battery=60, data_units=16_000,
+        altitudes_m=(55, 60, 65)),
     "rdm": Preset(
-        CityParameters(1000, 1200, avenue_width_m=90, avenue_spacing_m=300, street_width_m=30, block_mean_m=120,
-                       block_min_m=100, side_min_m=75, side_mean_m=100, mean_height_m=30,
-                       first_block_m=(-72, -25)),
-        seed=0,
-        devices=_devices("(200,700) (280,1100)* (360,500) (460,400) (540,700)* (660,220) (600,1100) (660,800) "
-                         "(800,520)* (860,920)"),
-        start_m=(280, 300), terminal_m=(660, 920), battery=80, data_units=20_000, altitudes_m=(55, 60, 65)),
+        CityParameters(1000, 1200, avenue_width_m=90, avenue_spacing_m=300, street_width_m=30,
+                       block_mean_m=120, block_min_m=100, side_min_m=75, side_mean_m=100,
+                       mean_height_m=30, first_block_m=(-72, -25)),
+        _devices("(200,700) (280,1100)* (360,500) (460,400) (540,700)* (660,220) (600,1100) "
+                 "(660,800) (800,520)* (860,920)"),
+        start_m=(280, 300), terminal_m=(660, 920), battery=80, data_units=20_000,
+        altitudes_m=(55, 60, 65)),
     "small": Preset(
-        CityParameters(300, 300, avenue_width_m=40, avenue_spacing_m=160, street_width_m=20, block_mean_m=70,
-                       block_min_m=60, side_min_m=40, mean_height_m=18, first_block_m=(-100, -60)),
-        seed=0,
-        devices=_devices("(80,40)* (280,60) (80,200) (160,120) (280,280) (200,200)* (80,280)*"),
-        start_m=(80, 120), terminal_m=(80, 120), battery=40, data_units=8_000, altitudes_m=(55, 60)),
+        CityParameters(300, 300, avenue_width_m=40, avenue_spacing_m=160, street_width_m=20,
+                       block_mean_m=70, block_min_m=60, side_min_m=40, mean_height_m=18,
+                       first_block_m=(-100, -60)),
+        _devices("(80,40)* (280,60) (80,200) (160,120) (280,280) (200,200)* (80,280)*"),
+        start_m=(80, 120), terminal_m=(80, 120), battery=40, data_units=8_000,
+        altitudes_m=(55, 60)),
 }
 
 
 def preset_config(name: str) -> SceneConfig:
-    """The declarations of a preset.
+    """Return the `scene.toml` of a preset.
+
+    Args:
+        name: Key of `PRESETS`.
 
     Raises:
-        BadInput: no such preset.
+        BadInput: No such preset.
     """
     preset = _find(name)
+    (start_x_m, start_y_m), (terminal_x_m, terminal_y_m) = preset.start_m, preset.terminal_m
     return SceneConfig(
         name=name,
-        extent=Extent(x_min_m=0, x_max_m=preset.city.width_m, y_min_m=0, y_max_m=preset.city.depth_m),
+        extent=Extent(x_min_m=0, x_max_m=preset.city.width_m,
+                      y_min_m=0, y_max_m=preset.city.depth_m),
         lattice=LatticeConfig(step_m=20, altitudes_m=list(preset.altitudes_m)),
-        devices=[DeviceConfig(device=f"d{i}", x_m=x_m, y_m=y_m, z_m=ANTENNA_HEIGHT_M,
+        devices=[DeviceConfig(device=f"d{i}", x_m=x_m, y_m=y_m,
                               role="anchor" if anchor else "unknown")
                  for i, (x_m, y_m, anchor) in enumerate(preset.devices)],
-        uavs=[UavConfig(uav=f"uav{i}", altitude_m=altitude_m, start_x_m=preset.start_m[0],
-                        start_y_m=preset.start_m[1], terminal_x_m=preset.terminal_m[0],
-                        terminal_y_m=preset.terminal_m[1], battery=preset.battery)
+        uavs=[UavConfig(uav=f"uav{i}", altitude_m=altitude_m, start_x_m=start_x_m,
+                        start_y_m=start_y_m, terminal_x_m=terminal_x_m, terminal_y_m=terminal_y_m,
+                        battery=preset.battery)
               for i, altitude_m in enumerate(preset.altitudes_m)],
         mission=MissionConfig(data_units=preset.data_units),
         provenance={"source": f"preset:{name}", "seed": str(preset.seed),
@@ -99,32 +117,40 @@ def preset_config(name: str) -> SceneConfig:
 
 
 def preset_boxes(name: str) -> np.ndarray:
-    """The buildings of a preset: (n, 5) x_min, y_min, x_max, y_max, height [m]."""
+    """Return the buildings of a preset.
+
+    Args:
+        name: Key of `PRESETS`.
+
+    Returns:
+        (n, 5) x_min, y_min, x_max, y_max, height [m].
+
+    Raises:
+        BadInput: No such preset.
+    """
     preset = _find(name)
-    return draw_buildings(preset.city, np.array([(x_m, y_m) for x_m, y_m, _ in preset.devices]), preset.seed)
+    devices_m = np.array([(x_m, y_m) for x_m, y_m, _ in preset.devices])
+    return draw_buildings(preset.city, devices_m, preset.seed)
 
 
 def build_preset(name: str, folder: Path | str) -> None:
     """Write the scene folder of a preset.
 
-    Raises:
-        BadInput: no such preset, or the folder cannot be written or holds something else.
-    """
-    from radiotwin.scene import Scene
-    from radiotwin.scene.build import check_target
-    from radiotwin.scene.preview import draw_preview
+    Args:
+        name: Key of `PRESETS`.
+        folder: Folder to write.
 
+    Raises:
+        BadInput: No such preset, or the folder cannot be written or holds something else.
+    """
     preset, folder = _find(name), Path(folder)
     check_target(folder)
-    margin = GROUND_MARGIN_M
+    low, (x_high, y_high) = -100.0, (preset.city.width_m + 100.0, preset.city.depth_m + 100.0)
     ground = trimesh.Trimesh(
-        vertices=[[-margin, -margin, 0], [preset.city.width_m + margin, -margin, 0],
-                  [preset.city.width_m + margin, preset.city.depth_m + margin, 0],
-                  [-margin, preset.city.depth_m + margin, 0]],
+        vertices=[[low, low, 0], [x_high, low, 0], [x_high, y_high, 0], [low, y_high, 0]],
         faces=[[0, 1, 2], [0, 2, 3]], process=False)
-    concrete = Material("concrete", itu="concrete")
-    shapes = [CityShape("ground", ground, Material("asphalt_concrete", itu="asphalt_concrete"))]
-    shapes += [CityShape(f"building_{i:03d}", mesh, concrete)
+    shapes = [CityShape("ground", ground, itu_material("asphalt_concrete"))]
+    shapes += [CityShape(f"building_{i:03d}", mesh, itu_material("concrete"))
                for i, mesh in enumerate(building_meshes(preset_boxes(name)))]
     with atomic_folder(folder) as temporary:
         write_city(temporary, shapes)
@@ -132,29 +158,27 @@ def build_preset(name: str, folder: Path | str) -> None:
         draw_preview(Scene.load(temporary), temporary / "preview.png")
 
 
-def build_preset_scene(name: str, folder: Path | str, check_only: bool = False):
+def build_preset_scene(name: str, folder: Path | str, check_only: bool = False) -> BuildReport:
     """Write the scene folder of a preset, and report on it as on any other city.
 
     Args:
-        name: of the preset.
-        folder: to write.
-        check_only: build it aside, and leave nothing behind.
+        name: Key of `PRESETS`.
+        folder: Folder to write.
+        check_only: Build it in a temporary folder, and leave nothing behind.
 
-    Returns:
-        the `radiotwin.scene.report.BuildReport`.
+    Raises:
+        BadInput: No such preset, or the folder cannot be written or holds something else.
     """
-    from radiotwin.scene.build import BuildOptions, build_scene
-
     if check_only:
-        with TemporaryDirectory() as aside:
-            return replace(build_preset_scene(name, Path(aside) / name), folder=None)
+        with TemporaryDirectory() as temporary:
+            return replace(build_preset_scene(name, Path(temporary) / name), folder=None)
     build_preset(name, folder)
     config = preset_config(name)
-    report = build_scene(Path(folder) / "city.xml", folder, BuildOptions(frequency_hz=config.radio.frequency_hz),
-                         check_only=True)
-    return replace(report, source=f"preset:{name}", folder=Path(folder), extent_m=config.extent.bounds,
-                   altitudes_m=tuple(config.lattice.altitudes_m), devices=len(config.devices),
-                   uavs=len(config.uavs))
+    report = build_scene(Path(folder) / "city.xml", folder,
+                         BuildOptions(frequency_hz=config.radio.frequency_hz), check_only=True)
+    return replace(report, source=f"preset:{name}", folder=Path(folder),
+                   extent_m=config.extent.bounds, altitudes_m=tuple(config.lattice.altitudes_m),
+                   devices=len(config.devices), uavs=len(config.uavs))
 
 
 def _find(name: str) -> Preset:

@@ -1,4 +1,4 @@
-"""What is wrong with a city, said so that it can be put right."""
+"""Findings about a city, each with a message that says what was found and what to do."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,10 +12,10 @@ class Problem:
     """One finding.
 
     Attributes:
-        severity: `error`: tracing would fail; `warning`: tracing works, the result may not be what is meant;
-            `fixed`: put right in the scene that is written.
-        shape: name of the shape or material it is about, or "" for the whole city.
-        message: what was found, and what to do or what was done.
+        severity: `error`: tracing would fail; `warning`: tracing works, but the result may not be
+            the intended one; `fixed`: corrected in the scene that is written.
+        shape: Name of the shape or material concerned, or "" for the whole city.
+        message: What was found, and what to do or what was done.
     """
 
     severity: Severity
@@ -23,7 +23,22 @@ class Problem:
     message: str
 
 
+def error(message: str, shape: str = "") -> Problem:
+    """Return a finding that makes tracing fail."""
+    return Problem("error", shape, message)
+
+
+def warning(message: str, shape: str = "") -> Problem:
+    """Return a finding that leaves the scene traceable but may not be intended."""
+    return Problem("warning", shape, message)
+
+
+def fixed(message: str, shape: str = "") -> Problem:
+    """Return a finding that has been corrected."""
+    return Problem("fixed", shape, message)
+
+
 def listed(names: Sequence[str], most: int = 3) -> str:
-    """`'a', 'b', 'c' and 7 more`: names for a message about many shapes at once."""
+    """Return `'a', 'b', 'c' and 7 more`: names for a message about many shapes at once."""
     text = ", ".join(repr(name) for name in names[:most])
     return text if len(names) <= most else f"{text} and {len(names) - most} more"

@@ -1,4 +1,4 @@
-"""What was found in a city, and its printed form."""
+"""The report on a city that was built into a scene, and its printed form."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +20,11 @@ class MaterialUse:
     """A material at the scene's frequency.
 
     Attributes:
-        name: in `city.xml`.
+        name: Name in `city.xml`.
         kind: `ITU` of that name, `ITU concrete`, or `own constants`.
-        shapes: how many shapes are made of it.
-        relative_permittivity, conductivity_s_per_m: at the scene's frequency.
+        shapes: Number of shapes made of it.
+        relative_permittivity: At the scene's frequency.
+        conductivity_s_per_m: At the scene's frequency [S/m].
         in_range: False where the ITU table does not cover the frequency.
     """
 
@@ -37,22 +38,22 @@ class MaterialUse:
 
 @dataclass(frozen=True)
 class BuildReport:
-    """Result of `build_scene`.
+    """Result of `build_scene`. Only counts and problems are set where tracing would fail.
 
     Attributes:
-        source: as given.
-        folder: where the scene was written; None where it was only checked.
-        frequency_hz: of the scene [Hz].
-        shapes, triangles: as written.
+        source: As given.
+        folder: Folder of the scene; None where it was only checked.
+        frequency_hz: Frequency of the scene [Hz].
+        shapes, triangles: Numbers written.
         extent_m: (x_min, x_max, y_min, y_max) of the lattice [m].
-        tallest_m: highest point of a building above the ground datum [m]; 0 without buildings.
-        tallest: name of its shape.
-        built_fraction: share of the extent's area under buildings.
-        altitudes_m: of the lattice [m].
-        devices, uavs: how many were placed.
-        materials: in use.
-        problems: errors first.
-        facts: more lines, as (what, finding).
+        tallest_m: Highest point of a building above the ground datum [m]; 0 without buildings.
+        tallest: Name of its shape.
+        built_fraction: Share of the extent's area under buildings.
+        altitudes_m: Altitudes of the lattice [m].
+        devices, uavs: Numbers placed.
+        materials: Materials in use.
+        problems: Errors first.
+        facts: More lines, as (subject, finding).
     """
 
     source: str
@@ -60,24 +61,30 @@ class BuildReport:
     frequency_hz: float
     shapes: int
     triangles: int
-    extent_m: tuple[float, float, float, float]
-    tallest_m: float
-    tallest: str
-    built_fraction: float
-    altitudes_m: tuple[float, ...]
-    devices: int
-    uavs: int
-    materials: tuple[MaterialUse, ...]
-    problems: tuple[Problem, ...]
+    extent_m: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    tallest_m: float = 0.0
+    tallest: str = ""
+    built_fraction: float = 0.0
+    altitudes_m: tuple[float, ...] = ()
+    devices: int = 0
+    uavs: int = 0
+    materials: tuple[MaterialUse, ...] = ()
+    problems: tuple[Problem, ...] = ()
     facts: tuple[tuple[str, str], ...] = ()
 
     @property
     def tracing_would_fail(self) -> bool:
+        """Whether there is an error among the problems."""
         return any(problem.severity == "error" for problem in self.problems)
 
 
 def print_report(report: BuildReport, console: Console) -> None:
-    """Print the report as tables, the problems last."""
+    """Print the report as tables, the problems last.
+
+    Args:
+        report: Report to print.
+        console: Where to print it.
+    """
     facts = Table(title="Scene from " + escape(report.source), show_header=False, **_TITLE)
     facts.add_row("shapes, triangles", f"{report.shapes:,}, {report.triangles:,}")
     if report.altitudes_m:
@@ -90,8 +97,8 @@ def print_report(report: BuildReport, console: Console) -> None:
         altitudes = ", ".join(f"{altitude:g}" for altitude in report.altitudes_m)
         facts.add_row("lattice altitudes", altitudes + " m   (from 10 m above 95 % of the roofs)")
         facts.add_row("devices, UAVs", f"{report.devices}, {report.uavs}")
-    for what, finding in report.facts:
-        facts.add_row(what, escape(finding))
+    for subject, finding in report.facts:
+        facts.add_row(subject, escape(finding))
     console.print(facts)
     if report.materials:
         console.print(_material_table(report))
@@ -101,29 +108,19 @@ def print_report(report: BuildReport, console: Console) -> None:
 def _problem_table(report: BuildReport) -> Table:
     table = Table(title="Problems", show_header=False, show_lines=True, **_TITLE)
     for problem in report.problems:
-        table.add_row(Text(problem.severity, style=_COLOURS[problem.severity]), Text(problem.message))
+        table.add_row(Text(problem.severity, style=_COLOURS[problem.severity]),
+                      Text(problem.message))
     return table
 
 
 def _material_table(report: BuildReport) -> Table:
-    table = Table(
-        title=f"Materials at {report.frequency_hz / 1e9:g} GHz", title_justify="left", title_style="bold"
-    )
-    for heading, justify in (
-        ("material", "left"),
-        ("kind", "left"),
-        ("shapes", "right"),
-        ("relative permittivity", "right"),
-        ("conductivity [S/m]", "right"),
-    ):
-        table.add_column(heading, justify=justify)  # type: ignore[arg-type]  # one of Rich's words
+    table = Table(title=f"Materials at {report.frequency_hz / 1e9:g} GHz", **_TITLE)
+    table.add_column("material")
+    table.add_column("kind")
+    for heading in ("shapes", "relative permittivity", "conductivity [S/m]"):
+        table.add_column(heading, justify="right")
     for use in report.materials:
-        mark = "" if use.in_range else " (out of range)"
-        table.add_row(
-            use.name,
-            use.kind + mark,
-            f"{use.shapes:,}",
-            f"{use.relative_permittivity:.3f}",
-            f"{use.conductivity_s_per_m:.4g}",
-        )
+        table.add_row(use.name, use.kind + ("" if use.in_range else " (out of range)"),
+                      f"{use.shapes:,}", f"{use.relative_permittivity:.3f}",
+                      f"{use.conductivity_s_per_m:.4g}")
     return table

@@ -1,4 +1,4 @@
-"""Where a city comes from: a file, or a scene inside the installed sionna-rt package."""
+"""Sources of a city: a file, or a scene inside the installed sionna-rt package."""
 
 import re
 from importlib.util import find_spec
@@ -8,53 +8,46 @@ from radiotwin.errors import BadInput
 
 
 def sionna_scenes() -> dict[str, Path]:
-    """XML files of the scenes that come with sionna-rt, by name; found without importing it."""
+    """Return the XML files of the scenes in sionna-rt by name, without importing it."""
     spec = find_spec("sionna")
-    folders = (
-        [] if spec is None else [Path(place) / "rt" / "scenes" for place in spec.submodule_search_locations or ()]
-    )
-    return {
-        path.parent.name: path
-        for folder in folders
-        for path in sorted(folder.glob("*/*.xml"))
-        if path.stem == path.parent.name
-    }
+    roots = [] if spec is None else spec.submodule_search_locations or []
+    return {path.parent.name: path for root in roots
+            for path in sorted((Path(root) / "rt" / "scenes").glob("*/*.xml"))
+            if path.stem == path.parent.name}
 
 
 def find_source(source: Path | str) -> Path:
-    """The XML file that a source stands for.
+    """Return the XML file of a source.
 
     Args:
-        source: a path, or `sionna:NAME`.
+        source: A path, or `sionna:NAME`.
 
     Raises:
-        BadInput: unknown name (the message lists the known ones), no such file, or not XML.
+        BadInput: Unknown name (the message lists the known ones), no such file, or not XML.
     """
     text = str(source)
     if text.startswith("sionna:"):
         scenes = sionna_scenes()
         if not scenes:
-            raise BadInput(
-                f"{text}: no scenes of sionna-rt were found; install it with `pip install sionna-rt`"
-            )
+            raise BadInput(f"{text}: no scenes of sionna-rt were found; install it with "
+                           "`pip install sionna-rt`")
         name = text.removeprefix("sionna:")
         if name not in scenes:
             raise BadInput(f"{text}: sionna-rt has no scene {name!r}; it has: {', '.join(scenes)}")
         return scenes[name]
     path = Path(source)
     if not path.is_file():
-        raise BadInput(
-            f"{path} is not a file; give a map, a Mitsuba or Sionna RT scene (.xml), or sionna:NAME with one of: "
-            f"{', '.join(sionna_scenes()) or '(sionna-rt is not installed)'}"
-        )
+        raise BadInput(f"{path} is not a file; give a map, a Mitsuba or Sionna RT scene (.xml), or "
+                       "sionna:NAME with one of: "
+                       f"{', '.join(sionna_scenes()) or '(sionna-rt is not installed)'}")
     if path.suffix.lower() != ".xml":
-        raise BadInput(f"{path}: '{path.suffix}' is not read; give a map (.osm, .osm.pbf, .geojson, .gpkg) or a "
-                       "Mitsuba or Sionna RT scene (.xml)")
+        raise BadInput(f"{path}: '{path.suffix}' is not read; give a map (.osm, .osm.pbf, "
+                       ".geojson, .gpkg) or a Mitsuba or Sionna RT scene (.xml)")
     return path
 
 
 def scene_name(source: Path | str) -> str:
-    """Name of the scene made from a source, in the characters that `scene.toml` allows.
+    """Return the name of a source's scene, in the characters that `scene.toml` allows.
 
     >>> scene_name("sionna:munich"), scene_name("data/My city.xml")
     ('munich', 'My_city')

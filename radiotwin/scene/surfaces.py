@@ -1,6 +1,6 @@
-"""All triangles of a city at once: which way they face, which of them are ground, and where they meet."""
+"""All triangles of a city in one array: their sense, the ground, and the edges where they meet."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 
 import numpy as np
@@ -9,10 +9,9 @@ from scipy.sparse.csgraph import connected_components
 
 from radiotwin.scene.meshes import WELD_M
 
-FLAT_M = 0.5  # surfaces that differ by less than a kerb or a step are one level
-WALL_COSINE = 0.3
-SHEET_SHARE = 0.7
-GROUND_SHARE = 0.3
+FLAT_M = 0.5  # surfaces that differ by less than a kerb or a step are at one level [m]
+_MAX_WALL_COSINE = 0.3  # of a wall's normal to the vertical: walls lean by at most 17 degrees
+_MIN_GROUND_SHARE = 0.3  # of the city's plane that the ground covers
 
 
 class Surfaces:
@@ -23,12 +22,14 @@ class Surfaces:
 
     Attributes:
         vertices: (v, 3) [m]
-        faces: (f, 3)
-        shape: (f,) index of the mesh each face came from.
+        faces: (f, 3) indices of vertices.
+        shape: (f,) index of the mesh that each face belongs to.
+        shapes: Number of meshes.
         part: (f,) index of the connected part of its mesh, unique in the city.
+        parts: Number of connected parts.
     """
 
-    def __init__(self, meshes: Sequence[tuple[np.ndarray, np.ndarray]]):
+    def __init__(self, meshes: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
         sizes = np.array([len(vertices) for vertices, _ in meshes])
         starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
         self.vertices = np.concatenate([vertices for vertices, _ in meshes])
@@ -42,27 +43,26 @@ class Surfaces:
 
     @cached_property
     def area_vectors(self) -> np.ndarray:
-        """(f, 3) normal times area [m²]; depends on the faces' order of corners."""
+        """(f, 3) normal times area, signed by the faces' order of corners [m²]."""
         corners = self.vertices[self.faces]
         return 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
 
     @cached_property
     def areas(self) -> np.ndarray:
-        """(f,) [m²]"""
+        """(f,) areas [m²]."""
         return np.linalg.norm(self.area_vectors, axis=1)
 
     @cached_property
     def centres(self) -> np.ndarray:
-        """(f, 3) [m]"""
+        """(f, 3) centroids [m]."""
         return self.vertices[self.faces].mean(axis=1)
 
     @cached_property
     def free_edges(self) -> tuple[np.ndarray, np.ndarray]:
-        """(n, 2) edges that belong to one triangle of their mesh only, and (n,) the faces they belong to."""
+        """(n, 2) edges of only one triangle of their mesh, and (n,) the faces they belong to."""
         edges, owner = self._edges()
-        _, inverse, counts = np.unique(
-            _edge_keys(np.sort(edges, axis=1)), return_inverse=True, return_counts=True
-        )
+        _, inverse, counts = np.unique(_edge_keys(np.sort(edges, axis=1)), return_inverse=True,
+                                       return_counts=True)
         alone = counts[inverse] == 1
         return edges[alone], owner[alone]
 
@@ -70,18 +70,18 @@ class Surfaces:
         edges = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         return edges, np.repeat(np.arange(len(self.faces)), 3)
 
-    def _slices(self):
-        """Rows of faces and rows of vertices of each mesh."""
+    def _slices(self) -> Iterator[tuple[slice, slice]]:
+        """Yield the rows of faces and of vertices of each mesh."""
         rows = np.searchsorted(self.shape, np.arange(self.shapes + 1))
         ends = [*self._starts[1:], len(self.vertices)]
         for first, last, start, end in zip(rows, rows[1:], self._starts, ends):
             yield slice(first, last), slice(start, end)
 
     def meshes(self, keep: np.ndarray | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
-        """(vertices, faces) of each mesh.
+        """Return (vertices, faces) of each mesh.
 
         Args:
-            keep: (f,) bool, faces to keep (all); meshes that keep none are left out.
+            keep: (f,) bool, faces to keep; None: all. Meshes that keep none are left out.
         """
         keep = np.ones(len(self.faces), dtype=bool) if keep is None else keep
         result = []
@@ -92,22 +92,21 @@ class Surfaces:
         return result
 
     def turned(self, which: np.ndarray) -> "Surfaces":
-        """The same surfaces, the faces `which`, (f,) bool, facing the other way."""
+        """Return the surfaces with the faces `which`, (f,) bool, turned round."""
         faces = np.where(which[:, None], self.faces[:, ::-1], self.faces)
-        return Surfaces(
-            [(self.vertices[points], faces[rows] - points.start) for rows, points in self._slices()]
-        )
+        return Surfaces([(self.vertices[points], faces[rows] - points.start)
+                         for rows, points in self._slices()])
 
     def moved(self, offset_m: np.ndarray) -> "Surfaces":
-        """The same surfaces elsewhere."""
+        """Return the surfaces translated by (3,) [m]."""
         return Surfaces([(vertices + offset_m, faces) for vertices, faces in self.meshes()])
 
     def part_sum(self, values: np.ndarray) -> np.ndarray:
-        """(parts,) sum of a value per face over each part."""
+        """Return the (parts,) sums of (f,) values over the faces of each part."""
         return np.bincount(self.part, weights=values, minlength=self.parts)
 
     def part_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """(parts, 3) lowest and highest coordinates of each part [m]."""
+        """Return the (parts, 3) lowest and highest coordinates of each part [m]."""
         face_low, face_high = self.face_bounds()
         low, high = np.full((self.parts, 3), np.inf), np.full((self.parts, 3), -np.inf)
         np.minimum.at(low, self.part, face_low)
@@ -115,15 +114,19 @@ class Surfaces:
         return low, high
 
     def face_bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """(f, 3) lowest and highest coordinates of each face [m]."""
+        """Return the (f, 3) lowest and highest coordinates of each face [m]."""
         corners = self.vertices[self.faces]
         return corners.min(axis=1), corners.max(axis=1)
 
     @cached_property
+    def _upright(self) -> np.ndarray:
+        """(f,) bool: faces of walls."""
+        return np.abs(self.area_vectors[:, 2]) < _MAX_WALL_COSINE * self.areas
+
+    @cached_property
     def wall_share(self) -> np.ndarray:
-        """(parts,) share of each part's area that stands upright."""
-        upright = np.abs(self.area_vectors[:, 2]) < WALL_COSINE * self.areas
-        return self.part_sum(self.areas * upright) / self.part_sum(self.areas)
+        """(parts,) share of each part's area that is upright."""
+        return self.part_sum(self.areas * self._upright) / self.part_sum(self.areas)
 
     @cached_property
     def closed(self) -> np.ndarray:
@@ -133,20 +136,19 @@ class Surfaces:
         return closed
 
     def inconsistent_shapes(self) -> np.ndarray:
-        """Indices of meshes in which two neighbouring triangles run round in opposite senses."""
+        """Return the indices of meshes in which neighbouring triangles have opposite senses."""
         edges, owner = self._edges()
         _, inverse, counts = np.unique(_edge_keys(edges), return_inverse=True, return_counts=True)
-        _, pair, pairs = np.unique(
-            _edge_keys(np.sort(edges, axis=1)), return_inverse=True, return_counts=True
-        )
+        _, pair, pairs = np.unique(_edge_keys(np.sort(edges, axis=1)), return_inverse=True,
+                                   return_counts=True)
         return np.unique(self.shape[owner[(counts[inverse] == 2) & (pairs[pair] == 2)]])
 
     def inward(self) -> np.ndarray:
-        """(f,) bool: faces to turn round so that solids face outwards and sheets upwards.
+        """Return (f,) bool: faces to turn so that solids face outwards and sheets upwards.
 
-        The flux of (x, y, 0) through a part is twice the volume it encloses, also where a flat bottom is
-        missing, since that would add nothing. Walls without a roof are judged together within a mesh: those
-        of a courtyard rightly face inwards, and alone would seem wrong.
+        The flux of (x, y, 0) through a part is twice the volume it encloses, also where a flat
+        bottom is missing, as that would add nothing. Walls without a roof are judged together
+        within a mesh: those of a courtyard rightly face inwards, and alone would seem wrong.
         """
         middle = np.stack([self.part_sum(self.areas * axis) for axis in self.centres.T], axis=1)
         offset = self.centres - (middle / self.part_sum(self.areas)[:, None])[self.part]
@@ -162,25 +164,27 @@ class Surfaces:
         return (measure < -1e-6 * scale)[self.part]
 
     def ground_faces(self) -> np.ndarray:
-        """(f,) bool: faces of the ground (terrain, plane, streets); none when nothing looks like ground.
+        """Return (f,) bool: faces of the ground (terrain, plane, streets), none if there is none.
 
-        Ground is a sheet or slab that covers at least 30 % of the city's plane and lies no higher than half of
-        the other parts reach, and the faces at the lowest level that look upwards, where they cover as much
-        (they may be of one piece with buildings). Thin sheets at the level of a flat ground belong to it.
+        Ground is a sheet or slab that covers at least 30 % of the city's plane and lies no higher
+        than half of the other parts reach, and the upward faces at the lowest level, if they cover
+        as much (they may be of one piece with buildings). Thin sheets at the level of a flat
+        ground belong to it.
         """
         low, high = self.part_bounds()
         extent_m2 = np.prod(np.maximum((high.max(axis=0) - low.min(axis=0))[:2], 1e-9))
         flat_area = self.part_sum(np.abs(self.area_vectors[:, 2]))
         area = self.part_sum(self.areas)
-        sheet = (flat_area > SHEET_SHARE * area) & (self.wall_share < np.where(self.closed, 0.1, 0.01))
+        sheet = (flat_area > 0.7 * area) & (self.wall_share < np.where(self.closed, 0.1, 0.01))
         cover = np.minimum(flat_area, np.prod((high - low)[:, :2], axis=1))
         others = high[~sheet, 2] if (~sheet).any() else high[:, 2]
         middle = self.part_sum(self.areas * self.centres[:, 2]) / area
-        faces = (sheet & (cover >= GROUND_SHARE * extent_m2) & (middle <= np.median(others)))[self.part]
+        min_cover_m2 = _MIN_GROUND_SHARE * extent_m2
+        faces = (sheet & (cover >= min_cover_m2) & (middle <= np.median(others)))[self.part]
         face_top = self.face_bounds()[1][:, 2]
         up = self.area_vectors[:, 2] > 0.95 * self.areas
         lowest = up & (face_top <= low[:, 2].min() + FLAT_M)
-        if self.areas[lowest].sum() >= GROUND_SHARE * extent_m2:
+        if self.areas[lowest].sum() >= min_cover_m2:
             faces |= lowest
         if faces.any():
             level = face_top[faces].max()
@@ -189,34 +193,37 @@ class Surfaces:
         return faces
 
     def level_m(self, faces: np.ndarray) -> float:
-        """Height at which half of the area of the faces, (f,) bool, that look upwards lies [m]."""
+        """Return the height that halves the upward area of the faces, (f,) bool [m]."""
         up = faces & (self.area_vectors[:, 2] > 0)
         order = np.argsort(self.centres[up, 2])
         area = np.cumsum(self.areas[up][order])
         return float(self.centres[up, 2][order][np.searchsorted(area, area[-1] / 2)])
 
     def seams(self) -> np.ndarray:
-        """(n, 2) pairs of meshes of which a roof of one and a wall of the other meet in an edge."""
+        """Return (n, 2) pairs of meshes: a roof of one meets a wall of the other in an edge."""
         edges, owner = self.free_edges
         if len(edges) == 0:
             return np.zeros((0, 2), dtype=int)
-        _, place = np.unique(np.round(self.vertices / WELD_M).astype(np.int64), axis=0, return_inverse=True)
-        keys = _edge_keys(np.sort(place.reshape(-1)[edges], axis=1))
+        _, position = np.unique(np.round(self.vertices / WELD_M).astype(np.int64), axis=0,
+                                return_inverse=True)
+        keys = _edge_keys(np.sort(position.reshape(-1)[edges], axis=1))
         owner = owner[np.argsort(keys, kind="stable")]
         _, start, counts = np.unique(np.sort(keys), return_index=True, return_counts=True)
         first, second = owner[start[counts == 2]], owner[start[counts == 2] + 1]
-        upright = np.abs(self.area_vectors[:, 2]) < WALL_COSINE * self.areas
-        meets = (self.shape[first] != self.shape[second]) & (upright[first] != upright[second])
-        return np.unique(np.sort(self.shape[np.stack([first, second], axis=1)[meets]], axis=1), axis=0)
+        meets = ((self.shape[first] != self.shape[second])
+                 & (self._upright[first] != self._upright[second]))
+        pairs = self.shape[np.stack([first, second], axis=1)[meets]]
+        return np.unique(np.sort(pairs, axis=1), axis=0)
 
 
 def _labels(faces: np.ndarray, vertices: int) -> np.ndarray:
-    """(v,) label of the connected part each vertex belongs to."""
+    """Return the (v,) label of the connected part that each vertex belongs to."""
     rows, columns = faces[:, [0, 1]].reshape(-1), faces[:, [1, 2]].reshape(-1)
-    graph = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(vertices, vertices))
+    graph = coo_matrix((np.ones(len(rows), dtype=bool), (rows, columns)),
+                       shape=(vertices, vertices))
     return connected_components(graph, directed=False)[1]
 
 
 def _edge_keys(edges: np.ndarray) -> np.ndarray:
-    """One integer for each (a, b)."""
+    """Return one integer for each (a, b) of (n, 2) edges."""
     return edges[:, 0].astype(np.int64) << 32 | edges[:, 1].astype(np.int64)

@@ -12,7 +12,7 @@ from radiotwin.scene.config import UavConfig
 from radiotwin.survey.grid import MOVE_COST, FlightGrid
 from radiotwin.survey.patterns import PATTERNS
 
-MOST_FLIGHTS = 100_000
+_MAX_FLIGHTS = 100_000  # far beyond any campaign: a typing error
 
 
 def fly_survey(scene: Scene, truth: RadioMap, *, flights: int, pattern: str, seed: int,
@@ -20,24 +20,28 @@ def fly_survey(scene: Scene, truth: RadioMap, *, flights: int, pattern: str, see
     """Fly and measure.
 
     Args:
-        scene: its UAVs, devices and sensitivity.
-        truth: map over the scene's lattice; where it has `sigma_db`, shadowing is drawn anew for every link.
-        flights: number of flights; in each, every UAV of the scene flies once.
-        pattern: a key of `PATTERNS`.
-        seed: of paths and noise; the n-th flight does not depend on how many there are.
-        noise_db: standard deviation of the receiver's measurement error [dB].
+        scene: UAVs, devices and sensitivity.
+        truth: Map over the scene's lattice; where it has `sigma_db`, shadowing is drawn anew for
+            every link.
+        flights: Number of flights; in each, every UAV of the scene flies once.
+        pattern: Key of `PATTERNS`.
+        seed: Seed of paths and noise; the n-th flight does not depend on the number of flights.
+        noise_db: Standard deviation of the receiver's measurement error [dB].
+
+    Returns:
+        The measurements; unknown devices are without x and y.
 
     Raises:
-        BadInput: an unknown pattern, no flight, no UAV, or a map that belongs to another scene.
+        BadInput: An unknown pattern, no flight, no UAV, or a map of another scene.
     """
     _check(scene, truth, flights, pattern, noise_db)
     limit_db = scene.config.gain_limit_db
     rows = [truth.devices.index(device.device) for device in scene.config.devices]
     gain_db = truth.gain_db[rows].reshape(len(rows), -1).astype(float)
-    shadowing_db = None
+    shadowing_sd_db = None
     if "sigma_db" in truth.dataset:
-        shadowing_db = truth.dataset["sigma_db"].values[rows].reshape(gain_db.shape)
-    slot_s, start_s, parts = scene.config.mission.slot_s, 0.0, []
+        shadowing_sd_db = truth.dataset["sigma_db"].values[rows].reshape(gain_db.shape)
+    slot_s, start_s, tables = scene.config.mission.slot_s, 0.0, []
     with progress("flying", total=flights) as advance:
         for flight in range(flights):
             longest = 0
@@ -46,50 +50,84 @@ def fly_survey(scene: Scene, truth: RadioMap, *, flights: int, pattern: str, see
                 cells = fly(scene, uav, pattern, rng)
                 index = _lattice_index(scene, uav, cells)
                 level_db = gain_db[:, index] + rng.normal(0, noise_db, (len(gain_db), len(index)))
-                if shadowing_db is not None:
-                    level_db += rng.normal(0, 1, level_db.shape) * shadowing_db[:, index]
+                if shadowing_sd_db is not None:
+                    level_db += rng.normal(0, 1, level_db.shape) * shadowing_sd_db[:, index]
                 level_db[level_db < limit_db] = np.nan
                 time_s = start_s + slot_s * np.arange(len(index))
-                parts.append(link_table(scene, f"f{flight}", uav.uav, index, level_db, time_s, heading_deg(cells)))
+                tables.append(link_table(scene, f"f{flight}", uav.uav, index, level_db, time_s,
+                                         heading_deg(cells)))
                 longest = max(longest, len(index))
             start_s += slot_s * longest
             advance(1)
-    return Measurements(pd.concat(parts, ignore_index=True), declared_devices(scene))
+    return Measurements(pd.concat(tables, ignore_index=True), declared_devices(scene))
 
 
 def declared_devices(scene: Scene) -> pd.DataFrame:
-    """What a survey may tell of the devices: all positions of anchors, only the height of unknown ones."""
-    rows = [(d.device, *((d.x_m, d.y_m) if d.role == "anchor" else (np.nan, np.nan)), d.z_m, d.role)
-            for d in scene.config.devices]
+    """Return the devices as a survey knows them: unknown ones with their height only.
+
+    Args:
+        scene: Scene that declares them.
+
+    Returns:
+        Rows of `devices.csv`: device, x_m, y_m, z_m, role.
+    """
+    rows = [(device.device,
+             *((device.x_m, device.y_m) if device.role == "anchor" else (np.nan, np.nan)),
+             device.z_m, device.role)
+            for device in scene.config.devices]
     return pd.DataFrame(rows, columns=["device", "x_m", "y_m", "z_m", "role"])
 
 
 def fly(scene: Scene, uav: UavConfig, pattern: str, rng: np.random.Generator) -> np.ndarray:
-    """One flight of one UAV: (slots, 2) cells (row, column) from its start to its terminal.
+    """Fly one UAV once.
+
+    Args:
+        scene: City and lattice.
+        uav: Its altitude, start, terminal and battery.
+        pattern: Key of `PATTERNS`.
+        rng: Source of the path.
+
+    Returns:
+        (slots, 2) cells (row, column) from its start to its terminal.
 
     Raises:
-        BadInput: the battery does not reach from the start to the terminal.
+        BadInput: The battery does not reach from the start to the terminal.
     """
     lattice = scene.lattice
-    level = int(np.abs(lattice.z_m - uav.altitude_m).argmin())
-    start, terminal = ((round((y_m - lattice.y_m[0]) / lattice.step_m), round((x_m - lattice.x_m[0]) / lattice.step_m))
-                       for x_m, y_m in ((uav.start_x_m, uav.start_y_m), (uav.terminal_x_m, uav.terminal_y_m)))
-    grid = FlightGrid(~scene.blocked[level], terminal)
+    start, terminal = ((round((y_m - lattice.y_m[0]) / lattice.step_m),
+                        round((x_m - lattice.x_m[0]) / lattice.step_m))
+                       for x_m, y_m in ((uav.start_x_m, uav.start_y_m),
+                                        (uav.terminal_x_m, uav.terminal_y_m)))
+    grid = FlightGrid(~scene.blocked[_level(scene, uav)], terminal)
     needed = grid.steps_home(start) * MOVE_COST
     if needed > uav.battery:
-        raise BadInput(f"uav {uav.uav!r}: battery = {uav.battery:g} does not reach from its start to its terminal "
-                       f"({needed:g} moves are needed); raise it in {scene.folder / 'scene.toml'}")
+        raise BadInput(f"uav {uav.uav!r}: battery = {uav.battery:g} does not reach from its start "
+                       f"to its terminal ({needed:g} moves are needed); raise it in "
+                       f"{scene.folder / 'scene.toml'}")
     return np.array(PATTERNS[pattern](grid, start, uav.battery, rng))
 
 
+def _level(scene: Scene, uav: UavConfig) -> int:
+    """Return the index of a UAV's altitude."""
+    return int(np.abs(scene.lattice.z_m - uav.altitude_m).argmin())
+
+
 def _lattice_index(scene: Scene, uav: UavConfig, cells: np.ndarray) -> np.ndarray:
-    level = int(np.abs(scene.lattice.z_m - uav.altitude_m).argmin())
-    return np.ravel_multi_index((np.full(len(cells), level), cells[:, 0], cells[:, 1]), scene.lattice.shape)
+    level = np.full(len(cells), _level(scene, uav))
+    return np.ravel_multi_index((level, cells[:, 0], cells[:, 1]), scene.lattice.shape)
 
 
 def heading_deg(cells: np.ndarray) -> np.ndarray:
-    """Heading along (slots, 2) cells (row, column), clockwise from north: that of the move that led here; a hover keeps
-    it, the first slot has that of the next move."""
+    """Return the heading along a flight, clockwise from north.
+
+    It is that of the last move; the first slot has that of the next move.
+
+    Args:
+        cells: (slots, 2) cells (row, column).
+
+    Returns:
+        (slots,) headings [degrees]; 0 where the UAV never moves.
+    """
     moves = np.diff(cells, axis=0)
     heading = pd.Series(np.full(len(cells), np.nan))
     moved = np.flatnonzero(moves.any(axis=1))
@@ -97,23 +135,26 @@ def heading_deg(cells: np.ndarray) -> np.ndarray:
     return heading.ffill().bfill().fillna(0.0).to_numpy()
 
 
-def link_table(scene: Scene, flight: str, receiver: str, index: np.ndarray, level_db: np.ndarray, time_s: np.ndarray,
-               heading_deg: np.ndarray) -> pd.DataFrame:
-    """What one receiver measured on one flight, as rows of `Measurements.table`.
+def link_table(scene: Scene, flight: str, receiver: str, index: np.ndarray, level_db: np.ndarray,
+               time_s: np.ndarray, heading_deg: np.ndarray) -> pd.DataFrame:
+    """Return the measurements of one receiver on one flight as rows of `Measurements.table`.
 
     Args:
-        scene: names the devices.
-        flight, receiver: names.
+        scene: Names and order of the devices.
+        flight: Name of the flight.
+        receiver: Name of the receiver.
         index: (slots,) flat lattice index of the positions.
-        level_db: (devices, slots) gain, NaN where not detected [dB].
-        time_s, heading_deg: (slots,)
+        level_db: (devices, slots) gain [dB], NaN where not detected.
+        time_s: (slots,) times [s].
+        heading_deg: (slots,) headings [degrees].
     """
     devices, slots = len(level_db), len(index)
     position_m = scene.lattice.positions_m[index]
     return pd.DataFrame({
         "time_s": np.repeat(time_s, devices), "flight": flight, "receiver": receiver,
-        **{f"receiver_{axis}_m": np.repeat(position_m[:, i], devices) for i, axis in enumerate("xyz")},
-        "device": np.tile([d.device for d in scene.config.devices], slots),
+        **{f"receiver_{axis}_m": np.repeat(position_m[:, i], devices)
+           for i, axis in enumerate("xyz")},
+        "device": np.tile([device.device for device in scene.config.devices], slots),
         "gain_db": level_db.T.ravel().round(3), "heading_deg": np.repeat(heading_deg, devices),
     })
 
@@ -122,15 +163,15 @@ def _check(scene: Scene, truth: RadioMap, flights: int, pattern: str, noise_db: 
     path = scene.folder / "scene.toml"
     if pattern not in PATTERNS:
         raise BadInput(f"pattern {pattern!r} is unknown; allowed are {', '.join(PATTERNS)}")
-    if not 1 <= flights <= MOST_FLIGHTS:
-        raise BadInput(f"flights = {flights}: allowed is 1 to {MOST_FLIGHTS}")
+    if not 1 <= flights <= _MAX_FLIGHTS:
+        raise BadInput(f"flights = {flights}: allowed is 1 to {_MAX_FLIGHTS}")
     if not 0 <= noise_db < np.inf:
         raise BadInput(f"noise_db = {noise_db}: a standard deviation is a finite number, 0 or more")
     if not scene.config.uavs:
-        raise BadInput(f"{path}: declares no UAV; add at least one [[uavs]] table, or build the scene with "
-                       "--uavs N")
+        raise BadInput(f"{path}: declares no UAV; add at least one [[uavs]] table, or build the "
+                       "scene with --uavs N")
     if not scene.config.devices:
         raise BadInput(f"{path}: declares no device; add some, each as a table\n\n"
-                       "[[devices]]\ndevice = 'd0'\nx_m = 10.0\ny_m = 20.0\nz_m = 1.5\nrole = 'anchor'\n\n"
-                       "or build the scene with --devices N")
+                       "[[devices]]\ndevice = 'd0'\nx_m = 10.0\ny_m = 20.0\nz_m = 1.5\n"
+                       "role = 'anchor'\n\nor build the scene with --devices N")
     scene.check_map(truth)

@@ -1,4 +1,4 @@
-"""Ray tracing with Sionna RT: the physical truth. Needs libLLVM; importing this package does not."""
+"""Ray tracing with Sionna RT: the physical truth. Tracing needs libLLVM; importing does not."""
 
 from radiotwin.trace.points import read_points, trace_gains, trace_points
 from radiotwin.trace.run import trace_map

@@ -1,8 +1,9 @@
-"""Finished batches of a trace on disk, so that an interrupted one goes on where it was."""
+"""Finished batches of a trace on disk, so that an interrupted one can be resumed."""
 
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,11 +14,15 @@ class BatchStore:
     """A folder of arrays that belong to one key.
 
     Args:
-        root: parent folder.
-        key: everything that decides the arrays; whatever differs in anything goes to another folder.
+        root: Parent folder.
+        key: Everything that decides the arrays; different keys have different folders.
+
+    Attributes:
+        hash: SHA-256 of the key.
+        folder: The folder.
     """
 
-    def __init__(self, root: Path, key: dict):
+    def __init__(self, root: Path, key: dict[str, Any]) -> None:
         text = json.dumps(key, sort_keys=True, indent=1)
         self.hash = hashlib.sha256(text.encode()).hexdigest()
         self.folder = root / f"trace-{self.hash[:12]}"
@@ -26,7 +31,15 @@ class BatchStore:
                 temporary.write_text(text + "\n", encoding="utf-8")
 
     def get(self, name: str, size: int) -> np.ndarray | None:
-        """The array (size,) of that name; None where it is absent or damaged."""
+        """Read an array.
+
+        Args:
+            name: Name that it was saved under.
+            size: Its length.
+
+        Returns:
+            (size,) array; None where it is absent or damaged.
+        """
         try:
             array = np.load(self.folder / f"{name}.npy", allow_pickle=False)
         except (OSError, ValueError, EOFError):
@@ -34,6 +47,11 @@ class BatchStore:
         return array if array.shape == (size,) else None
 
     def put(self, name: str, array: np.ndarray) -> None:
-        """Save an array, whole or not at all."""
+        """Save an array, completely or not at all.
+
+        Args:
+            name: Name in the store.
+            array: One-dimensional array.
+        """
         with atomic_path(self.folder / f"{name}.npy") as temporary:
             np.save(temporary, array, allow_pickle=False)

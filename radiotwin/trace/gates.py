@@ -1,29 +1,51 @@
 """Checks that every traced map must pass before it is kept."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import RunFailed
 
-# The power of an LoS link is that of the direct path plus that of each reflected or diffracted one. None of them
-# is stronger than the direct path, as each is longer and loses power where it turns; over a city there are
-# rarely more than the ground and two walls that come close. So the median LoS link lies 0 to 3 dB above free
-# space, and none 10 dB (nine more paths as strong as the direct one). The fields of the same paths may also
-# cancel (no lower bound) or add up to 20 dB.
-LOS_MEDIAN_EXCESS_DB = (-0.5, 3.0)
-LOS_LOWEST_EXCESS_DB = -0.5
-LOS_HIGHEST_EXCESS_DB = {"power": 10.0, "coherent": 20.0}
-# The map decides LoS by a ray test of its own; where a ray grazes an edge the two tests may differ.
-LOS_DISAGREEMENT = 0.005
-LOS_DISAGREEMENT_LINKS = 3  # so few prove nothing, however small the map
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits of physics for LoS links, relative to free space.
+
+    The power of an LoS link is that of the direct path plus that of each reflected or diffracted
+    one. None of them is stronger than the direct path, as each is longer and loses power at every
+    interaction; over a city there are rarely more than the ground and two walls that come close. So
+    the median LoS link lies 0 to 3 dB above free space, and none 10 dB (nine more paths as strong
+    as the direct one). The fields of the same paths may also cancel (no lower bound) or add up to
+    20 dB. The 0.5 dB below allow for numerical noise.
+
+    Attributes:
+        median_excess_db: Lowest and highest median.
+        min_excess_db: Lowest gain of a link that the tracer sees in LoS.
+        max_power_excess_db: Highest gain of one link, powers added.
+        max_field_excess_db: Highest gain of one link, fields added.
+        max_dark_share: Share of LoS links that may lie below: the map decides LoS by a ray test of
+            its own, and where a ray grazes an edge the two tests may differ.
+        max_dark_links: Number of such links that is accepted however small the map.
+    """
+
+    median_excess_db: tuple[float, float] = (-0.5, 3.0)
+    min_excess_db: float = -0.5
+    max_power_excess_db: float = 10.0
+    max_field_excess_db: float = 20.0
+    max_dark_share: float = 0.005
+    max_dark_links: int = 3
+
+
+_LIMITS = _Limits()
 
 
 def free_space_gain_db(distance_m: np.ndarray, frequency_hz: float) -> np.ndarray:
-    """Friis' gain between isotropic antennas (ITU-R P.525-4, eq. 4) [dB].
+    """Return Friis' gain between isotropic antennas (ITU-R P.525-4, eq. 4) [dB].
 
     Args:
-        distance_m: distances [m], any shape.
-        frequency_hz: frequency [Hz].
+        distance_m: Distances, any shape [m].
+        frequency_hz: Frequency [Hz].
     """
     return 20 * np.log10(speed_of_light / (4 * np.pi * frequency_hz * np.asarray(distance_m)))
 
@@ -31,52 +53,61 @@ def free_space_gain_db(distance_m: np.ndarray, frequency_hz: float) -> np.ndarra
 def check_gains(gain_db: np.ndarray, los: np.ndarray, distance_m: np.ndarray, frequency_hz: float,
                 solver: str, combining: str, direct_dbi: np.ndarray | float = 0.0,
                 peak_dbi: np.ndarray | float = 0.0) -> dict[str, float]:
-    """Check raw gains against what physics allows.
+    """Check raw gains against the limits of physics.
+
+    With antennas, a link is no weaker than its direct path, and no stronger than if all its paths
+    left and arrived in the directions of the antennas' peaks.
 
     Args:
-        gain_db: (n,) gain of links; NaN = no path.
+        gain_db: (n,) gain of links [dB]; NaN: no path.
         los: (n,) bool line of sight by the 3D map.
         distance_m: (n,) lengths of the links [m].
-        frequency_hz: frequency [Hz].
-        solver, combining: as in `SolverSettings`.
-        direct_dbi, peak_dbi: (n,) what the antennas of both ends add along the straight line, and at most [dB]; zero
-            where both are isotropic. A link is no weaker than its direct path, and no stronger than if all its paths
-            met the antennas at their best.
+        frequency_hz: Frequency [Hz].
+        solver: As in `SolverSettings`.
+        combining: As in `SolverSettings`.
+        direct_dbi: (n,) gain of both antennas along the straight line [dBi].
+        peak_dbi: (n,) highest gain of both antennas [dBi].
 
     Returns:
         Figures for the map's attributes.
 
     Raises:
-        RunFailed: a gain above 0 dB, no path at all, or LoS links that are far from free space.
+        RunFailed: A gain above 0 dB, no path at all, or LoS links that are far from free space.
     """
     found = np.isfinite(gain_db)
     if not found.any():
-        raise RunFailed(f"none of {gain_db.size} links has a path; check that the devices are outdoors and that the "
-                        "lattice lies over the city, or trace with more samples or depth")
+        raise RunFailed(f"none of {gain_db.size} links has a path; check that the devices are "
+                        "outdoors and that the lattice lies over the city, or trace with more "
+                        "samples or depth")
     if np.nanmax(gain_db) > 0:
         worst = int(np.nanargmax(gain_db))
-        raise RunFailed(f"a link of {distance_m[worst]:.3g} m has a gain of {gain_db[worst]:.1f} dB: more power would "
-                        "arrive than was sent; is a receiver within a wavelength of a device?")
+        raise RunFailed(f"a link of {distance_m[worst]:.3g} m has a gain of {gain_db[worst]:.1f} "
+                        "dB: more power would arrive than was sent; is a receiver within a "
+                        "wavelength of a device?")
     figures: dict[str, float] = {"links": int(gain_db.size), "links_with_path": int(found.sum()),
                                  "links_los": int(los.sum())}
     if not los.any():
         return figures
     above_db = np.where(found, gain_db, -np.inf) - free_space_gain_db(distance_m, frequency_hz)
-    excess_db, most_db = (above_db - direct_dbi)[los], (above_db - peak_dbi)[los]
-    median_db, highest_db = float(np.median(excess_db)), float(most_db.max())
-    too_low = float(np.mean(excess_db < LOS_LOWEST_EXCESS_DB))
+    excess_db, peak_excess_db = (above_db - direct_dbi)[los], (above_db - peak_dbi)[los]
+    median_db, highest_db = float(np.median(excess_db)), float(peak_excess_db.max())
+    dark_share = float(np.mean(excess_db < _LIMITS.min_excess_db))
     figures |= {"los_excess_median_db": median_db, "los_excess_highest_db": highest_db,
-                "los_below_free_space_share": too_low}
-    low_db, high_db = LOS_MEDIAN_EXCESS_DB
-    bound_db = LOS_HIGHEST_EXCESS_DB[combining]
-    if (median_db < low_db or np.median(most_db) > high_db) and combining == "power":
-        raise RunFailed(f"LoS links lie {median_db:+.1f} dB from free space in the median; {low_db:+.1f} to "
-                        f"{high_db:+.1f} dB is possible: is city.xml in metres, and its ground below the devices?")
+                "los_below_free_space_share": dark_share}
+    powers = combining == "power"
+    low_db, high_db = _LIMITS.median_excess_db
+    if powers and (median_db < low_db or np.median(peak_excess_db) > high_db):
+        raise RunFailed(f"LoS links lie {median_db:+.1f} dB from free space in the median; "
+                        f"{low_db:+.1f} to {high_db:+.1f} dB is possible: is city.xml in metres, "
+                        "and its ground below the devices?")
+    bound_db = _LIMITS.max_power_excess_db if powers else _LIMITS.max_field_excess_db
     if solver == "paths" and highest_db > bound_db:
-        raise RunFailed(f"an LoS link lies {highest_db:+.1f} dB above free space; at most {bound_db:+.1f} dB is "
-                        "possible: are there surfaces in city.xml that lie on one another?")
-    if solver == "paths" and combining == "power" and too_low > LOS_DISAGREEMENT \
-            and too_low * len(excess_db) > LOS_DISAGREEMENT_LINKS:
-        raise RunFailed(f"{100 * too_low:.1f} % of the links that have LoS by the 3D map are weaker than free space, "
-                        f"{100 * LOS_DISAGREEMENT:.1f} % may be: the ray tracer and the map do not see the same city")
+        raise RunFailed(f"an LoS link lies {highest_db:+.1f} dB above free space; at most "
+                        f"{bound_db:+.1f} dB is possible: are there surfaces in city.xml that lie "
+                        "on one another?")
+    if (solver == "paths" and powers and dark_share > _LIMITS.max_dark_share
+            and dark_share * len(excess_db) > _LIMITS.max_dark_links):
+        raise RunFailed(f"{100 * dark_share:.1f} % of the links that have LoS by the 3D map are "
+                        f"weaker than free space, {100 * _LIMITS.max_dark_share:.1f} % may be: the "
+                        "ray tracer and the map do not see the same city")
     return figures

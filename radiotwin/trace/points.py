@@ -18,65 +18,62 @@ from radiotwin.trace.run import device_indices
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import PathGains
 
-COLUMNS = ["x_m", "y_m", "z_m"]
-GEOGRAPHIC = ["latitude_deg", "longitude_deg", "z_m"]
-# Within a wavelength there is no far field, and Sionna RT loses the direct path at a centimetre.
-REASONS = ["below the ground", "inside a building", "within a wavelength", "no path", "below sensitivity"]
-MOST_DEG = {"latitude_deg": 90, "longitude_deg": 180}
-
 
 def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settings: SolverSettings,
                 antennas: list[Antenna | None] | None = None) -> np.ndarray:
-    """Gains between positions in a scene's city. Receivers have the antenna of the scene's UAVs.
+    """Trace the gains between positions; receivers have the antenna of the scene's UAVs.
 
     Args:
-        scene: city and frequency.
+        scene: City and frequency.
         device_m: (k, 3) positions of transmitters [m].
         points_m: (n, 3) positions of receivers [m].
-        settings: with solver `paths`.
-        antennas: of the k transmitters; None: isotropic.
+        settings: Settings with solver `paths`.
+        antennas: Antennas of the k transmitters; None: isotropic.
 
     Returns:
         (k, n) gain [dB]; NaN where there is no path.
 
     Raises:
-        BadInput: settings for another solver, or a scene that cannot be read.
-        RunFailed: no usable libLLVM.
+        BadInput: Settings for another solver, or a scene that cannot be read.
+        RunFailed: No usable libLLVM.
     """
     if settings.solver != "paths":
-        raise BadInput(f"the solver {settings.solver!r} averages over lattice cells; points need the solver 'paths'")
+        raise BadInput(f"the solver {settings.solver!r} averages over lattice cells; points need "
+                       "the solver 'paths'")
     solver = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings)
     gain_db = np.full((len(device_m), len(points_m)), np.nan)
     with progress("tracing", total=gain_db.size) as advance:
         for row, (one_m, antenna) in enumerate(zip(device_m, antennas or [None] * len(device_m))):
-            for part in solver.batches(len(points_m)):
-                gain_db[row, part] = solver.solve(one_m, points_m[part], (antenna, scene.uav_antenna))
-                advance(part.stop - part.start)
+            gain_db[row] = solver.gains(one_m, points_m, (antenna, scene.uav_antenna), advance)
     return gain_db
 
 
-def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings, out_path: Path | str | None = None,
-                 devices: list[str] | None = None) -> pd.DataFrame:
-    """Gains from a scene's devices to any points.
+def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings,
+                 out_path: Path | str | None = None, devices: list[str] | None = None
+                 ) -> pd.DataFrame:
+    """Trace the gains from a scene's devices to any points.
 
     Args:
-        scene: city, devices and radio.
+        scene: City, devices and radio.
         points_m: (n, 3) positions [m].
-        settings: with solver `paths`.
+        settings: Settings with solver `paths`.
         out_path: CSV file (.csv or .csv.gz); None writes nothing.
-        devices: names; all devices of the scene by default.
+        devices: Names; None: all devices of the scene.
 
     Returns:
-        One row a link: device, x_m, y_m, z_m, gain_db (NaN = not detected), los, and reason: empty, or why there
-        is no gain, one of `REASONS`.
+        One row per link: device, x_m, y_m, z_m, gain_db (NaN: not detected), los, and reason:
+        empty, or why there is no gain: below the ground, inside a building, within a wavelength
+        (no far field, and Sionna RT drops the direct path at a centimetre), no path, or below
+        sensitivity.
 
     Raises:
-        BadInput: an unknown device, settings for another solver, or an output that cannot be written.
-        RunFailed: no usable libLLVM.
+        BadInput: An unknown device, settings for another solver, or an output that cannot be
+            written.
+        RunFailed: No usable libLLVM.
     """
-    if out_path is not None and not str(out_path).endswith((".csv", ".csv.gz")):
-        raise BadInput(f"{out_path}: unknown format; allowed are .csv and .csv.gz")
     if out_path is not None:
+        if not str(out_path).endswith((".csv", ".csv.gz")):
+            raise BadInput(f"{out_path}: unknown format; allowed are .csv and .csv.gz")
         require_writable(out_path)
     index = device_indices(scene, devices)
     inside = scene.city.inside(points_m)
@@ -85,13 +82,18 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings, o
     gain_db = trace_gains(scene, scene.device_m[index], points_m, settings, antennas)
     tables = []
     for row, device in enumerate(index):
-        near = np.linalg.norm(points_m - scene.device_m[device], axis=1) < wavelength_m
-        reason = np.select([inside & (points_m[:, 2] < 0), inside, near, np.isnan(gain_db[row]),
-                            gain_db[row] < scene.config.gain_limit_db], REASONS, default="")
+        device_m = scene.device_m[device]
+        near = np.linalg.norm(points_m - device_m, axis=1) < wavelength_m
+        reason = np.select(
+            [inside & (points_m[:, 2] < 0), inside, near, np.isnan(gain_db[row]),
+             gain_db[row] < scene.config.gain_limit_db],
+            ["below the ground", "inside a building", "within a wavelength", "no path",
+             "below sensitivity"], default="")
         tables.append(pd.DataFrame({
-            "device": scene.config.devices[device].device, "x_m": points_m[:, 0], "y_m": points_m[:, 1],
-            "z_m": points_m[:, 2], "gain_db": np.where(reason == "", gain_db[row], np.nan),
-            "los": scene.city.line_of_sight(scene.device_m[device][None], points_m), "reason": reason}))
+            "device": scene.config.devices[device].device,
+            "x_m": points_m[:, 0], "y_m": points_m[:, 1], "z_m": points_m[:, 2],
+            "gain_db": np.where(reason == "", gain_db[row], np.nan),
+            "los": scene.city.line_of_sight(device_m[None], points_m), "reason": reason}))
     table = pd.concat(tables, ignore_index=True)
     if out_path is not None:
         with atomic_path(out_path) as temporary:
@@ -103,42 +105,44 @@ def read_points(path: Path | str, origin: Origin | None = None) -> np.ndarray:
     """Read points from a CSV file; columns other than those of the position are ignored.
 
     Args:
-        path: file with the columns x_m, y_m and z_m, or latitude_deg, longitude_deg and z_m (above the ground datum).
-        origin: of the local frame, which latitude and longitude need.
+        path: File with the columns x_m, y_m and z_m, or latitude_deg, longitude_deg and z_m (above
+            the ground datum).
+        origin: Origin of the local frame, which latitude and longitude need.
 
     Returns:
         (n, 3) positions [m].
 
     Raises:
-        BadInput: no such file, a missing column, no rows, a cell that is not a finite number, or latitudes where
-            there is no origin.
+        BadInput: No such file, a missing column, no rows, a cell that is not a finite number, or
+            latitudes where there is no origin.
     """
     path = Path(path)
     raw = read_cells(path)
-    geographic = "x_m" not in raw and GEOGRAPHIC[0] in raw
-    wanted = GEOGRAPHIC if geographic else COLUMNS
-    missing = [name for name in wanted if name not in raw]
+    geographic = "x_m" not in raw and "latitude_deg" in raw
+    columns = (["latitude_deg", "longitude_deg", "z_m"] if geographic else ["x_m", "y_m", "z_m"])
+    missing = [name for name in columns if name not in raw]
     if missing:
-        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {wanted}, it has {list(raw.columns)}")
+        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {columns}, it has "
+                       f"{list(raw.columns)}")
     if raw.empty:
         raise BadInput(f"{path}: has no rows; it needs at least one point")
-    if geographic and origin is None:
-        raise BadInput(f"{path} gives latitude and longitude, and the scene has no [origin] in scene.toml; add one, or "
-                       "give x_m and y_m")
-    points = np.column_stack([_numbers(path, raw, name) for name in wanted])
+    points = np.column_stack([_numbers(path, raw, name) for name in columns])
     if geographic:
-        assert origin is not None  # said above
+        if origin is None:
+            raise BadInput(f"{path} gives latitude and longitude, and the scene has no [origin] in "
+                           "scene.toml; add one, or give x_m and y_m")
         points[:, :2] = np.column_stack(to_local(origin, points[:, 1], points[:, 0]))
     return points
 
 
 def _numbers(path: Path, raw: pd.DataFrame, name: str) -> np.ndarray:
-    """(n,) finite numbers of a column; degrees within their range."""
+    """Return the (n,) finite numbers of a column; degrees within their range."""
     values = pd.to_numeric(raw[name].astype(str).str.strip(), errors="coerce").to_numpy(dtype=float)
-    most = MOST_DEG.get(name, np.inf)
-    bad = ~np.isfinite(values) | (np.abs(values) > most)
+    limit = {"latitude_deg": 90, "longitude_deg": 180}.get(name, np.inf)
+    bad = ~np.isfinite(values) | (np.abs(values) > limit)
     if bad.any():
         row = int(np.flatnonzero(bad)[0])
-        allowed = "a finite number [m]" if np.isinf(most) else f"a number from -{most} to {most} [degrees]"
+        allowed = ("a finite number [m]" if np.isinf(limit) else
+                   f"a number from -{limit} to {limit} [degrees]")
         raise BadInput(f"{path}: row {row + 2}, column {name}: {raw[name][row]!r} is not {allowed}")
     return values

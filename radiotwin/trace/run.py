@@ -2,6 +2,7 @@
 
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,65 +22,74 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
               devices: list[str] | None = None) -> RadioMap:
     """Trace the radio map of a scene's lattice and write it.
 
-    Each finished batch is kept in the scene's `cache/trace-<hash>`, named by the hash of all that decides a gain.
-    Run again after a kill, the trace goes on behind the last finished batch and gives the same map to the bit;
-    run again when it is finished, it solves nothing.
+    Each finished batch is kept in the scene's `cache/trace-<hash>`, named by the hash of all that
+    decides a gain. Run again after a kill, the trace resumes after the last finished batch and
+    gives the same map to the bit; run again when it is finished, it solves nothing.
 
     Args:
-        scene: city, devices and lattice.
-        settings: of the solver.
-        out_path: NetCDF file.
-        devices: names, in the map's order; all devices of the scene by default.
+        scene: City, devices and lattice.
+        settings: Settings of the solver.
+        out_path: NetCDF file to write.
+        devices: Names, in the map's order; None: all devices of the scene.
 
     Returns:
-        The map: gain [dB], NaN where there is no path, the gain is below the receiver's sensitivity, or the
-        position is inside a building; the counts of each are attributes.
+        The map: gain [dB], NaN where there is no path, the gain is below the receiver's
+        sensitivity, or the position is inside a building; the counts of each are attributes.
 
     Raises:
-        BadInput: no device, an unknown one, a scene that cannot be read, or an output that cannot be written.
-        RunFailed: no usable libLLVM, or gains that physics does not allow. Nothing is written then.
+        BadInput: No device, an unknown one, a scene that cannot be read, or an output that cannot
+            be written.
+        RunFailed: No usable libLLVM, or gains that physics does not allow. Nothing is written then.
     """
     index = device_indices(scene, devices)
     require_writable(out_path)
-    positions_m = scene.lattice.positions_m
-    device_m = scene.device_m[index]
+    names = [scene.config.devices[i].device for i in index]
     key = _key(scene, settings)
     store = BatchStore(scene.folder / "cache", key)
-    finished = _finished(Path(out_path), store.hash, [scene.config.devices[i].device for i in index])
+    finished = _finished(Path(out_path), store.hash, names)
     if finished is not None:
-        placed = finished.placed(scene.config.origin)  # of no account for the gains
+        placed = finished.placed(scene.config.origin)  # the origin does not change the gains
         if placed.dataset.attrs != finished.dataset.attrs:
             placed.write(out_path)
         return placed
     raw_db = solve_lattice(scene, settings, store, index)
 
+    positions_m, device_m = scene.lattice.positions_m, scene.device_m[index]
     los = np.stack([scene.city.line_of_sight(one_m[None], positions_m) for one_m in device_m])
     inside = scene.blocked.ravel()
     distance_m = np.linalg.norm(device_m[:, None, :] - positions_m[None], axis=2)
     frequency_hz = scene.config.radio.frequency_hz
-    direct_dbi, peak_dbi = antenna_gains(scene, index)
+    direct_dbi, peak_dbi = _antenna_gains(scene, index)
+
+    def outdoors(values: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(values, raw_db.shape)[:, ~inside].ravel()
+
     figures: dict[str, float | str] = dict(
-        check_gains(raw_db[:, ~inside].ravel(), los[:, ~inside].ravel(), distance_m[:, ~inside].ravel(), frequency_hz,
-                    settings.solver, settings.combining, direct_dbi[:, ~inside].ravel(),
-                    np.broadcast_to(peak_dbi, raw_db.shape)[:, ~inside].ravel()))
+        check_gains(outdoors(raw_db), outdoors(los), outdoors(distance_m), frequency_hz,
+                    settings.solver, settings.combining, outdoors(direct_dbi), outdoors(peak_dbi)))
     limit_db = scene.config.gain_limit_db
     gain_db, counts = _censor(raw_db, inside, limit_db)
     rows, columns, finer_db = solve_finer(scene, settings, store, index)
     outside = ~inside[columns]
     finer_db = np.where(finer_db >= limit_db, finer_db, np.nan)
-    figures |= noise_figures(gain_db[rows, columns][:, outside].ravel(), finer_db[:, outside].ravel())
-    radio_map = RadioMap.build(
-        [scene.config.devices[i].device for i in index], scene.lattice, gain_db, los,
-        attributes={"source": "raytrace", "frequency_hz": frequency_hz, "gain_limit_db": limit_db,
-                    "scene": scene.config.name, "scene_hash": key["scene"],
-                    "trace_hash": store.hash, **settings.attributes(), **counts, **figures,
-                    **library_versions(), "radiotwin_version": version("radiotwin")}).placed(scene.config.origin)
+    figures |= noise_figures(gain_db[rows, columns][:, outside].ravel(),
+                             finer_db[:, outside].ravel())
+    attributes = {"source": "raytrace", "frequency_hz": frequency_hz, "gain_limit_db": limit_db,
+                  "scene": scene.config.name, "scene_hash": key["scene"],
+                  "trace_hash": store.hash, **settings.attributes(), **counts, **figures,
+                  **library_versions(), "radiotwin_version": version("radiotwin")}
+    radio_map = RadioMap.build(names, scene.lattice, gain_db, los, attributes=attributes)
+    radio_map = radio_map.placed(scene.config.origin)
     radio_map.write(out_path)
     return radio_map
 
 
-def antenna_gains(scene: Scene, index: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """What both ends' antennas add along the straight line, (devices, positions), and at most, (devices, 1) [dB]."""
+def _antenna_gains(scene: Scene, index: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Return both antennas' gain along each straight line, and its maximum.
+
+    Returns:
+        (devices, positions) and (devices, 1) [dBi].
+    """
     way_m = scene.lattice.positions_m[None] - scene.device_m[index][:, None]
     direct_dbi, peak_dbi = np.zeros(way_m.shape[:2]), np.zeros((len(index), 1))
     for row, antenna in enumerate(scene.device_antennas[device] for device in index):
@@ -93,47 +103,57 @@ def antenna_gains(scene: Scene, index: list[int]) -> tuple[np.ndarray, np.ndarra
 
 
 def _finished(path: Path, trace_hash: str, devices: list[str]) -> RadioMap | None:
-    """The map that is at `path` already, where it is the one that was asked for."""
+    """Return the map at `path` if it is the requested one."""
     if not path.is_file():
         return None
     try:
         radio_map = RadioMap.read(path)
     except BadInput:  # something else, or damaged: to be replaced
         return None
-    same = radio_map.dataset.attrs.get("trace_hash") == trace_hash and radio_map.devices == devices
+    same = (radio_map.dataset.attrs.get("trace_hash") == trace_hash
+            and radio_map.devices == devices)
     return radio_map if same else None
 
 
 def device_indices(scene: Scene, devices: list[str] | None) -> list[int]:
-    """Rows in `scene.config.devices` of the named devices, or of all.
+    """Return the indices into `scene.config.devices` of the named devices, or of all.
+
+    Args:
+        scene: Scene that declares them.
+        devices: Names; None: all.
 
     Raises:
-        BadInput: the scene has no devices, or not that one.
+        BadInput: The scene has no devices, or not that one.
     """
     names = [device.device for device in scene.config.devices]
     if not names:
-        raise BadInput(f"{scene.folder / 'scene.toml'} declares no devices; add at least one to trace from")
+        raise BadInput(f"{scene.folder / 'scene.toml'} declares no devices; add at least one to "
+                       "trace from")
     for name in devices or []:
         if name not in names:
-            raise BadInput(f"device {name!r} is not in {scene.folder / 'scene.toml'}; it has {', '.join(names)}")
+            raise BadInput(f"device {name!r} is not in {scene.folder / 'scene.toml'}; it has "
+                           f"{', '.join(names)}")
     return [names.index(name) for name in dict.fromkeys(devices or names)]
 
 
-def _key(scene: Scene, settings: SolverSettings) -> dict:
-    return {
-        "scene": scene.content_hash(),
-        "lattice": {axis: getattr(scene.lattice, axis).tolist() for axis in ("x_m", "y_m", "z_m")},
-        "settings": settings.attributes(), "libraries": library_versions(),
-    }
+def _key(scene: Scene, settings: SolverSettings) -> dict[str, Any]:
+    lattice = scene.lattice
+    return {"scene": scene.content_hash(),
+            "lattice": {"x_m": lattice.x_m.tolist(), "y_m": lattice.y_m.tolist(),
+                        "z_m": lattice.z_m.tolist()},
+            "settings": settings.attributes(), "libraries": library_versions()}
 
 
-def _censor(raw_db: np.ndarray, inside: np.ndarray, limit_db: float) -> tuple[np.ndarray, dict[str, int]]:
-    """Gains with NaN where nothing is detected, and how many links are so for which reason."""
+def _censor(raw_db: np.ndarray, inside: np.ndarray, limit_db: float
+            ) -> tuple[np.ndarray, dict[str, int]]:
+    """Replace undetected gains by NaN, and count the links by reason."""
     within = np.broadcast_to(inside, raw_db.shape)
     no_path = np.isnan(raw_db) & ~within
     below = ~within & (raw_db < limit_db)
     gain_db = np.where(within | below, np.nan, raw_db)
     return gain_db, {
-        "links_detected": int(np.isfinite(gain_db).sum()), "links_without_path": int(no_path.sum()),
-        "links_below_sensitivity": int(below.sum()), "links_inside_building": int(within.sum()),
+        "links_detected": int(np.isfinite(gain_db).sum()),
+        "links_without_path": int(no_path.sum()),
+        "links_below_sensitivity": int(below.sum()),
+        "links_inside_building": int(within.sum()),
     }

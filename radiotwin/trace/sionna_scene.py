@@ -5,24 +5,29 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 from radiotwin import llvm
 from radiotwin.errors import BadInput
 from radiotwin.scene.materials import permittivity, ranges_text
+from radiotwin.scene.reader import read_city
+from radiotwin.scene.writer import write_city
 
 log = logging.getLogger(__name__)
 
 
 def library_versions() -> dict[str, str]:
-    """Versions of what computes a gain."""
-    return {f"{name.replace('-', '_')}_version": version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
+    """Return the versions of the libraries that compute a gain."""
+    return {f"{name.replace('-', '_')}_version": version(name)
+            for name in ("sionna-rt", "mitsuba", "drjit")}
 
 
-def import_sionna():
-    """The module `sionna.rt`, on a libLLVM that works.
+def import_sionna() -> Any:
+    """Return the module `sionna.rt`, on a libLLVM that works.
 
     Raises:
-        RunFailed: no usable libLLVM.
+        RunFailed: No usable libLLVM.
     """
     llvm.prepare()
     import sionna.rt
@@ -30,27 +35,26 @@ def import_sionna():
     return sionna.rt
 
 
-def load_city(xml_path: Path | str | None, frequency_hz: float):
-    """Load a scene file at a frequency. Devices and receivers get one vertically polarised isotropic antenna.
+def load_city(xml_path: Path | str | None, frequency_hz: float) -> Any:
+    """Load a city at a frequency, with one vertically polarised isotropic antenna at every end.
 
-    ITU materials outside their frequency range are held at its nearest end, with a warning.
+    Mitsuba's parser, which can load other files and plugins, gets a copy that is written from what
+    `read_city` read, not the scene's own file. ITU materials outside their frequency range are
+    held at its nearest end, with a warning.
 
     Args:
-        xml_path: Mitsuba scene file; None for free space.
-        frequency_hz: frequency [Hz].
+        xml_path: `city.xml` of a scene folder; None for free space.
+        frequency_hz: Frequency [Hz].
+
+    Returns:
+        The `sionna.rt.Scene`.
 
     Raises:
-        BadInput: the file cannot be read.
-        RunFailed: no usable libLLVM.
+        BadInput: The file cannot be read.
+        RunFailed: No usable libLLVM.
     """
     rt = import_sionna()
-    if xml_path is not None and not Path(xml_path).is_file():
-        raise BadInput(f"{xml_path} does not exist; `radiotwin build-scene` makes a scene folder")
-    try:
-        city = rt.load_scene(None if xml_path is None else str(xml_path))
-    except (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OSError, SyntaxError) as error:
-        raise BadInput(f"{xml_path}: Sionna RT cannot read it ({str(error).strip()}); "
-                       "`radiotwin build-scene --check` lists what is wrong with it") from None
+    city = rt.load_scene(None) if xml_path is None else _load_copy(rt, Path(xml_path))
     for material in city.radio_materials.values():
         if isinstance(material, rt.ITURadioMaterial):
             _hold_in_range(material, frequency_hz)
@@ -60,14 +64,27 @@ def load_city(xml_path: Path | str | None, frequency_hz: float):
     return city
 
 
-def _hold_in_range(material, frequency_hz: float) -> None:
-    relative_permittivity, conductivity, in_range = permittivity(material.itu_type, frequency_hz)
+def _load_copy(rt: Any, xml_path: Path) -> Any:
+    shapes = read_city(xml_path)
+    with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+        write_city(folder, shapes)
+        try:
+            return rt.load_scene(str(Path(folder) / "city.xml"))
+        except (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OSError,
+                SyntaxError) as error:
+            raise BadInput(f"{xml_path}: Sionna RT cannot read it ({str(error).strip()}); "
+                           "`radiotwin build-scene --check` lists what is wrong with it") from None
+
+
+def _hold_in_range(material: Any, frequency_hz: float) -> None:
+    epsilon, conductivity, in_range = permittivity(material.itu_type, frequency_hz)
     if in_range:
         return
-    log.warning("material %s: ITU-R P.2040 defines %s for %s only; at %g GHz its constants at the nearest end are "
-                "used (relative permittivity %.3g, conductivity %.3g S/m)", material.name, material.itu_type,
-                ranges_text(material.itu_type), frequency_hz / 1e9, relative_permittivity, conductivity)
-    material.frequency_update_callback = lambda _: (relative_permittivity, conductivity)
+    log.warning("material %s: ITU-R P.2040 defines %s for %s only; at %g GHz its constants at the "
+                "nearest end are used (relative permittivity %.3g, conductivity %.3g S/m)",
+                material.name, material.itu_type, ranges_text(material.itu_type),
+                frequency_hz / 1e9, epsilon, conductivity)
+    material.frequency_update_callback = lambda _: (epsilon, conductivity)
 
 
 @contextmanager
@@ -75,12 +92,14 @@ def candidate_search(table_size: int, diffraction_probability: float) -> Iterato
     """Set two constants of Sionna RT's search for candidate paths that it has no arguments for.
 
     Args:
-        table_size, diffraction_probability: see `radiotwin.trace.settings`.
+        table_size: Entries of the hash table of candidates, see `radiotwin.trace.settings`.
+        diffraction_probability: Share of rays that are diffracted at an edge, see there.
     """
     from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator as Search
 
     before = Search.MIN_SPEC_COUNT_SIZE, Search.DIFFRACTION_SAMPLING_PROBABILITY
-    Search.MIN_SPEC_COUNT_SIZE, Search.DIFFRACTION_SAMPLING_PROBABILITY = table_size, diffraction_probability
+    Search.MIN_SPEC_COUNT_SIZE = table_size
+    Search.DIFFRACTION_SAMPLING_PROBABILITY = diffraction_probability
     try:
         yield
     finally:

@@ -88,7 +88,7 @@ def test_the_greatest_lattice_is_allowed(tmp_path):
     ("frequency_hz = 3.5e9", "frequency_hz = true", r"radio\.frequency_hz = True: .*valid number"),
     ("frequency_hz = 3.5e9", "sensitivity_dbm = 5", r"radio: sensitivity_dbm = 5 must lie below tx_power_dbm"),
     ("altitudes_m = [50]", "altitudes_m = [50, true]", r"lattice\.altitudes_m\.1 = True: .*valid number"),
-    ("altitudes_m = [50]", "altitudes_m = [50, 60, 50.0]", r"lattice\.altitudes_m.*50 stands there twice"),
+    ("altitudes_m = [50]", "altitudes_m = [50, 60, 50.0]", r"lattice\.altitudes_m.*50 is listed twice"),
     ("step_m = 20", "step_m = 0.01", r"lattice\.step_m = 0\.01 over an extent of 100 x 60 m .*10,000,000"),
     ("step_m = 20", "step_m = 1e-300", r"lattice\.step_m = 1e-300 over"),
     ("x_m = 1\n", "x_m = 100.5\n", r"device 'd0' at \(100\.5, 2\) m lies outside the extent \(x 0 to 100 m, y 0 to"),

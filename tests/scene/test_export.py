@@ -11,7 +11,8 @@ import trimesh
 
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
-from radiotwin.scene.export import Y_UP, export_scene, scene_shapes
+from radiotwin.scene.export import Y_UP, export_scene
+from radiotwin.scene.reader import read_city
 from radiotwin.scene.writer import CityShape, write_city
 
 POINTS_M = np.array([[x, y, z] for x in (10.0, 130.0, 250.0) for y in (20.0, 170.0, 290.0) for z in (2.0, 55.0)])
@@ -66,7 +67,7 @@ def test_the_folder_holds_the_same_bytes(small_scene, tmp_path):
 def test_models_hold_the_same_triangles_and_materials(small_scene, tmp_path, suffix):
     path = tmp_path / f"city{suffix}"
     export_scene(small_scene, path)
-    shapes = scene_shapes(small_scene)
+    shapes = read_city(small_scene.xml_path)
     meshes, materials = read_model(path)
     same_meshes(shapes, [meshes[shape.name] for shape in shapes])
     assert materials == {shape.name: shape.material.name for shape in shapes}
@@ -102,7 +103,7 @@ def test_traced_gains_agree_before_and_after(small_scene, tmp_path):
         folders.append(tmp_path / suffix[1:])
         folders[-1].mkdir()
         write_city(folders[-1], [CityShape(shape.name, meshes[shape.name], shape.material)
-                                 for shape in scene_shapes(small_scene)])
+                                 for shape in read_city(small_scene.xml_path)])
     for folder in folders:
         after_db = PathGains(folder / "city.xml", frequency_hz, settings).solve(device_m, POINTS_M)
         assert after_db == pytest.approx(before_db, abs=1e-9, nan_ok=True), folder
@@ -126,5 +127,5 @@ def test_an_export_can_be_repeated_and_built_from(small_scene, tmp_path):
     for _ in range(2):
         export_scene(small_scene, tmp_path / "out")
     report = build_scene(tmp_path / "out" / "city.xml", tmp_path / "again")
-    assert report.shapes == len(scene_shapes(small_scene)) and not report.problems
+    assert report.shapes == len(read_city(small_scene.xml_path)) and not report.problems
     assert isinstance(report.folder, Path)

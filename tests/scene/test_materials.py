@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.materials import ITU_TABLE, Material, itu_material, itu_name, permittivity, traceable
+from radiotwin.scene.materials import (
+    ITU_TABLE,
+    Material,
+    itu_material,
+    itu_name,
+    permittivity,
+    traceable,
+)
 
 
 def test_concrete_at_2_4_ghz():

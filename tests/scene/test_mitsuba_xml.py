@@ -114,3 +114,9 @@ def test_merged_shapes_are_opened_and_cameras_passed_over(tmp_path):
         '<shape type="merge"><shape type="cube" id="a"/><shape type="cube" id="b"/></shape>',
     )
     assert [shape.name for shape in read_mitsuba_xml(path).shapes] == ["a", "b"]
+
+
+def test_deeply_nested_merges(tmp_path):
+    deep = 5_000
+    merge = '<shape type="merge">' * deep + '<shape type="cube" id="a"/>' + "</shape>" * deep
+    assert [shape.name for shape in read_mitsuba_xml(write(tmp_path, merge)).shapes] == ["a"]

@@ -38,9 +38,9 @@ def law(monkeypatch, small_scene):
             gain_db = 20 * np.log10(self.wavelength_m / (4 * np.pi * distance_m)) - 25 * ~los + Law.offset_db
             return np.where(~los & (distance_m > 250), np.nan, gain_db)
 
-        def gains(self, device_m, points_m, antennas=(None, None)):
-            for part in self.batches(len(points_m)):
-                yield self.solve(device_m, points_m[part], antennas)
+        def gains(self, device_m, points_m, antennas=(None, None), advance=lambda n: None):
+            return np.concatenate([self.solve(device_m, points_m[part], antennas)
+                                   for part in self.batches(len(points_m))])
 
     monkeypatch.setattr("radiotwin.trace.lattice_gains.PathGains", Law)
     monkeypatch.setattr("radiotwin.trace.points.PathGains", Law)

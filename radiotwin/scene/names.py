@@ -1,0 +1,32 @@
+"""Names of shapes and materials that Sionna RT, Mitsuba and file systems accept."""
+
+import re
+
+RESERVED_NAMES = {"merged-shapes", "__root__"}  # of objects that Sionna RT adds to a scene
+
+
+def safe_name(text: str) -> str:
+    """Return the text with everything but ASCII letters, digits, `_` and `-` replaced by `_`.
+
+    Sionna RT 2.2 stops at `$` (a Mitsuba parameter) in a name, and reads scene files in the
+    system's own encoding; `.` is Mitsuba's separator; `/` and the like cannot be in a file name.
+
+    Args:
+        text: Any text; more than 100 characters are cut off.
+    """
+    return re.sub(r"[^A-Za-z0-9_-]", "_", text)[:100] or "unnamed"
+
+
+def unique_name(name: str, taken: set[str]) -> str:
+    """Return the name, with a number appended where it is taken, and add it to `taken`.
+
+    Args:
+        name: Name to use.
+        taken: Names in use, in lower case, as some file systems ignore case; grows by one.
+    """
+    free, number = name, 1
+    while free.lower() in taken:
+        number += 1
+        free = f"{name}_{number}"
+    taken.add(free.lower())
+    return free

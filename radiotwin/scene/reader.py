@@ -1,0 +1,79 @@
+"""Read the city of a scene folder: `city.xml` and its meshes, which may come from a stranger.
+
+All that uses a scene's geometry goes through here. The ray tracer loads a file that
+`radiotwin.scene.writer` writes from what was read here, never the scene's own.
+"""
+
+from dataclasses import replace
+from pathlib import Path
+
+import trimesh
+
+from radiotwin.errors import BadInput
+from radiotwin.scene.material_mapping import map_materials
+from radiotwin.scene.meshes import RawMesh, load_shape
+from radiotwin.scene.mitsuba_xml import DeclaredCity, read_mitsuba_xml
+from radiotwin.scene.names import RESERVED_NAMES, safe_name, unique_name
+from radiotwin.scene.writer import CityShape
+
+
+def read_triangles(xml_path: Path | str) -> list[RawMesh]:
+    """Read the triangles of every shape, whatever it is made of.
+
+    Args:
+        xml_path: `city.xml` of a scene folder.
+
+    Returns:
+        The meshes in the file's order.
+
+    Raises:
+        BadInput: No such file, malformed XML, an element or a mesh that cannot be read, or a file
+            outside the folder.
+    """
+    return _meshes(Path(xml_path), _declared(Path(xml_path)))
+
+
+def read_city(xml_path: Path | str) -> list[CityShape]:
+    """Read the shapes with their materials.
+
+    Names that Sionna RT or a file system would not accept are changed; those of a city that
+    `write_city` wrote stay, and writing it again gives the same bytes.
+
+    Args:
+        xml_path: `city.xml` of a scene folder.
+
+    Returns:
+        The shapes in the file's order.
+
+    Raises:
+        BadInput: As `read_triangles`; or a shape without a known material.
+    """
+    declared = _declared(Path(xml_path))
+    materials, problems = map_materials(declared.shapes, declared.materials, {})
+    errors = [problem.message for problem in problems if problem.severity == "error"]
+    if errors:
+        raise BadInput("\n".join([f"{xml_path}: not every shape has a usable material:", *errors]))
+    taken = set(RESERVED_NAMES)
+    names = [unique_name(safe_name(shape.name.removeprefix("mesh-")), taken)
+             for shape in declared.shapes]
+    used = sorted({material for material in materials if material is not None}, key=repr)
+    unique = {material: replace(material, name=unique_name(material.name, taken))
+              for material in used}
+    return [CityShape(name, trimesh.Trimesh(mesh.vertices, mesh.faces, process=False),
+                      unique[material])
+            for name, mesh, material in zip(names, _meshes(Path(xml_path), declared), materials)
+            if material is not None]
+
+
+def _declared(xml_path: Path) -> DeclaredCity:
+    if not xml_path.is_file():
+        raise BadInput(f"{xml_path} does not exist; `radiotwin build-scene` makes a scene folder")
+    return read_mitsuba_xml(xml_path, includes=False)
+
+
+def _meshes(xml_path: Path, declared: DeclaredCity) -> list[RawMesh]:
+    meshes = [load_shape(shape) for shape in declared.shapes]
+    if not any(len(mesh.faces) for mesh in meshes) or any(mesh.polygons for mesh in meshes):
+        raise BadInput(f"{xml_path} names no meshes, or some that are not of triangles; build the "
+                       "scene with `radiotwin build-scene`")
+    return meshes

@@ -1,0 +1,171 @@
+"""The scene folder as an object."""
+
+import hashlib
+import shutil
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from radiotwin.antennas import Antenna, Pattern, read_pattern
+from radiotwin.errors import BadInput
+from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.config import DeviceConfig, SceneConfig, UavConfig, read_config
+from radiotwin.scene.lattice import Lattice
+from radiotwin.scene.own_files import require_within
+
+if TYPE_CHECKING:
+    from radiotwin.radiomap import RadioMap
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A scene folder that was read and checked.
+
+    Attributes:
+        folder: Its path.
+        config: Content of `scene.toml`.
+    """
+
+    folder: Path
+    config: SceneConfig
+
+    @classmethod
+    def load(cls, folder: Path | str) -> "Scene":
+        """Read a scene folder.
+
+        Args:
+            folder: As `radiotwin build-scene` makes it.
+
+        Raises:
+            BadInput: Not a scene folder, an impossible value, a device inside a building, or a file
+                outside the folder.
+        """
+        folder = Path(folder)
+        if not folder.is_dir():
+            raise BadInput(f"{folder} is not a folder; give a scene folder, as "
+                           "`radiotwin build-scene` makes it")
+        for name in ("scene.toml", "city.xml"):
+            require_within(folder, folder / name, str(folder))
+        scene = cls(folder, read_config(folder / "scene.toml"))
+        scene.check_devices()
+        _ = scene.device_antennas, scene.uav_antenna  # report a broken file before any work
+        return scene
+
+    @property
+    def xml_path(self) -> Path:
+        """Path of `city.xml`."""
+        return self.folder / "city.xml"
+
+    @cached_property
+    def city(self) -> CityMap:
+        """3D map of the city."""
+        return CityMap.from_xml(self.xml_path)
+
+    @cached_property
+    def lattice(self) -> Lattice:
+        """Positions that UAVs fly on."""
+        lattice = self.config.lattice
+        return Lattice.over(*self.config.extent.bounds, lattice.step_m, lattice.altitudes_m)
+
+    @cached_property
+    def device_m(self) -> np.ndarray:
+        """(k, 3) true positions of the declared devices [m]."""
+        positions = [(device.x_m, device.y_m, device.z_m) for device in self.config.devices]
+        return np.array(positions, dtype=float).reshape(-1, 3)
+
+    @cached_property
+    def blocked(self) -> np.ndarray:
+        """(nz, ny, nx) bool: lattice positions inside a building, where no UAV can be."""
+        return self.city.inside(self.lattice.positions_m).reshape(self.lattice.shape)
+
+    @cached_property
+    def device_antennas(self) -> list[Antenna | None]:
+        """Antenna of each declared device; None: isotropic."""
+        return [None if device.antenna is None else
+                Antenna(self._pattern(device.antenna), device.azimuth_deg or 0.0,
+                        device.tilt_deg or 0.0)
+                for device in self.config.devices]
+
+    @cached_property
+    def uav_antenna(self) -> Antenna | None:
+        """Antenna of all UAVs, averaged over all headings; None: isotropic."""
+        names = {uav.antenna for uav in self.config.uavs if uav.antenna is not None}
+        return Antenna(self._pattern(names.pop()).around()) if names else None
+
+    def copy_antennas(self, folder: Path) -> None:
+        """Copy the files of all antennas into another scene folder, under the same names.
+
+        Args:
+            folder: The other scene folder.
+        """
+        ends: list[DeviceConfig | UavConfig] = [*self.config.devices, *self.config.uavs]
+        for name in sorted({end.antenna for end in ends if end.antenna is not None}):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(self.folder / name, folder / name)
+
+    def _pattern(self, name: str) -> Pattern:
+        source = str(self.folder / "scene.toml")
+        return read_pattern(require_within(self.folder, self.folder / name, source))
+
+    def check_devices(self) -> None:
+        """Raise BadInput if a device is inside a building, or a UAV starts or ends in one."""
+        path = self.folder / "scene.toml"
+        for device, bad in zip(self.config.devices, self.city.inside(self.device_m)):
+            if bad:
+                top_m = float(self.city.height_at(device.x_m, device.y_m))
+                raise BadInput(
+                    f"{path}: device {device.device!r} at ({device.x_m:g}, {device.y_m:g}, "
+                    f"{device.z_m:g}) m is inside a building {top_m:.1f} m high; move it, or put "
+                    f"it on the roof (z_m > {top_m:.1f})")
+        for uav in self.config.uavs:
+            for end, x_m, y_m in (("start", uav.start_x_m, uav.start_y_m),
+                                  ("terminal", uav.terminal_x_m, uav.terminal_y_m)):
+                if self.city.inside(np.array([[x_m, y_m, uav.altitude_m]]))[0]:
+                    raise BadInput(
+                        f"{path}: uav {uav.uav!r}: its {end} ({x_m:g}, {y_m:g}, "
+                        f"{uav.altitude_m:g}) m is inside a building; move it or raise altitude_m")
+
+    def check_map(self, radio_map: "RadioMap") -> None:
+        """Raise BadInput unless a map was made for this scene as it is now, with all its devices.
+
+        Args:
+            radio_map: Map with the attribute `scene_hash`.
+        """
+        missing = [device.device for device in self.config.devices
+                   if device.device not in radio_map.devices]
+        if missing or not self.over_lattice(radio_map) \
+                or radio_map.dataset.attrs.get("scene_hash") != self.content_hash():
+            what = (f"it lacks device {missing[0]!r}" if missing else
+                    "geometry, radio, devices or lattice differ")
+            raise BadInput(f"the radio map was not made for the scene as it is now in "
+                           f"{self.folder} ({what}); run `radiotwin trace` again")
+
+    def over_lattice(self, radio_map: "RadioMap") -> bool:
+        """Return whether a map is over this scene's lattice."""
+        return (radio_map.gain_db.shape[1:] == self.lattice.shape
+                and np.allclose(radio_map.lattice.positions_m, self.lattice.positions_m))
+
+    def content_hash(self) -> str:
+        """Return the SHA-256 of all inputs of a gain map.
+
+        These are geometry, materials, frequency, sensitivity, devices and antennas.
+        """
+        digest = hashlib.sha256()
+        meshes = sorted(path for path in self.folder.glob("meshes/*") if path.is_file())
+        for path in (self.xml_path, *meshes):
+            require_within(self.folder, path, str(self.folder))
+            digest.update(path.name.encode() + b"\0" + path.read_bytes())
+        radio = self.config.radio
+        digest.update(f"{radio.frequency_hz!r},{radio.tx_power_dbm!r},"
+                      f"{radio.sensitivity_dbm!r};".encode())
+        for device in self.config.devices:
+            digest.update(f"{device.device},{device.x_m!r},{device.y_m!r},"
+                          f"{device.z_m!r};".encode())
+        for number, antenna in enumerate((*self.device_antennas, self.uav_antenna)):
+            if antenna is not None:
+                digest.update(f"{number},{antenna.azimuth_deg!r},{antenna.tilt_deg!r};".encode())
+                digest.update(np.ascontiguousarray(antenna.pattern.gain_dbi).tobytes())
+        return digest.hexdigest()
