@@ -1,4 +1,4 @@
-"""Radio maps as files that other programs read, by the name of the file."""
+"""Radio maps in the file formats of other programs, chosen by the file name."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -12,34 +12,54 @@ from radiotwin.scene import Scene
 
 
 def write_picture(radio_map: RadioMap, scene: Scene, path: Path) -> None:
-    """All devices at the lowest altitude, over the city's outlines."""
+    """Write a PNG of all devices at the lowest altitude, over the outlines of the buildings.
+
+    Args:
+        radio_map: map to draw.
+        scene: whose city is outlined.
+        path: of the PNG file.
+    """
     from radiotwin.figures import draw_radio_map
 
     draw_radio_map(radio_map, scene, path)
 
 
 EXPORTERS: dict[str, Callable[[RadioMap, Scene, Path], None]] = {
-    ".nc": write_netcdf, ".csv": write_csv, ".npz": write_numpy, ".tif": write_geotiff, ".kmz": write_kmz,
-    ".png": write_picture}
-NEED_ORIGIN = (".kmz",)
+    ".nc": write_netcdf, ".csv": write_csv, ".npz": write_numpy, ".tif": write_geotiff,
+    ".kmz": write_kmz, ".png": write_picture}
 
 
-def check_format(path: Path, scene: Scene | None = None) -> None:
-    """Raise BadInput for a file name that no exporter writes, or that needs to know where on the globe `scene` is."""
-    if path.suffix not in EXPORTERS:
-        raise BadInput(f"{path}: unknown format {path.suffix!r}; allowed are {', '.join(EXPORTERS)}")
-    if scene is not None and path.suffix in NEED_ORIGIN and scene.config.origin is None:
-        raise BadInput(f"{path}: Google Earth needs to know where the scene is, and {scene.folder / 'scene.toml'} has "
-                       "no [origin]; add one with latitude_deg and longitude_deg of x = y = 0")
-
-
-def select(radio_map: RadioMap, devices: list[str] | None, altitudes_m: list[float] | None) -> RadioMap:
-    """A part of a map.
+def check_format(path: Path, scene: Scene) -> None:
+    """Check that a radio map of a scene can be written under a file name.
 
     Args:
-        radio_map: the whole.
+        path: of the output; its suffix chooses the format.
+        scene: of the map.
+
+    Raises:
+        BadInput: no exporter writes the suffix, or it needs an origin and the scene has none.
+    """
+    if path.suffix not in EXPORTERS:
+        raise BadInput(f"{path}: unknown format {path.suffix!r}; allowed are "
+                       f"{', '.join(EXPORTERS)}")
+    if path.suffix == ".kmz" and scene.config.origin is None:
+        raise BadInput(f"{path}: Google Earth needs the position of the scene, and "
+                       f"{scene.folder / 'scene.toml'} has no [origin]; add one with latitude_deg "
+                       "and longitude_deg of x = y = 0")
+
+
+def select(
+    radio_map: RadioMap, devices: list[str] | None, altitudes_m: list[float] | None
+) -> RadioMap:
+    """Select devices and altitudes of a map.
+
+    Args:
+        radio_map: the whole map.
         devices: names, in the order wanted; None: all.
-        altitudes_m: of the lattice; None: all.
+        altitudes_m: altitudes of the lattice [m]; None: all.
+
+    Returns:
+        The map of the selection.
 
     Raises:
         BadInput: the map has no such device or altitude.
@@ -47,7 +67,8 @@ def select(radio_map: RadioMap, devices: list[str] | None, altitudes_m: list[flo
     dataset = radio_map.dataset
     for name in devices or []:
         if name not in radio_map.devices:
-            raise BadInput(f"device {name!r} is not in the map; it has {', '.join(radio_map.devices)}")
+            raise BadInput(f"device {name!r} is not in the map; it has "
+                           f"{', '.join(radio_map.devices)}")
     known_m = radio_map.lattice.z_m
     for altitude_m in altitudes_m or []:
         if altitude_m not in known_m:
