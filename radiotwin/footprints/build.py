@@ -10,7 +10,7 @@ import shapely
 from radiotwin.errors import BadInput
 from radiotwin.footprints.building_table import building_table, height_counts
 from radiotwin.footprints.extrude import make_blocks
-from radiotwin.footprints.features import Feature, MapFile
+from radiotwin.footprints.features import Feature, MapFile, problems_of
 from radiotwin.footprints.gis_files import read_geojson, read_geopackage
 from radiotwin.footprints.heights import LEVEL_M
 from radiotwin.footprints.material_table import STANDARD, MaterialTable
@@ -25,7 +25,7 @@ from radiotwin.scene.importer import RESERVED_NAMES, ImportedCity
 from radiotwin.scene.material_mapping import safe_name, unique_name
 from radiotwin.scene.materials import Material, itu_material
 from radiotwin.scene.placement import choose_extent
-from radiotwin.scene.problems import Problem, listed
+from radiotwin.scene.problems import Problem
 from radiotwin.scene.report import BuildReport
 from radiotwin.scene.sources import scene_name
 from radiotwin.scene.surfaces import Surfaces
@@ -225,11 +225,8 @@ def _bounds_m(prisms: list[Prism], origin: Origin, bbox_deg: Bounds | None) -> B
 def _overlaps(prisms: list[Prism]) -> list[Problem]:
     """Return a warning about buildings that overlap, the largest overlap first."""
     overlaps = sorted(find_overlaps(prisms), key=lambda overlap: -overlap[2])
-    if not overlaps:
-        return []
     names = [f"{a.name} and {b.name}: {shared_m2:.0f} m²" for a, b, shared_m2 in overlaps]
-    return [Problem("warning", "", f"{len(overlaps)} pair(s) of buildings overlap: what they "
-                    f"share is built once ({listed(names)})")]
+    return problems_of(names, "pair(s) of buildings overlap: their common part is built once")
 
 
 def _city(

@@ -1,11 +1,11 @@
 """Areas of a map file with their tags, as every reader returns them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from shapely.geometry.base import BaseGeometry
 
-from radiotwin.scene.problems import Problem
+from radiotwin.scene.problems import Problem, Severity, listed
 
 BUILDING_KEYS = ("building", "building:part")  # tags of OpenStreetMap
 
@@ -41,6 +41,11 @@ class MapFile:
 
     features: list[Feature]
     problems: list[Problem] = field(default_factory=list)
+
+
+def problems_of(names: Sequence[str], text: str, severity: Severity = "warning") -> list[Problem]:
+    """Return one problem about several features, with their number and first names; none: empty."""
+    return [Problem(severity, "", f"{len(names)} {text} ({listed(names)})")] if names else []
 
 
 def is_building(tags: Mapping[str, str]) -> bool:

@@ -16,8 +16,13 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from radiotwin.errors import BadInput
-from radiotwin.footprints.features import BUILDING_KEYS, Feature, MapFile, is_building
-from radiotwin.scene.problems import Problem, listed
+from radiotwin.footprints.features import (
+    BUILDING_KEYS,
+    Feature,
+    MapFile,
+    is_building,
+    problems_of,
+)
 
 WGS84 = ("EPSG:4326", "OGC:CRS84", "urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:EPSG::4326")
 _ALIASES = {key.replace(":", "_"): key for key in (
@@ -145,11 +150,8 @@ def _map_file(
             unusable.append(name)
             continue
         features.append(Feature(name, tags if marked else tags | {"building": "yes"}, area))
-    problems = []
-    if unusable:
-        problems.append(Problem(
-            "warning", "", f"{len(unusable)} building(s) are points or lines, without an area: "
-            f"left out ({listed(unusable)})"))
+    problems = problems_of(
+        unusable, "building(s) are points or lines, without an area: left out")
     return MapFile(_to_degrees(path, features, crs), problems)
 
 

@@ -13,8 +13,7 @@ from typing import Literal
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from radiotwin.footprints.features import Feature, MapFile, is_building
-from radiotwin.scene.problems import Problem, listed
+from radiotwin.footprints.features import Feature, MapFile, is_building, problems_of
 
 MIN_RING_NODES = 4  # a triangle, with the first node again at the end
 
@@ -93,15 +92,9 @@ def assemble(elements: OsmElements) -> MapFile:
             unclosed.append(f"way/{number}")
         else:
             ways.append(Feature(f"way/{number}", way.tags, _polygon(way.nodes, elements)))
-    problems = []
-    if incomplete:
-        problems.append(Problem(
-            "warning", "", f"{len(incomplete)} building(s) lack nodes or ways, as where an extract "
-            f"was cut off: left out ({listed(incomplete)}); take a larger extract"))
-    if unclosed:
-        problems.append(Problem(
-            "warning", "", f"{len(unclosed)} building(s) have an outline that is not closed: left "
-            f"out ({listed(unclosed)})"))
+    problems = problems_of(incomplete, "building(s) lack nodes or ways, as where an extract was "
+                                       "cut off: left out; take a larger extract")
+    problems += problems_of(unclosed, "building(s) have an outline that is not closed: left out")
     return MapFile(ways + relations, problems)
 
 

@@ -8,12 +8,12 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from radiotwin.footprints.features import Feature
+from radiotwin.footprints.features import Feature, problems_of
 from radiotwin.footprints.heights import Height, height_of
 from radiotwin.footprints.material_table import MaterialTable
 from radiotwin.geodesy import to_local
 from radiotwin.scene.materials import Material
-from radiotwin.scene.problems import Problem, Severity, listed
+from radiotwin.scene.problems import Problem, Severity
 from radiotwin.tables import Origin
 
 GRID_M = 0.01  # [m], corners are rounded to it, so that walls meant to coincide do
@@ -112,9 +112,8 @@ class _Defects:
         self.names.setdefault(kind, []).append(name)
 
     def problems(self) -> list[Problem]:
-        return [Problem(severity, "", f"{len(names)} {text} ({listed(names)})")
-                for kind, (severity, text) in self._KINDS.items()
-                if (names := self.names.get(kind))]
+        return [problem for kind, (severity, text) in self._KINDS.items()
+                for problem in problems_of(self.names.get(kind, ()), text, severity)]
 
 
 def _clean(feature: Feature, origin: Origin, defects: _Defects) -> shapely.MultiPolygon | None:
