@@ -1,4 +1,4 @@
-"""Measured antenna patterns: read from files, turned to where an antenna looks, asked for the gain in a direction."""
+"""Measured antenna patterns: read from files, oriented, and evaluated in a direction."""
 
 from radiotwin.antennas.pattern import Antenna, Pattern
 from radiotwin.antennas.read import read_pattern

@@ -1,4 +1,4 @@
-"""Files of antenna patterns: MSI Planet (.msi, .pln) and CSV."""
+"""Readers of antenna patterns: MSI Planet (.msi, .pln) and CSV."""
 
 import re
 from pathlib import Path
@@ -9,100 +9,115 @@ import pandas as pd
 from radiotwin.antennas.pattern import Pattern
 from radiotwin.errors import BadInput
 
-DIPOLE_DBI = 2.15  # 0 dBd
-HIGHEST_DBI = 60.0
-COLUMNS = ["azimuth_deg", "elevation_deg", "gain_dbi"]
-AZIMUTH_DEG = np.arange(0.0, 360.0)
+DIPOLE_DBI = 2.15  # [dBi], gain of a half-wave dipole: 0 dBd
+MAX_GAIN_DBI = 60.0  # [dBi], about that of a dish of 20 m at 5 GHz; more is taken for an error
+AZIMUTH_DEG = np.arange(0.0, 360.0)  # grid of the patterns between two cuts
 ELEVATION_DEG = np.arange(-90.0, 91.0)
+_COLUMNS = {"azimuth_deg": (-360, 360), "elevation_deg": (-90, 90),
+            "gain_dbi": (-200, MAX_GAIN_DBI)}  # of a CSV file, with the range of their values
 _GAIN = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*(dbd|dbi)?", re.IGNORECASE)
 
 
 def read_pattern(path: Path | str) -> Pattern:
-    """Read a pattern.
+    """Read an antenna pattern.
 
-    `.msi`, `.pln`: GAIN in dBd unless it says dBi, and the cuts HORIZONTAL and VERTICAL of 360 attenuations [dB] each.
-    Angles of the vertical cut count downwards from the horizon, as makers write their downtilts; what lies between the
-    cuts is interpolated (see `between_cuts`).
-    `.csv`: columns azimuth_deg (clockwise from the boresight), elevation_deg (up), gain_dbi, on a full grid.
+    `.msi`, `.pln`: GAIN in dBd unless it says dBi, and the cuts HORIZONTAL and VERTICAL of 360
+    attenuations [dB] each. Angles of the vertical cut count downwards from the horizon, as
+    manufacturers give downtilts; directions between the cuts are interpolated (see
+    `between_cuts`).
+    `.csv`: columns azimuth_deg (clockwise from the boresight), elevation_deg (up) and gain_dbi, on
+    a full grid.
+
+    Args:
+        path: file to read.
+
+    Returns:
+        The pattern in the antenna's own frame.
 
     Raises:
-        BadInput: no such file, an unknown form, a missing part, or a number that cannot be; with file and row.
+        BadInput: no such file, an unknown format, a missing part, or an impossible number; with
+            file and row.
     """
     path = Path(path)
     readers = {".msi": _read_msi, ".pln": _read_msi, ".csv": _read_csv}
     if path.suffix.lower() not in readers:
-        raise BadInput(f"{path}: unknown format {path.suffix!r} of an antenna; allowed are {', '.join(readers)}")
+        raise BadInput(f"{path}: unknown format {path.suffix!r} of an antenna; allowed are "
+                       f"{', '.join(readers)}")
     if not path.is_file():
         raise BadInput(f"{path} is not a file; give the pattern of an antenna")
     pattern = readers[path.suffix.lower()](path)
-    if not -HIGHEST_DBI <= pattern.peak_dbi <= HIGHEST_DBI:
-        raise BadInput(f"{path}: a gain of {pattern.peak_dbi:g} dBi is not possible; allowed is up to "
-                       f"{HIGHEST_DBI:g} dBi")
+    if not -MAX_GAIN_DBI <= pattern.peak_dbi <= MAX_GAIN_DBI:
+        raise BadInput(f"{path}: a gain of {pattern.peak_dbi:g} dBi is not possible; allowed is up "
+                       f"to {MAX_GAIN_DBI:g} dBi")
     return pattern
+
+
+def between_cuts(horizontal_db: np.ndarray, vertical_db: np.ndarray) -> np.ndarray:
+    """Interpolate relative gain over the sphere from two cuts: horizontal projection [1].
+
+    With f the azimuth's fraction of the way from the front (0) to the back (1):
+    G(az, el) = G_H(az) - (1 - f) (G_H(0) - G_V(el)) - f (G_H(180) - G_V(180 - el)).
+
+    [1] Gil, Claro, Ferreira, Pardelinha, Correia, "A 3-D interpolation method for
+    base-station-antenna radiation patterns", IEEE Antennas and Propagation Magazine 43(2), 2001.
+
+    Args:
+        horizontal_db: (360,) relative gain at azimuths 0 to 359 degrees [dB].
+        vertical_db: (360,) relative gain at angles 0 to 359 degrees, downwards from the horizon in
+            front [dB].
+
+    Returns:
+        (181, 360) relative gain at elevations -90 to 90 degrees [dB].
+    """
+    down = -ELEVATION_DEG.astype(int)
+    front_db, back_db = vertical_db[down % 360, None], vertical_db[(180 - down) % 360, None]
+    fraction = np.minimum(AZIMUTH_DEG, 360 - AZIMUTH_DEG) / 180
+    return horizontal_db - (1 - fraction) * (horizontal_db[0] - front_db) \
+        - fraction * (horizontal_db[180] - back_db)
 
 
 def _read_msi(path: Path) -> Pattern:
     gain_dbi: float | None = None
-    cuts: dict[str, dict[float, float]] = {}
+    cuts: dict[str, dict[float, float]] = {"HORIZONTAL": {}, "VERTICAL": {}}
     cut: dict[float, float] | None = None
     for row, line in enumerate(path.read_text(encoding="latin-1").splitlines(), start=1):
-        words = line.split()
-        if not words:
+        fields = line.split()
+        if not fields:
             continue
-        key = words[0].upper()
+        key = fields[0].upper()
         if key == "GAIN":
-            found = _GAIN.fullmatch(" ".join(words[1:]))
+            found = _GAIN.fullmatch(" ".join(fields[1:]))
             if not found:
-                raise BadInput(f"{path}, row {row}: {line.strip()!r} is not GAIN, a number, and dBd or dBi")
-            gain_dbi = float(found[1]) + (0.0 if (found[2] or "dBd").lower() == "dbi" else DIPOLE_DBI)
-        elif key in ("HORIZONTAL", "VERTICAL"):
-            cut = cuts.setdefault(key, {})
+                raise BadInput(f"{path}, row {row}: {line.strip()!r} is not GAIN, a number, and "
+                               "dBd or dBi")
+            is_dbi = (found[2] or "dBd").lower() == "dbi"
+            gain_dbi = float(found[1]) + (0.0 if is_dbi else DIPOLE_DBI)
+        elif key in cuts:
+            cut = cuts[key]
         elif cut is not None:
             try:
-                angle, attenuation = (float(word) for word in words)
+                angle, attenuation = (float(field) for field in fields)
             except ValueError:
                 angle = attenuation = np.nan
             if not (0 <= angle <= 360 and 0 <= attenuation < 200):
-                raise BadInput(f"{path}, row {row}: {line.strip()!r} is not an angle (0 to 360) and an attenuation (0 "
-                               "dB or more)")
+                raise BadInput(f"{path}, row {row}: {line.strip()!r} is not an angle (0 to 360) "
+                               "and an attenuation (0 dB or more)")
             cut[angle % 360] = -attenuation
-    for key in ("HORIZONTAL", "VERTICAL"):
-        if len(cuts.get(key, ())) < 2:
-            raise BadInput(f"{path}: has no cut {key}; it needs HORIZONTAL and VERTICAL with an angle and an "
-                           "attenuation a row")
+    for key, cut in cuts.items():
+        if len(cut) < 2:
+            raise BadInput(f"{path}: has no cut {key}; it needs HORIZONTAL and VERTICAL with an "
+                           "angle and an attenuation a row")
     if gain_dbi is None:
         raise BadInput(f"{path}: has no GAIN; add a row such as GAIN 15.5 dBi")
-    horizontal, vertical = (_even(cuts[key]) for key in ("HORIZONTAL", "VERTICAL"))
-    return Pattern(AZIMUTH_DEG, ELEVATION_DEG, gain_dbi + between_cuts(horizontal, vertical))
+    horizontal_db, vertical_db = (_resample(cut) for cut in cuts.values())
+    return Pattern(AZIMUTH_DEG, ELEVATION_DEG, gain_dbi + between_cuts(horizontal_db, vertical_db))
 
 
-def _even(cut: dict[float, float]) -> np.ndarray:
-    """(360,) a cut at every whole degree."""
+def _resample(cut: dict[float, float]) -> np.ndarray:
+    """Return a cut at every whole degree (360,)."""
     angles = np.array(sorted(cut))
     values = np.array([cut[angle] for angle in angles])
     return np.interp(AZIMUTH_DEG, angles, values, period=360)
-
-
-def between_cuts(horizontal_db: np.ndarray, vertical_db: np.ndarray) -> np.ndarray:
-    """Relative gain over the sphere out of two cuts, by horizontal projection interpolation [1].
-
-    With f the azimuth's share of the way from the front (0) to the back (1):
-    G(az, el) = G_H(az) - (1 - f) (G_H(0) - G_V(el)) - f (G_H(180) - G_V(180 - el)).
-
-    [1] Gil, Claro, Ferreira, Pardelinha, Correia, "A 3-D interpolation method for base-station-antenna radiation
-    patterns", IEEE Antennas and Propagation Magazine 43(2), 2001.
-
-    Args:
-        horizontal_db: (360,) at azimuths 0 to 359 degrees.
-        vertical_db: (360,) at angles 0 to 359 degrees, downwards from the horizon in front.
-
-    Returns:
-        (181, 360) at elevations -90 to 90 degrees.
-    """
-    down = -ELEVATION_DEG.astype(int)
-    front_db, back_db = vertical_db[down % 360][:, None], vertical_db[(180 - down) % 360][:, None]
-    share = np.minimum(AZIMUTH_DEG, 360 - AZIMUTH_DEG) / 180
-    return horizontal_db - (1 - share) * (horizontal_db[0] - front_db) - share * (horizontal_db[180] - back_db)
 
 
 def _read_csv(path: Path) -> Pattern:
@@ -110,19 +125,23 @@ def _read_csv(path: Path) -> Pattern:
         table = pd.read_csv(path, skipinitialspace=True)
     except (ValueError, OSError) as error:
         raise BadInput(f"{path} cannot be read as CSV: {error}") from None
-    missing = [name for name in COLUMNS if name not in table]
+    columns = list(_COLUMNS)
+    missing = [name for name in columns if name not in table]
     if missing:
-        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {COLUMNS}, it has {list(table.columns)}")
-    numbers = table[COLUMNS].apply(pd.to_numeric, errors="coerce")
-    for name, (low, high) in zip(COLUMNS, ((-360, 360), (-90, 90), (-200, HIGHEST_DBI))):
+        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {columns}, it has "
+                       f"{list(table.columns)}")
+    numbers = table[columns].apply(pd.to_numeric, errors="coerce")
+    for name, (low, high) in _COLUMNS.items():
         bad = ~numbers[name].between(low, high)
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
-            raise BadInput(f"{path}: row {row + 2}, column {name}: {table[name][row]!r} is not a number from {low} "
-                           f"to {high}")
+            raise BadInput(f"{path}: row {row + 2}, column {name}: {table[name][row]!r} is not a "
+                           f"number from {low} to {high}")
     numbers["azimuth_deg"] %= 360
-    grid = numbers.drop_duplicates(COLUMNS[:2]).pivot(index="elevation_deg", columns="azimuth_deg", values="gain_dbi")
+    grid = numbers.drop_duplicates(columns[:2]).pivot(
+        index="elevation_deg", columns="azimuth_deg", values="gain_dbi")
     if grid.isna().any(axis=None) or len(grid) < 2:
-        raise BadInput(f"{path}: {len(table)} rows are no full grid of {len(grid)} elevations and {grid.shape[1]} "
-                       "azimuths; give a gain for every pair")
-    return Pattern(grid.columns.to_numpy(dtype=float), grid.index.to_numpy(dtype=float), grid.to_numpy(dtype=float))
+        raise BadInput(f"{path}: {len(table)} rows are no full grid of {len(grid)} elevations and "
+                       f"{grid.shape[1]} azimuths; give a gain for every pair")
+    return Pattern(grid.columns.to_numpy(dtype=float), grid.index.to_numpy(dtype=float),
+                   grid.to_numpy(dtype=float))

@@ -88,7 +88,7 @@ def _print(report: dict[str, Any]) -> None:
              for name, value in report["baselines"].items()]
     print_rows(
         f"Error on held-out links (by {report['heldout']['by']}) [dB], base {report['base']}",
-        {"links": "left", "": "left", "RMSE": "right", "MAE": "right", "mean": "right"}, rows)
+        {"links": "left", "": "left", "RMSE": "right", "MAE": "right", "bias": "right"}, rows)
     rows = [[effect["name"], name, *(_number(estimate[key]) for key in ("value", "low", "high")),
              estimate["unit"]]
             for effect in report["effects"] for name, estimate in effect["parameters"].items()]

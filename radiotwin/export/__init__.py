@@ -1,4 +1,4 @@
-"""Radio maps as files that other programs read, by the name of the file."""
+"""Radio maps in the file formats of other programs, chosen by the file name."""
 
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -10,36 +10,45 @@ from radiotwin.export.tables import write_csv, write_netcdf, write_numpy
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 
+
 EXPORTERS: dict[str, Callable[[RadioMap, Scene, Path], None]] = {
-    ".nc": write_netcdf, ".csv": write_csv, ".npz": write_numpy, ".tif": write_geotiff, ".kmz": write_kmz}
-NEED_ORIGIN = (".kmz",)
+    ".nc": write_netcdf, ".csv": write_csv, ".npz": write_numpy, ".tif": write_geotiff,
+    ".kmz": write_kmz}
 
 
-def check_format(path: Path, scene: Scene | None = None, formats: Collection[str] = tuple(EXPORTERS)) -> None:
-    """Check that a radio map of a scene can be written to a file.
+def check_format(path: Path, scene: Scene,
+                 formats: Collection[str] = tuple(EXPORTERS)) -> None:
+    """Check that a radio map of a scene can be written under a file name.
 
     Args:
-        path: file to write.
-        scene: scene of the map.
+        path: of the output; its suffix chooses the format.
+        scene: of the map.
         formats: suffixes that can be written.
 
     Raises:
-        BadInput: another suffix, or a format that needs the origin of a scene that has none.
+        BadInput: no exporter writes the suffix, or it needs an origin and the scene has none.
     """
     if path.suffix not in formats:
-        raise BadInput(f"{path}: unknown format {path.suffix!r}; allowed are {', '.join(formats)}")
-    if scene is not None and path.suffix in NEED_ORIGIN and scene.config.origin is None:
-        raise BadInput(f"{path}: Google Earth needs to know where the scene is, and {scene.folder / 'scene.toml'} has "
-                       "no [origin]; add one with latitude_deg and longitude_deg of x = y = 0")
+        raise BadInput(f"{path}: unknown format {path.suffix!r}; allowed are "
+                       f"{', '.join(formats)}")
+    if path.suffix == ".kmz" and scene.config.origin is None:
+        raise BadInput(f"{path}: Google Earth needs the position of the scene, and "
+                       f"{scene.folder / 'scene.toml'} has no [origin]; add one with latitude_deg "
+                       "and longitude_deg of x = y = 0")
 
 
-def select(radio_map: RadioMap, devices: list[str] | None, altitudes_m: list[float] | None) -> RadioMap:
-    """A part of a map.
+def select(
+    radio_map: RadioMap, devices: list[str] | None, altitudes_m: list[float] | None
+) -> RadioMap:
+    """Select devices and altitudes of a map.
 
     Args:
-        radio_map: the whole.
+        radio_map: the whole map.
         devices: names, in the order wanted; None: all.
-        altitudes_m: of the lattice; None: all.
+        altitudes_m: altitudes of the lattice [m]; None: all.
+
+    Returns:
+        The map of the selection.
 
     Raises:
         BadInput: the map has no such device or altitude.
@@ -47,7 +56,8 @@ def select(radio_map: RadioMap, devices: list[str] | None, altitudes_m: list[flo
     dataset = radio_map.dataset
     for name in devices or []:
         if name not in radio_map.devices:
-            raise BadInput(f"device {name!r} is not in the map; it has {', '.join(radio_map.devices)}")
+            raise BadInput(f"device {name!r} is not in the map; it has "
+                           f"{', '.join(radio_map.devices)}")
     known_m = radio_map.lattice.z_m
     for altitude_m in altitudes_m or []:
         if altitude_m not in known_m:

@@ -1,7 +1,7 @@
-"""Radio maps for Google Earth: a KMZ file with an overlay for each device and altitude, and a legend.
+"""Radio maps for Google Earth: a KMZ file with an overlay for each device and altitude.
 
-Overlays are laid by their four corners (gx:LatLonQuad of Google's KML extension [1]), which the local frame's small
-turn against the meridians needs. What is not detected is transparent.
+Overlays are placed by their four corners (gx:LatLonQuad of Google's KML extension [1]), as the
+local frame is slightly rotated against the meridians. Cells that are not detected are transparent.
 
 [1] https://developers.google.com/kml/documentation/kmlreference
 """
@@ -19,7 +19,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from PIL import Image
 
-from radiotwin.export.geotiff import cell_m
+from radiotwin.export.geotiff import cell_size_m
 from radiotwin.files import atomic_path
 from radiotwin.geodesy import to_geographic
 from radiotwin.radiomap import RadioMap
@@ -28,19 +28,25 @@ from radiotwin.scene import Scene
 KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
 COLOURS = "viridis"
 OPACITY = 190  # of 255
-LEAST_PIXELS = 512  # of a picture's longer side: viewers blur what they enlarge
-DATE = (1980, 1, 1, 0, 0, 0)  # in the archive, so that equal maps give equal bytes
+MIN_PIXELS = 512  # of a picture's longer side: viewers blur what they enlarge
+DATE = (1980, 1, 1, 0, 0, 0)  # of all files in the archive, so that equal maps give equal bytes
 
 
 def write_kmz(radio_map: RadioMap, scene: Scene, path: Path) -> None:
-    """One folder a device, of which the first is shown; only one altitude is shown at a time.
+    """Write a KMZ file with a folder for each device and a legend.
+
+    The first device is shown at first, and one altitude at a time.
 
     Args:
-        radio_map: to draw.
-        scene: with an origin.
-        path: of the KMZ file.
+        radio_map: map to draw.
+        scene: of the map, with an origin.
+        path: of the .kmz file.
+
+    Raises:
+        BadInput: the lattice is not regular.
     """
-    assert scene.config.origin is not None
+    origin = scene.config.origin
+    assert origin is not None, "check_format refuses scenes without"
     ET.register_namespace("", KML)
     ET.register_namespace("gx", GX)
     values_db = radio_map.gain_db[np.isfinite(radio_map.gain_db)]
@@ -51,14 +57,14 @@ def write_kmz(radio_map: RadioMap, scene: Scene, path: Path) -> None:
     pictures = {"legend.png": _legend(norm)}
     _add_legend(top)
     corners = _corners(radio_map, scene)
-    positions = {device.device: device for device in scene.config.devices}
+    declared = {device.device: device for device in scene.config.devices}
     for row, device in enumerate(radio_map.devices):
         folder = _add(top, "Folder", name=device, open="0")
-        _radio_buttons(folder)
-        if device in positions:
-            longitude, latitude = to_geographic(scene.config.origin, [positions[device].x_m], [positions[device].y_m])
+        _add(_add(folder, "Style"), "ListStyle", listItemType="radioFolder")  # one at a time
+        if device in declared:
+            longitude, latitude = to_geographic(origin, declared[device].x_m, declared[device].y_m)
             mark = _add(top, "Placemark", name=device)
-            _add(_add(mark, "Point"), "coordinates").text = f"{longitude[0]:.8f},{latitude[0]:.8f}"
+            _add(_add(mark, "Point"), "coordinates").text = f"{longitude:.8f},{latitude:.8f}"
         for level, altitude_m in enumerate(radio_map.lattice.z_m):
             name = f"overlays/{row:03d}-{level:02d}.png"
             pictures[name] = _picture(radio_map.gain_db[row, level], norm)
@@ -66,9 +72,9 @@ def write_kmz(radio_map: RadioMap, scene: Scene, path: Path) -> None:
                            visibility="1" if row == level == 0 else "0")
             _add(_add(overlay, "Icon"), "href").text = name
             _add(_add(overlay, "LatLonQuad", GX), "coordinates").text = corners
-    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-        ET.indent(document)
-        text = ET.tostring(document, encoding="utf-8", xml_declaration=True)
+    ET.indent(document)
+    text = ET.tostring(document, encoding="utf-8", xml_declaration=True)
+    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, data in {"doc.kml": text, **pictures}.items():  # doc.kml must be the first
             archive.writestr(zipfile.ZipInfo(name, DATE), data, zipfile.ZIP_DEFLATED)
 
@@ -80,42 +86,41 @@ def _add(parent: ET.Element, tag: str, space: str = KML, **texts: str) -> ET.Ele
     return element
 
 
-def _radio_buttons(folder: ET.Element) -> None:
-    """Only one of a folder's overlays at a time."""
-    _add(_add(folder, "Style"), "ListStyle", listItemType="radioFolder")
-
-
 def _corners(radio_map: RadioMap, scene: Scene) -> str:
-    """Longitude and latitude of the outer corners of the cells: south-west, south-east, north-east, north-west."""
+    """Return longitude and latitude of the outer corners: counter-clockwise, south-west first."""
     assert scene.config.origin is not None
-    half_m, lattice = cell_m(radio_map, scene) / 2, radio_map.lattice
+    half_m, lattice = cell_size_m(radio_map, scene) / 2, radio_map.lattice
     west, east = lattice.x_m[0] - half_m, lattice.x_m[-1] + half_m
     south, north = lattice.y_m[0] - half_m, lattice.y_m[-1] + half_m
-    longitude, latitude = to_geographic(scene.config.origin, [west, east, east, west], [south, south, north, north])
+    longitude, latitude = to_geographic(scene.config.origin, [west, east, east, west],
+                                        [south, south, north, north])
     return " ".join(f"{a:.8f},{b:.8f},0" for a, b in zip(longitude, latitude))
 
 
 def _picture(gain_db: np.ndarray, norm: Normalize) -> bytes:
-    """PNG of (ny, nx) gains, north above, transparent where nothing is detected."""
+    """Return the PNG of (ny, nx) gains, north up, transparent where not detected."""
     pixels = colormaps[COLOURS](norm(np.nan_to_num(gain_db)), bytes=True)
     pixels[..., 3] = np.where(np.isfinite(gain_db), OPACITY, 0)
-    times = -(-LEAST_PIXELS // max(gain_db.shape))
+    times = -(-MIN_PIXELS // max(gain_db.shape))
+    enlarged = pixels[::-1].repeat(times, axis=0).repeat(times, axis=1)
     data = io.BytesIO()
-    Image.fromarray(pixels[::-1].repeat(times, axis=0).repeat(times, axis=1)).save(data, "PNG", optimize=True)
+    Image.fromarray(enlarged).save(data, "PNG", optimize=True)
     return data.getvalue()
 
 
 def _legend(norm: Normalize) -> bytes:
+    """Return the PNG of the colour bar."""
     figure = Figure(figsize=(1.15, 3.6), facecolor="white", layout="constrained")
     FigureCanvasAgg(figure)
-    figure.colorbar(ScalarMappable(norm, COLOURS), cax=figure.add_subplot(), label="channel gain [dB]", extend="both")
+    figure.colorbar(ScalarMappable(norm, COLOURS), cax=figure.add_subplot(),
+                    label="channel gain [dB]", extend="both")
     data = io.BytesIO()
     figure.savefig(data, dpi=90, format="png")
     return data.getvalue()
 
 
 def _add_legend(top: ET.Element) -> None:
-    """The colour bar, at the left edge of the view."""
+    """Put the colour bar at the left edge of the view."""
     legend = _add(top, "ScreenOverlay", name="legend")
     _add(_add(legend, "Icon"), "href").text = "legend.png"
     for tag, x, y in (("overlayXY", "0", "0.5"), ("screenXY", "0.01", "0.5")):

@@ -1,7 +1,6 @@
-"""Radio maps as numbers: NetCDF, CSV, NumPy."""
+"""Radio maps as numbers: NetCDF, CSV and NumPy."""
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -11,27 +10,49 @@ from radiotwin.scene import Scene
 
 
 def write_netcdf(radio_map: RadioMap, scene: Scene, path: Path) -> None:
-    """The whole map after the CF conventions; `xarray.open_dataset` reads it, and so does `RadioMap.read`."""
+    """Write NetCDF-4 after the CF conventions, for `xarray.open_dataset` and `RadioMap.read`.
+
+    Args:
+        radio_map: map to write.
+        scene: whose origin places the map on the globe.
+        path: of the .nc file.
+    """
     radio_map.placed(scene.config.origin).write(path)
 
 
 def write_csv(radio_map: RadioMap, scene: Scene, path: Path) -> None:
-    """One row a link: device, x_m, y_m, z_m, gain_db (empty: not detected), los, and sigma_db of a learned map.
+    """Write CSV with one row a link.
 
-    Nine digits bring single precision back to the bit.
+    Columns: device, x_m, y_m, z_m, gain_db (empty: not detected), los, and sigma_db of a learned
+    map. Nine digits restore single precision to the bit.
+
+    Args:
+        radio_map: map to write.
+        scene: not used.
+        path: of the .csv file.
     """
     table = radio_map.dataset.to_dataframe().reset_index()
     table = table.rename(columns={axis: f"{axis}_m" for axis in "xyz"})
     first = ["device", "x_m", "y_m", "z_m", "gain_db"]
+    rest = [name for name in table.columns if name not in first]
     with atomic_path(path) as temporary:
-        table[first + [name for name in table.columns if name not in first]].to_csv(
-            temporary, index=False, float_format="%.9g")
+        table[first + rest].to_csv(temporary, index=False, float_format="%.9g")
 
 
 def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:
-    """`numpy.load` reads it without pickling: gain_db, los and sigma_db (device, z, y, x), device, z_m, y_m, x_m."""
-    dataset, lattice = radio_map.dataset, radio_map.lattice
-    arrays: dict[str, Any] = {name: dataset[name].values for name in ("gain_db", "los", "sigma_db") if name in dataset}
+    """Write NumPy arrays, which `numpy.load` reads without pickling.
+
+    Arrays: gain_db, los and sigma_db (device, z, y, x), device, z_m, y_m, x_m.
+
+    Args:
+        radio_map: map to write.
+        scene: not used.
+        path: of the .npz file.
+    """
+    lattice, dataset = radio_map.lattice, radio_map.dataset
+    arrays = {"device": np.array(radio_map.devices), "z_m": lattice.z_m, "y_m": lattice.y_m,
+              "x_m": lattice.x_m}
+    arrays |= {name: dataset[name].values for name in ("gain_db", "los", "sigma_db")
+               if name in dataset}
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, device=np.array(radio_map.devices), z_m=lattice.z_m, y_m=lattice.y_m,
-                            x_m=lattice.x_m, **arrays)
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # no array is called allow_pickle

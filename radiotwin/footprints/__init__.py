@@ -1,8 +1,7 @@
-"""Scenes from maps: footprints of OpenStreetMap, GeoJSON and GeoPackage, extruded into watertight buildings."""
+"""Scenes from maps: footprints of OpenStreetMap, GeoJSON and GeoPackage as watertight buildings."""
 
 from radiotwin.footprints.build import MapOptions, build_scene_from_map, map_name, map_suffix
-from radiotwin.footprints.material_table import STANDARD as STANDARD_TABLE
 from radiotwin.footprints.material_table import MaterialTable, read_material_table, with_pairs
 
-__all__ = ["STANDARD_TABLE", "MapOptions", "MaterialTable", "build_scene_from_map", "map_name", "map_suffix",
+__all__ = ["MapOptions", "MaterialTable", "build_scene_from_map", "map_name", "map_suffix",
            "read_material_table", "with_pairs"]

@@ -1,7 +1,7 @@
-"""A map with footprints -> a scene folder."""
+"""Scene folders from maps with footprints."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ import shapely
 from radiotwin.errors import BadInput
 from radiotwin.footprints.building_table import building_table, height_counts
 from radiotwin.footprints.extrude import make_blocks
-from radiotwin.footprints.features import Feature, MapFile
+from radiotwin.footprints.features import Feature, MapFile, problems_of
 from radiotwin.footprints.gis_files import read_geojson, read_geopackage
 from radiotwin.footprints.heights import LEVEL_M
 from radiotwin.footprints.material_table import STANDARD, MaterialTable
@@ -25,19 +25,22 @@ from radiotwin.scene.importer import ImportedCity
 from radiotwin.scene.materials import Material, itu_material
 from radiotwin.scene.names import RESERVED_NAMES, safe_name, unique_name
 from radiotwin.scene.placement import choose_extent
-from radiotwin.scene.problems import Problem, listed
+from radiotwin.scene.problems import Problem
 from radiotwin.scene.report import BuildReport
 from radiotwin.scene.sources import scene_name
 from radiotwin.scene.surfaces import Surfaces
 from radiotwin.tables import Origin
 
 READERS: dict[str, Callable[[Path], MapFile]] = {
-    ".osm": lambda path: assemble(read_osm_xml(path)), ".osm.pbf": lambda path: assemble(read_osm_pbf(path)),
+    ".osm": lambda path: assemble(read_osm_xml(path)),
+    ".osm.pbf": lambda path: assemble(read_osm_pbf(path)),
     ".geojson": read_geojson, ".gpkg": read_geopackage}
-GROUND_MARGIN_M = 100.0
-WIDEST_M = 50e3  # in one plane, and in single precision
-DECIMALS = 6  # of an origin [degrees]: a decimetre
-SOURCES = {"height": "height tag", "building:levels": f"building:levels × {LEVEL_M:g} m", "default": "default"}
+GROUND_MARGIN_M = 100.0  # [m], of the ground plane beyond buildings and extent
+MAX_WIDTH_M = 50e3  # [m], chosen so that a plane and single precision are good enough
+ORIGIN_DECIMALS = 6  # of latitude and longitude [degrees]: a decimetre
+HEIGHT_SOURCES = {"height": "height tag", "building:levels": f"building:levels × {LEVEL_M:g} m",
+                  "default": "default"}
+Bounds = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -45,164 +48,196 @@ class MapOptions:
     """How to read a map.
 
     Attributes:
-        bbox_deg: (south, west, north, east) [degrees]: only buildings that reach into it are kept, and it becomes the
-            extent; None: all of the file.
-        default_height_m: of buildings that say nothing about theirs.
+        bbox_deg: (south, west, north, east) [degrees]: only buildings that reach into it are kept,
+            and it becomes the extent; None: all of the file.
+        default_height_m: height of buildings whose tags give none [m].
         materials: by tag.
     """
 
-    bbox_deg: tuple[float, float, float, float] | None = None
+    bbox_deg: Bounds | None = None
     default_height_m: float = 10.0
-    materials: MaterialTable = field(default_factory=lambda: STANDARD)
+    materials: MaterialTable = STANDARD
 
     def check(self) -> None:
-        """Raise BadInput for a value that cannot be."""
+        """Raise BadInput for an impossible value."""
         if not 0 < self.default_height_m <= 1000:
-            raise BadInput(f"a default height of {self.default_height_m:g} m is not possible; give more than 0 and at "
-                           "most 1000 m")
+            raise BadInput(f"a default height of {self.default_height_m:g} m is not possible; give "
+                           "more than 0 and at most 1000 m")
         if self.bbox_deg is not None:
             south, west, north, east = self.bbox_deg
             if not (-90 <= south < north <= 90 and -180 <= west < east <= 180):
-                raise BadInput(f"bbox {self.bbox_deg} is not possible; give SOUTH,WEST,NORTH,EAST in degrees, the "
-                               "south below the north and the west below the east")
+                raise BadInput(f"bbox {self.bbox_deg} is not possible; give SOUTH,WEST,NORTH,EAST "
+                               "in degrees, the south below the north and the west below the east")
 
 
 def map_suffix(source: Path | str) -> str | None:
-    """The suffix in `READERS` of a file name, or None where it is no map."""
-    return next((suffix for suffix in READERS if str(source).lower().endswith(suffix)), None)
+    """Return the suffix of a map file's name, a key of `READERS`; None for other files."""
+    name = str(source).lower()
+    return next((suffix for suffix in READERS if name.endswith(suffix)), None)
 
 
 def map_name(source: Path | str) -> str:
-    """Name of the scene made from a map.
+    """Return the name of the scene made from a map.
 
     >>> map_name("data/old town.osm.pbf")
     'old_town'
     """
-    suffix = map_suffix(source)
-    assert suffix is not None, "only for what `map_suffix` calls a map"
-    return scene_name(f"{str(source)[: -len(suffix)]}.osm")
+    text = str(source)
+    return scene_name(f"{text[:len(text) - len(map_suffix(source) or '')]}.osm")
 
 
-def build_scene_from_map(source: Path | str, out_folder: Path | str, map_options: MapOptions = MapOptions(),
-                         options: BuildOptions = BuildOptions(), check_only: bool = False) -> BuildReport:
+def build_scene_from_map(
+    source: Path | str, out_folder: Path | str, map_options: MapOptions | None = None,
+    options: BuildOptions | None = None, check_only: bool = False,
+) -> BuildReport:
     """Read footprints, extrude them, and write a scene folder with a table of all buildings.
 
     Args:
-        source: `.osm`, `.osm.pbf`, `.geojson` or `.gpkg`.
-        out_folder: scene folder to write; a scene that is already in it is replaced.
-        map_options: see there.
-        options: frequency, devices, UAVs and seed; `bbox`, `scale`, `up` and `materials` belong to other cities.
+        source: `.osm`, `.osm.pbf`, `.geojson` or `.gpkg` file.
+        out_folder: scene folder to write; a scene in it is replaced.
+        map_options: how to read the map; None: the defaults.
+        options: frequency, devices, UAVs and seed; `bbox`, `scale`, `up` and `materials` are for
+            city models. None: the defaults.
         check_only: write nothing.
 
+    Returns:
+        The report of the scene.
+
     Raises:
-        BadInput: the file cannot be read, holds no buildings (in the box), or an option is impossible.
+        BadInput: the file cannot be read, holds no buildings (in the box), or an option is
+            impossible.
     """
     path, out_folder = Path(source), Path(out_folder)
+    map_options, options = map_options or MapOptions(), options or BuildOptions()
     map_options.check()
     options.check()
     if not check_only:
         check_target(out_folder)
         if path.resolve().is_relative_to(out_folder.resolve()):
-            raise BadInput(f"{source} lies in {out_folder}, which the new scene would replace; choose another output "
-                           "folder")
+            raise BadInput(f"{source} lies in {out_folder}, which the new scene would replace; "
+                           "choose another output folder")
     if not path.is_file():
         raise BadInput(f"{path} is not a file; give a map ({', '.join(READERS)})")
     suffix = map_suffix(path)
-    assert suffix is not None, "only for what `map_suffix` calls a map"
+    if suffix is None:
+        raise BadInput(f"{path} is not a map; allowed are {', '.join(READERS)}")
     found = READERS[suffix](path)
     features = _within(found.features, map_options.bbox_deg, path)
     origin = _origin(features, map_options.bbox_deg)
-    prisms, problems = make_prisms(features, origin, map_options.materials, map_options.default_height_m)
+    prisms, problems = make_prisms(features, origin, map_options.materials,
+                                   map_options.default_height_m)
+    problems = found.problems + problems
     if not prisms:
         raise BadInput("\n".join([f"{path}: none of its {len(features)} buildings can be used:",
-                                  *(problem.message for problem in [*found.problems, *problems])]))
-    problems = found.problems + problems + _overlaps(prisms)
-    extent = choose_extent(_bounds(prisms, origin, map_options.bbox_deg))
+                                  *(problem.message for problem in problems)]))
+    problems += _overlaps(prisms)
+    extent = choose_extent(_bounds_m(prisms, origin, map_options.bbox_deg))
     city, shape_of = _city(prisms, extent.bounds, map_options.materials, problems)
     table = building_table(prisms, shape_of)
     counts = height_counts(table)
-    facts = (("buildings", f"{table['building'].nunique():,} in {len(city.names) - 1:,} blocks"),
-             ("heights from", ", ".join(f"{text}: {counts.get(key, 0):,}" for key, text in SOURCES.items())
-              + f" ({map_options.default_height_m:g} m)"),
-             ("origin", f"latitude {origin.latitude_deg}, longitude {origin.longitude_deg}"))
-    known = {"source": str(source), "seed": str(options.seed), "height_default_m": f"{map_options.default_height_m:g}",
-             "heights_from": ", ".join(f"{key} {number}" for key, number in counts.items())}
-    if map_options.bbox_deg is not None:
-        known["bbox_deg"] = ", ".join(map(repr, map_options.bbox_deg))
-    declared = Declared(str(source), map_name(source), extent, origin, known, facts)
+    declared = Declared(str(source), map_name(source), extent, origin,
+                        _provenance(str(source), counts, map_options, options),
+                        _facts(table["building"].nunique(), len(city.names) - 1, counts, origin,
+                               map_options))
     return finish_scene(city, declared, out_folder, options, check_only, table)
 
 
-def _within(features: list[Feature], bbox_deg, path: Path) -> list[Feature]:
-    """Features that reach into the box."""
+def _facts(
+    buildings: int, blocks: int, counts: dict[str, int], origin: Origin, map_options: MapOptions
+) -> tuple[tuple[str, str], ...]:
+    """Return lines for the report."""
+    heights = ", ".join(f"{text}: {counts.get(key, 0):,}" for key, text in HEIGHT_SOURCES.items())
+    return (("buildings", f"{buildings:,} in {blocks:,} blocks"),
+            ("heights from", f"{heights} ({map_options.default_height_m:g} m)"),
+            ("origin", f"latitude {origin.latitude_deg}, longitude {origin.longitude_deg}"))
+
+
+def _provenance(
+    source: str, counts: dict[str, int], map_options: MapOptions, options: BuildOptions
+) -> dict[str, str]:
+    """Return `[provenance]` of `scene.toml`."""
+    known = {"source": source, "seed": str(options.seed),
+             "height_default_m": f"{map_options.default_height_m:g}",
+             "heights_from": ", ".join(f"{key} {number}" for key, number in counts.items())}
+    if map_options.bbox_deg is not None:
+        known["bbox_deg"] = ", ".join(map(repr, map_options.bbox_deg))
+    return known
+
+
+def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> list[Feature]:
+    """Return the features that reach into the box."""
     if not features:
-        raise BadInput(f"{path} holds no buildings (closed ways or multipolygons with the tag building or "
-                       "building:part; in GeoJSON and GeoPackage polygons)")
-    low_high = np.array([feature.area.bounds for feature in features])  # an empty area has NaN
-    for feature, bounds in zip(features, low_high):
+        raise BadInput(f"{path} holds no buildings (closed ways or multipolygons with the tag "
+                       "building or building:part; in GeoJSON and GeoPackage polygons)")
+    bounds_deg = np.array([feature.area.bounds for feature in features])  # NaN of an empty area
+    for feature, bounds in zip(features, bounds_deg):
         if (np.abs(bounds) > (180, 90, 180, 90)).any():
-            raise BadInput(f"{path}: {feature.name} lies at {bounds[0]:g}, {bounds[1]:g}, which is no longitude and "
-                           "latitude in degrees; export the map in EPSG:4326, or with the name of its system")
+            raise BadInput(f"{path}: {feature.name} lies at {bounds[0]:g}, {bounds[1]:g}, which is "
+                           "no longitude and latitude in degrees; export the map in EPSG:4326, or "
+                           "with the name of its system")
     if bbox_deg is None:
         return features
     south, west, north, east = bbox_deg
     box = shapely.box(west, south, east, north)
-    kept = [feature for feature, (x0, y0, x1, y1) in zip(features, low_high)
+    kept = [feature for feature, (x0, y0, x1, y1) in zip(features, bounds_deg)
             if x0 <= east and x1 >= west and y0 <= north and y1 >= south
             and shapely.make_valid(feature.area).intersects(box)]
     if not kept:
-        west_, south_ = np.nanmin(low_high[:, :2], axis=0)
-        east_, north_ = np.nanmax(low_high[:, 2:], axis=0)
-        raise BadInput(f"{path}: no building reaches into the bbox {south:g},{west:g},{north:g},{east:g}; the file's "
-                       f"lie in {south_:.5f},{west_:.5f},{north_:.5f},{east_:.5f} (south,west,north,east)")
+        west_, south_ = np.nanmin(bounds_deg[:, :2], axis=0)
+        east_, north_ = np.nanmax(bounds_deg[:, 2:], axis=0)
+        raise BadInput(f"{path}: no building reaches into the bbox "
+                       f"{south:g},{west:g},{north:g},{east:g}; the file's lie in "
+                       f"{south_:.5f},{west_:.5f},{north_:.5f},{east_:.5f} "
+                       "(south,west,north,east)")
     return kept
 
 
-def _origin(features: list[Feature], bbox_deg) -> Origin:
-    """The middle of the box, or of the buildings."""
+def _origin(features: list[Feature], bbox_deg: Bounds | None) -> Origin:
+    """Return the middle of the box, or of the buildings."""
     if bbox_deg is None:
         bounds = np.array([feature.area.bounds for feature in features])
-        bounds = bounds[np.isfinite(bounds).all(axis=1)] if np.isfinite(bounds).any() else np.zeros((1, 4))
+        finite = np.isfinite(bounds)
+        bounds = bounds[finite.all(axis=1)] if finite.any() else np.zeros((1, 4))
         (west, south), (east, north) = bounds[:, :2].min(axis=0), bounds[:, 2:].max(axis=0)
     else:
         south, west, north, east = bbox_deg
-    return Origin(latitude_deg=round(float(south + north) / 2, DECIMALS),
-                  longitude_deg=round(float(west + east) / 2, DECIMALS))
+    return Origin(latitude_deg=round(float(south + north) / 2, ORIGIN_DECIMALS),
+                  longitude_deg=round(float(west + east) / 2, ORIGIN_DECIMALS))
 
 
-def _bounds(prisms: list[Prism], origin: Origin, bbox_deg) -> tuple[float, float, float, float]:
-    """(x_min, x_max, y_min, y_max) of the box, or of the buildings [m]."""
+def _bounds_m(prisms: list[Prism], origin: Origin, bbox_deg: Bounds | None) -> Bounds:
+    """Return (x_min, x_max, y_min, y_max) of the box, or of the buildings [m]."""
     if bbox_deg is not None:
         south, west, north, east = bbox_deg
-        x_m, y_m = to_local(origin, np.array([west, east, west, east]), np.array([south, south, north, north]))
+        x_m, y_m = to_local(origin, np.array([west, east, west, east]),
+                            np.array([south, south, north, north]))
     else:
         bounds = np.array([prism.area.bounds for prism in prisms])
         x_m, y_m = bounds[:, [0, 2]], bounds[:, [1, 3]]
     box = float(np.min(x_m)), float(np.max(x_m)), float(np.min(y_m)), float(np.max(y_m))
-    if not np.isfinite(box).all() or max(box[1] - box[0], box[3] - box[2]) > WIDEST_M:
-        raise BadInput(f"the area is {max(box[1] - box[0], box[3] - box[2]) / 1000:.0f} km wide, {WIDEST_M / 1000:g} "
-                       "km are allowed; choose a part with --bbox SOUTH,WEST,NORTH,EAST")
+    width_m = max(box[1] - box[0], box[3] - box[2])
+    if not np.isfinite(box).all() or width_m > MAX_WIDTH_M:
+        raise BadInput(f"the area is {width_m / 1000:.0f} km wide, {MAX_WIDTH_M / 1000:g} km are "
+                       "allowed; choose a part with --bbox SOUTH,WEST,NORTH,EAST")
     return box
 
 
 def _overlaps(prisms: list[Prism]) -> list[Problem]:
-    overlaps = find_overlaps(prisms)
-    if not overlaps:
-        return []
-    names = [f"{a.name} and {b.name}: {shared_m2:.0f} m²"
-             for a, b, shared_m2 in sorted(overlaps, key=lambda found: -found[2])]
-    return [Problem("warning", "", f"{len(overlaps)} pair(s) of buildings stand in one another: what they share is "
-                    f"built once ({listed(names)})")]
+    """Return a warning about buildings that overlap, the largest overlap first."""
+    overlaps = sorted(find_overlaps(prisms), key=lambda overlap: -overlap[2])
+    names = [f"{a.name} and {b.name}: {shared_m2:.0f} m²" for a, b, shared_m2 in overlaps]
+    return problems_of(names, "pair(s) of buildings overlap: their common part is built once")
 
 
-def _city(prisms: list[Prism], extent_m: tuple[float, float, float, float], table: MaterialTable,
-          problems: list[Problem]) -> tuple[ImportedCity, dict[int, str]]:
-    """The city with its ground, and prism -> shape."""
+def _city(
+    prisms: list[Prism], extent_m: Bounds, table: MaterialTable, problems: list[Problem]
+) -> tuple[ImportedCity, dict[int, str]]:
+    """Return the city with its ground, and the name of the shape of each prism."""
     bounds = np.array([prism.area.bounds for prism in prisms])
     x0, y0 = np.minimum(bounds[:, :2].min(axis=0), extent_m[::2]) - GROUND_MARGIN_M
     x1, y1 = np.maximum(bounds[:, 2:].max(axis=0), extent_m[1::2]) + GROUND_MARGIN_M
-    ground = np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]]), np.array([[0, 1, 2], [0, 2, 3]])
-    names, meshes = ["ground"], [ground]
+    corners = np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
+    names, meshes = ["ground"], [(corners, np.array([[0, 1, 2], [0, 2, 3]]))]
     materials: list[Material | None] = [itu_material(table.ground)]
     taken = {*RESERVED_NAMES, "ground"}
     shape_of: dict[int, str] = {}

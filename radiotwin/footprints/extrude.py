@@ -1,6 +1,6 @@
-"""Prisms -> watertight meshes, one for each group of prisms of one material that touch.
+"""Watertight meshes from prisms, one for each group of touching prisms of one material.
 
-Walls that lie on one another would be hit twice by a ray tracer, so neighbours of one material are united, and between
+A ray tracer would hit coincident walls twice, so neighbours of one material are united, and between
 neighbours of different materials a slot of 2 cm is left open.
 """
 
@@ -19,13 +19,14 @@ from radiotwin.progress import progress
 from radiotwin.scene.materials import Material
 from radiotwin.scene.meshes import clean
 
-SLOT_M = 0.02
-SIMPLIFY_M = 1e-3  # what a surface may move to lose a splinter; files hold single precision, 0.1 mm at 1 km
+SLOT_M = 0.02  # [m], more than the 1 cm below which the 3D map takes two surfaces for one
+# [m], how far a surface may move to remove a splinter; files hold single precision, 0.1 mm at 1 km
+SIMPLIFY_M = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """A body of the city.
+    """One mesh of the city.
 
     Attributes:
         members: indices of its prisms, the largest first.
@@ -39,27 +40,35 @@ class Block:
 
 
 def make_blocks(prisms: Sequence[Prism]) -> list[Block]:
-    """Unite prisms of one material that touch. Where blocks of different materials meet, the larger stays whole."""
+    """Unite touching prisms of one material.
+
+    Args:
+        prisms: of all buildings.
+
+    Returns:
+        The blocks; where blocks of different materials meet, the larger one stays whole.
+    """
     if not prisms:
         return []
     pairs = np.array(neighbours(prisms), dtype=int).reshape(-1, 2)
     same = np.array([prisms[a].material == prisms[b].material for a, b in pairs], dtype=bool)
     graph = coo_matrix((np.ones(same.sum()), pairs[same].T), shape=(len(prisms), len(prisms)))
     block_of = connected_components(graph, directed=False)[1]
-    volume_m3 = np.array([prism.area.area * (prism.height.top_m - prism.height.bottom_m) for prism in prisms])
+    volume_m3 = np.array([prism.area.area * (prism.height.top_m - prism.height.bottom_m)
+                          for prism in prisms])
     block_m3 = np.bincount(block_of, volume_m3)
-    before: dict[int, set[int]] = {}  # block -> prisms of larger blocks that it gives way to
+    cut_by: dict[int, set[int]] = {}  # block -> touching prisms of larger blocks
     for a, b in pairs[~same]:
         large, small = sorted((a, b), key=lambda i: (-block_m3[block_of[i]], block_of[i]))
-        before.setdefault(int(block_of[small]), set()).add(int(large))
+        cut_by.setdefault(int(block_of[small]), set()).add(int(large))
+    order = np.argsort(block_of, kind="stable")
     blocks = []
     with progress("extruding buildings", total=len(block_m3)) as advance:
-        for block, members in enumerate(_members(block_of)):
-            members = sorted(members, key=lambda i: -volume_m3[i])
-            solid = Manifold.batch_boolean([_solid(prisms[i]) for i in members], OpType.Add)
-            if block in before:
-                around = Manifold.batch_boolean([_solid(prisms[i], SLOT_M) for i in sorted(before[block])], OpType.Add)
-                solid = solid - around
+        for block, part in enumerate(np.split(order, np.cumsum(np.bincount(block_of))[:-1])):
+            members = sorted(part.tolist(), key=lambda i: -volume_m3[i])
+            solid = _union([_solid(prisms[i]) for i in members])
+            if block in cut_by:
+                solid -= _union([_solid(prisms[i], SLOT_M) for i in sorted(cut_by[block])])
             solid = solid.simplify(SIMPLIFY_M)
             if not solid.is_empty():
                 blocks.append(Block(members, prisms[members[0]].material, _mesh(solid)))
@@ -68,29 +77,36 @@ def make_blocks(prisms: Sequence[Prism]) -> list[Block]:
 
 
 def extrude(area: shapely.Polygon, bottom_m: float, top_m: float) -> trimesh.Trimesh:
-    """A watertight prism over a polygon, triangulated by earcut."""
+    """Return a watertight prism over a polygon, triangulated by earcut.
+
+    Args:
+        area: footprint [m].
+        bottom_m: lower end [m].
+        top_m: upper end [m].
+    """
     mesh = trimesh.creation.extrude_polygon(area, height=top_m - bottom_m, engine="earcut")
     mesh.apply_translation([0, 0, bottom_m])
     return mesh
 
 
-def _members(block_of: np.ndarray) -> list[list[int]]:
-    order = np.argsort(block_of, kind="stable")
-    return [part.tolist() for part in np.split(order, np.flatnonzero(np.diff(block_of[order])) + 1)]
+def _union(solids: list[Manifold]) -> Manifold:
+    return Manifold.batch_boolean(solids, OpType.Add)
 
 
 def _solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
     area = prism.area.buffer(wider_m, join_style="mitre") if wider_m else prism.area
     mesh = extrude(area, prism.height.bottom_m - wider_m, prism.height.top_m + wider_m)
-    return Manifold(Mesh64(np.ascontiguousarray(mesh.vertices, dtype=np.float64), mesh.faces.astype(np.uint64)))
+    vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
+    return Manifold(Mesh64(vertices, mesh.faces.astype(np.uint64)))
 
 
 def _mesh(solid: Manifold) -> trimesh.Trimesh:
-    """With corners that lie together made one and triangles without area dropped, unless that opens the mesh: where
-    a solid touches itself along an upright edge, its two sides need corners of their own."""
+    """Return a clean mesh, or the mesh as it is where cleaning would open it.
+
+    Cleaning merges corners that coincide and drops triangles without area. Where a solid touches
+    itself along a vertical edge, its two sides need corners of their own.
+    """
     found = solid.to_mesh64()
-    vertices, faces, _ = clean(found.vert_properties[:, :3], found.tri_verts.astype(np.int64))
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    if mesh.is_volume:
-        return mesh
-    return trimesh.Trimesh(found.vert_properties[:, :3], found.tri_verts.astype(np.int64), process=False)
+    vertices, faces = found.vert_properties[:, :3], found.tri_verts.astype(np.int64)
+    cleaned = trimesh.Trimesh(*clean(vertices, faces)[:2], process=False)
+    return cleaned if cleaned.is_volume else trimesh.Trimesh(vertices, faces, process=False)

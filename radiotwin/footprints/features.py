@@ -1,23 +1,23 @@
-"""Areas of a map file with their tags: what every reader returns."""
+"""Areas of a map file with their tags, as every reader returns them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from shapely.geometry.base import BaseGeometry
 
-from radiotwin.scene.problems import Problem
+from radiotwin.scene.problems import Problem, Severity, listed
 
-NOT_BUILT = ("", "no", "none", "false", "0")
+BUILDING_KEYS = ("building", "building:part")  # tags of OpenStreetMap
 
 
 @dataclass(frozen=True, eq=False)
 class Feature:
-    """One building or part of one.
+    """One building or part of a building.
 
     Attributes:
-        name: how the file calls it: `way/17`, `relation/3`, `feature 4`.
-        tags: as in OpenStreetMap: `building`, `building:part`, `height`, `building:levels`, `min_height`, ….
-        area: polygons, longitude and latitude [degrees]; as the file has them, so possibly invalid.
+        name: as in the file: `way/17`, `relation/3`, `feature 4`.
+        tags: as in OpenStreetMap: `building`, `building:part`, `height`, `building:levels`, ….
+        area: polygons in longitude and latitude [degrees]; as in the file, so possibly invalid.
     """
 
     name: str
@@ -26,26 +26,33 @@ class Feature:
 
     @property
     def is_part(self) -> bool:
-        return is_set(self.tags, "building:part") and not is_set(self.tags, "building")
+        """Whether it is part of a building and not a building itself."""
+        return _is_set(self.tags, "building:part") and not _is_set(self.tags, "building")
 
 
 @dataclass
 class MapFile:
-    """What a map file holds about buildings.
+    """Buildings of a map file.
 
     Attributes:
         features: buildings and parts, in the file's order.
-        problems: what could not be read, and why.
+        problems: parts of the file that could not be used, and why.
     """
 
     features: list[Feature]
     problems: list[Problem] = field(default_factory=list)
 
 
-def is_set(tags: Mapping[str, str], key: str) -> bool:
-    return tags.get(key, "").strip().lower() not in NOT_BUILT
+def problems_of(names: Sequence[str], text: str, severity: Severity = "warning") -> list[Problem]:
+    """Return one problem about several features, with their number and first names; none: empty."""
+    return [Problem(severity, "", f"{len(names)} {text} ({listed(names)})")] if names else []
 
 
 def is_building(tags: Mapping[str, str]) -> bool:
-    """Whether tags stand for something built above the ground."""
-    return (is_set(tags, "building") or is_set(tags, "building:part")) and tags.get("location") != "underground"
+    """Return whether tags describe something built above the ground."""
+    return any(_is_set(tags, key) for key in BUILDING_KEYS) \
+        and tags.get("location") != "underground"
+
+
+def _is_set(tags: Mapping[str, str], key: str) -> bool:
+    return tags.get(key, "").strip().lower() not in ("", "no", "none", "false", "0")

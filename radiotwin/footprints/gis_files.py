@@ -1,8 +1,8 @@
-"""GeoJSON and GeoPackage: areas with the columns of a table for tags.
+"""Readers of GeoJSON and GeoPackage: areas, with the columns of a table as tags.
 
-Where a file has a column `building` or `building:part`, as exports of OpenStreetMap do, only what is built counts; else
-every polygon is a building. `_` may stand for the `:` of a tag, and case does not matter. GDAL's `other_tags` are taken
-apart.
+Where a file has a column `building` or `building:part`, as exports of OpenStreetMap do, only such
+rows are buildings; else every polygon is one. `_` may stand for the `:` of a tag, and case does not
+matter. The tags in GDAL's column `other_tags` are read, too.
 """
 
 import json
@@ -16,20 +16,32 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from radiotwin.errors import BadInput
-from radiotwin.footprints.features import Feature, MapFile, is_building
-from radiotwin.scene.problems import Problem, listed
+from radiotwin.footprints.features import (
+    BUILDING_KEYS,
+    Feature,
+    MapFile,
+    is_building,
+    problems_of,
+)
 
 WGS84 = ("EPSG:4326", "OGC:CRS84", "urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:EPSG::4326")
-_ALIASES = {key.replace(":", "_"): key for key in ("building:part", "building:levels", "building:min_level",
-                                                   "building:material")}
+_ALIASES = {key.replace(":", "_"): key for key in (
+    "building:part", "building:levels", "building:min_level", "building:material")}
 _OTHER_TAGS = re.compile(r'"((?:[^"\\]|\\.)*)"\s*=>\s*"((?:[^"\\]|\\.)*)"')
 
 
 def read_geojson(path: Path) -> MapFile:
-    """Read the polygons of a GeoJSON file (RFC 7946: longitude, latitude); an older `crs` member is heeded.
+    """Read the polygons of a GeoJSON file.
+
+    Args:
+        path: file after RFC 7946 (longitude, latitude), or with an older `crs` member.
+
+    Returns:
+        The buildings.
 
     Raises:
-        BadInput: no such file, not GeoJSON, or coordinates that are no numbers; with the feature's number.
+        BadInput: no such file, not GeoJSON, or coordinates that are not numbers; with the
+            feature's number.
     """
     try:
         data = json.loads(path.read_bytes())
@@ -42,17 +54,24 @@ def read_geojson(path: Path) -> MapFile:
         raise BadInput(f"{path} is not a GeoJSON FeatureCollection; export polygons as GeoJSON")
     rows = []
     for number, feature in enumerate(features, start=1):
-        geometry, tags = (feature.get(key) or {} for key in ("geometry", "properties")) if isinstance(
-            feature, dict) else (None, None)
+        geometry, tags = (feature.get(key) or {} if isinstance(feature, dict) else None
+                          for key in ("geometry", "properties"))
         if not isinstance(geometry, dict) or not isinstance(tags, dict):
-            raise BadInput(f"{path}: feature {number} is not a GeoJSON feature; export the map again")
+            raise BadInput(f"{path}: feature {number} is not a GeoJSON feature; export the map "
+                           "again")
         name = str(feature.get("id") or tags.get("@id") or f"feature {number}")
         rows.append((name, tags, _polygons(path, number, geometry)))
-    return _features(path, rows, _crs_name(path, data))
+    return _map_file(path, rows, _crs_name(path, data))
 
 
 def read_geopackage(path: Path) -> MapFile:
     """Read the polygons of all layers of a GeoPackage, in any coordinate reference system.
+
+    Args:
+        path: `.gpkg` file.
+
+    Returns:
+        The buildings, layer by layer.
 
     Raises:
         BadInput: pyogrio is not installed, no such file, or not a GeoPackage.
@@ -60,45 +79,50 @@ def read_geopackage(path: Path) -> MapFile:
     try:
         import pyogrio
     except ImportError:
-        raise BadInput(f"{path}: GeoPackages are read with the package pyogrio, which is not installed; install it "
-                       "with `pip install 'radiotwin[gis]'`, or export the layer as GeoJSON") from None
+        raise BadInput(
+            f"{path}: GeoPackages are read with the package pyogrio, which is not installed; "
+            "install it with `pip install 'radiotwin[gis]'`, or export the layer as GeoJSON"
+        ) from None
     if not path.is_file():
         raise BadInput(f"{path} does not exist; give a GeoPackage")
     found = MapFile([])
     try:
         for layer, kind in pyogrio.list_layers(path):
-            if kind is None or "Polygon" not in kind and kind not in ("Unknown", "Geometry", "GeometryCollection"):
+            if kind is None or "Polygon" not in kind and kind not in (
+                    "Unknown", "Geometry", "GeometryCollection"):
                 continue
             meta, _, shapes, columns = pyogrio.raw.read(path, layer=layer)
-            shapes = shapely.from_wkb(shapes)
             names = [str(name) for name in meta["fields"]]
-            rows = [(f"{layer} {number}", dict(zip(names, values)), shape) for number, (shape, *values) in enumerate(
-                zip(shapes, *columns), start=1)]
-            part = _features(path, rows, meta["crs"])
+            rows = [(f"{layer} {number}", dict(zip(names, values)), shape)
+                    for number, (shape, *values) in enumerate(
+                        zip(shapely.from_wkb(shapes), *columns), start=1)]
+            part = _map_file(path, rows, meta["crs"])
             found.features += part.features
             found.problems += part.problems
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError, shapely.errors.GEOSException) as error:
+    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError,
+            shapely.errors.GEOSException) as error:
         raise BadInput(f"{path} is not a readable GeoPackage ({error}); export it again") from None
     return found
 
 
 def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None:
-    """The polygons of a GeoJSON geometry; None where it has none."""
+    """Return the polygons of a GeoJSON geometry; None if it is of another type."""
     kind = geometry.get("type")
-    rings: Any = geometry.get("coordinates")  # whatever the file has; a TypeError says that it is no list
+    coordinates: Any = geometry.get("coordinates")  # unchecked: no list raises TypeError below
     if kind not in ("Polygon", "MultiPolygon"):
         return None
     try:
-        polygons = [[np.array([place[:2] for place in ring], dtype=float) for ring in polygon]
-                    for polygon in ([rings] if kind == "Polygon" else rings)]
-        if not all(np.isfinite(ring).all() and ring.ndim == 2 for polygon in polygons for ring in polygon):
+        polygons = [[np.array([point[:2] for point in ring], dtype=float) for ring in polygon]
+                    for polygon in ([coordinates] if kind == "Polygon" else coordinates)]
+        if not all(np.isfinite(ring).all() and ring.ndim == 2
+                   for polygon in polygons for ring in polygon):
             raise ValueError
-        # A ring needs four points; GeoJSON's own rule, and what is shorter has no area anyway
+        # RFC 7946 wants at least four points a ring; shorter ones have no area anyway
         return shapely.MultiPolygon([(polygon[0], [ring for ring in polygon[1:] if len(ring) > 3])
                                      for polygon in polygons if polygon and len(polygon[0]) > 3])
     except (TypeError, ValueError, IndexError, OverflowError):
-        raise BadInput(f"{path}: feature {number} has coordinates that are not rings of finite numbers; export the map "
-                       "again") from None
+        raise BadInput(f"{path}: feature {number} has coordinates that are not rings of finite "
+                       "numbers; export the map again") from None
 
 
 def _crs_name(path: Path, data: Mapping) -> str:
@@ -108,13 +132,16 @@ def _crs_name(path: Path, data: Mapping) -> str:
     try:
         return str(crs["properties"]["name"])
     except (TypeError, KeyError):
-        raise BadInput(f"{path}: its crs is {crs!r}, which names no system; remove it (longitude, latitude) or name one"
-                       ) from None
+        raise BadInput(f"{path}: its crs is {crs!r}, which names no system; remove it (longitude, "
+                       "latitude) or name one") from None
 
 
-def _features(path: Path, rows: Iterable[tuple[str, Mapping, BaseGeometry | None]], crs: str | None) -> MapFile:
+def _map_file(
+    path: Path, rows: Iterable[tuple[str, Mapping, BaseGeometry | None]], crs: str | None
+) -> MapFile:
+    """Return the buildings among rows of name, properties and area."""
     tagged = [(name, _tags(properties), area) for name, properties, area in rows]
-    marked = any("building" in tags or "building:part" in tags for _, tags, _ in tagged)
+    marked = any(key in tags for _, tags, _ in tagged for key in BUILDING_KEYS)
     features, unusable = [], []
     for name, tags, area in tagged:
         if marked and not is_building(tags):
@@ -123,15 +150,13 @@ def _features(path: Path, rows: Iterable[tuple[str, Mapping, BaseGeometry | None
             unusable.append(name)
             continue
         features.append(Feature(name, tags if marked else tags | {"building": "yes"}, area))
-    problems = []
-    if unusable:
-        problems.append(Problem("warning", "", f"{len(unusable)} building(s) are points or lines, without an area: "
-                                f"left out ({listed(unusable)})"))
+    problems = problems_of(
+        unusable, "building(s) are points or lines, without an area: left out")
     return MapFile(_to_degrees(path, features, crs), problems)
 
 
 def _tags(properties: Mapping) -> dict[str, str]:
-    """Columns as tags; empty cells are none."""
+    """Return columns as tags, without empty cells."""
     tags: dict[str, str] = {}
     for key, value in properties.items():
         if value is None or (isinstance(value, float) and not np.isfinite(value)):
@@ -140,7 +165,8 @@ def _tags(properties: Mapping) -> dict[str, str]:
         if key == "other_tags":
             tags |= dict(_OTHER_TAGS.findall(str(value)))
         else:
-            tags[_ALIASES.get(key, key)] = f"{value:g}" if isinstance(value, float | np.floating) else str(value)
+            is_float = isinstance(value, float | np.floating)
+            tags[_ALIASES.get(key, key)] = f"{value:g}" if is_float else str(value)
     return tags
 
 
@@ -151,13 +177,16 @@ def _to_degrees(path: Path, features: list[Feature], crs: str | None) -> list[Fe
     from pyproj.exceptions import CRSError
 
     if crs is None:
-        raise BadInput(f"{path} does not say in which coordinate reference system it is; assign one (in QGIS: Layer "
+        raise BadInput(f"{path} has no coordinate reference system; assign one (in QGIS: Layer "
                        "CRS) and export it again")
     try:
         transformer = Transformer.from_crs(CRS(crs), "EPSG:4326", always_xy=True)
     except CRSError as error:
-        raise BadInput(f"{path}: its coordinate reference system {crs!r} is unknown ({error}); export it in EPSG:4326"
-                       ) from None
-    areas = [shapely.transform(feature.area, lambda places: np.column_stack(transformer.transform(*places.T)))
-             for feature in features]
-    return [Feature(feature.name, feature.tags, area) for feature, area in zip(features, areas)]
+        raise BadInput(f"{path}: its coordinate reference system {crs!r} is unknown ({error}); "
+                       "export it in EPSG:4326") from None
+
+    def project(points: np.ndarray) -> np.ndarray:
+        return np.column_stack(transformer.transform(*points.T))
+
+    return [Feature(feature.name, feature.tags, shapely.transform(feature.area, project))
+            for feature in features]

@@ -1,4 +1,4 @@
-"""What buildings are made of: tags of a map -> materials of Recommendation ITU-R P.2040."""
+"""Materials of buildings: tags of a map to materials of Recommendation ITU-R P.2040."""
 
 import tomllib
 from collections.abc import Mapping
@@ -13,11 +13,11 @@ KEY = "building:material"
 
 @dataclass(frozen=True)
 class MaterialTable:
-    """Names of ITU materials.
+    """ITU materials by tag.
 
     Attributes:
-        default: for buildings without a tag that the table knows.
-        ground: of the plane.
+        default: material of buildings without a tag of the table.
+        ground: material of the ground plane.
         by_tag: key -> value -> material; keys are looked up in this order.
     """
 
@@ -26,30 +26,44 @@ class MaterialTable:
     by_tag: Mapping[str, Mapping[str, str]]
 
     def material_of(self, tags: Mapping[str, str]) -> tuple[Material, str]:
-        """The material, and the tag that says so, as `building:material=brick`, or `default`."""
-        for key, values in self.by_tag.items():
-            for value in tags.get(key, "").lower().split(";"):
-                if value.strip() in values:
-                    return itu_material(values[value.strip()]), f"{key}={value.strip()}"
+        """Return the material of a building and its source.
+
+        Args:
+            tags: of the building; a value may be a list with `;`.
+
+        Returns:
+            The material, and the tag it follows from, as `building:material=brick`, or `default`.
+        """
+        for key, known in self.by_tag.items():
+            for value in _values(tags, key):
+                if value in known:
+                    return itu_material(known[value]), f"{key}={value}"
         return itu_material(self.default), "default"
 
     def unknown(self, tags: Mapping[str, str]) -> str | None:
-        """The value of `building:material` where the table does not know it."""
-        values = [value.strip() for value in tags.get(KEY, "").lower().split(";") if value.strip()]
-        return values[0] if values and not any(value in self.by_tag.get(KEY, {}) for value in values) else None
+        """Return the value of `building:material` if it is not in the table."""
+        values = [value for value in _values(tags, KEY) if value]
+        known = self.by_tag.get(KEY, {})
+        return values[0] if values and not any(value in known for value in values) else None
 
 
-# Natural stone has no entry of its own in P.2040: dense stone is taken as marble, sandstone as concrete.
+def _values(tags: Mapping[str, str], key: str) -> list[str]:
+    return [value.strip() for value in tags.get(key, "").lower().split(";")]
+
+
+# Natural stone has no entry in P.2040: dense stone is taken as marble, sandstone as concrete
 STANDARD = MaterialTable(
     default="concrete", ground="asphalt_concrete",
     by_tag={
         KEY: {
             "concrete": "concrete", "reinforced_concrete": "concrete", "cement_block": "concrete",
             "sandstone": "concrete",
-            "brick": "brick", "bricks": "brick", "clay": "brick", "masonry": "brick", "plastered_brick": "brick",
+            "brick": "brick", "bricks": "brick", "clay": "brick", "masonry": "brick",
+            "plastered_brick": "brick",
             "wood": "wood", "timber_framing": "wood", "log": "wood",
             "glass": "glass", "mirror": "glass",
-            "metal": "metal", "steel": "metal", "tin": "metal", "aluminium": "metal", "copper": "metal",
+            "metal": "metal", "steel": "metal", "tin": "metal", "aluminium": "metal",
+            "copper": "metal",
             "stone": "marble", "limestone": "marble", "granite": "marble", "marble": "marble",
         },
         "building": {"greenhouse": "glass"},
@@ -57,7 +71,14 @@ STANDARD = MaterialTable(
 
 
 def read_material_table(path: Path | str) -> MaterialTable:
-    """The standard table with what a TOML file says otherwise: `default`, `ground`, tables named after keys of tags.
+    """Read a TOML file that changes the standard table.
+
+    Args:
+        path: file with `default`, `ground`, and tables named after keys of tags, which are looked
+            up in the order of the file, before the other keys of the standard table.
+
+    Returns:
+        The changed table.
 
     Raises:
         BadInput: no such file, not TOML, or a material that is not in ITU-R P.2040.
@@ -66,36 +87,44 @@ def read_material_table(path: Path | str) -> MaterialTable:
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise BadInput(f"{path} cannot be read: {error}; give a TOML file with materials by tag") from None
+        raise BadInput(f"{path} cannot be read: {error}; give a TOML file with materials by tag"
+                       ) from None
     except tomllib.TOMLDecodeError as error:
         raise BadInput(f"{path} is not valid TOML: {error}") from None
     own = {name: data.pop(name) for name in ("default", "ground") if name in data}
+    named: list[tuple[str, object]] = list(own.items())
     for key, values in data.items():
         if not isinstance(values, dict):
-            raise BadInput(f"{path}: {key} = {values!r} stands alone; write it under the key of its tag, for example "
-                           f'["{KEY}"]')
-    named = [*own.items(), *((f"[{key}] {value}", name)
-                             for key, values in data.items() for value, name in values.items())]
-    for place, name in named:
+            raise BadInput(f"{path}: {key} = {values!r} is in no table; write it under the key of "
+                           f'its tag, for example ["{KEY}"]')
+        named += [(f"[{key}] {value}", name) for value, name in values.items()]
+    for entry, name in named:
         if not isinstance(name, str):
-            raise BadInput(f"{path}: {place} = {name!r}; allowed is the name of an ITU material")
+            raise BadInput(f"{path}: {entry} = {name!r}; allowed is the name of an ITU material")
         try:
             itu_material(name)
         except BadInput as error:
-            raise BadInput(f"{path}: {place}: {error}") from None
-    by_tag = {key: dict(STANDARD.by_tag.get(key, {})) | {value.lower(): name for value, name in values.items()}
+            raise BadInput(f"{path}: {entry}: {error}") from None
+    by_tag = {key: dict(STANDARD.by_tag.get(key, {}))
+              | {value.lower(): name for value, name in values.items()}
               for key, values in data.items()}
-    return replace(STANDARD, **own, by_tag=by_tag | {k: v for k, v in STANDARD.by_tag.items() if k not in data})
+    rest = {key: known for key, known in STANDARD.by_tag.items() if key not in data}
+    return replace(STANDARD, **own, by_tag=by_tag | rest)
 
 
 def with_pairs(table: MaterialTable, pairs: Mapping[str, str]) -> MaterialTable:
-    """The table with values of `building:material`, or `default` and `ground`, replaced.
+    """Return a table with some entries replaced.
+
+    Args:
+        table: to change.
+        pairs: value of `building:material`, or `default` or `ground` -> ITU material.
 
     Raises:
-        BadInput: no ITU material.
+        BadInput: a material is not in ITU-R P.2040.
     """
     for name in pairs.values():
         itu_material(name)
     own = {name: itu for name, itu in pairs.items() if name in ("default", "ground")}
-    values = dict(table.by_tag[KEY]) | {name.lower(): itu for name, itu in pairs.items() if name not in own}
-    return replace(table, **own, by_tag=dict(table.by_tag) | {KEY: values})
+    values = {name.lower(): itu for name, itu in pairs.items() if name not in own}
+    return replace(table, **own,
+                   by_tag=dict(table.by_tag) | {KEY: dict(table.by_tag[KEY]) | values})

@@ -1,4 +1,4 @@
-"""Plain `.osm` files: the XML of OpenStreetMap's API, of Overpass and of JOSM."""
+"""Reader of `.osm` files: the XML of OpenStreetMap's API, of Overpass and of JOSM."""
 
 import math
 from pathlib import Path
@@ -11,8 +11,15 @@ from radiotwin.safe_xml import parse_elements
 def read_osm_xml(path: Path) -> OsmElements:
     """Read all nodes, ways and relations that are not deleted.
 
+    Args:
+        path: `.osm` file.
+
+    Returns:
+        The elements.
+
     Raises:
-        BadInput: no such file, malformed XML, not a map of OpenStreetMap, or an impossible value; with file and line.
+        BadInput: no such file, malformed XML, not a map of OpenStreetMap, or an impossible value;
+            with file and line.
     """
     reader = _Reader(path)
     parse_elements(path, reader.start, reader.end)
@@ -20,7 +27,9 @@ def read_osm_xml(path: Path) -> OsmElements:
 
 
 class _Reader:
-    def __init__(self, path: Path):
+    """Callbacks of the XML parser that collect the elements of one file."""
+
+    def __init__(self, path: Path) -> None:
         self.path = path
         self.elements = OsmElements()
         self.depth = 0
@@ -29,8 +38,9 @@ class _Reader:
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
         self.depth += 1
         if self.depth == 1 and tag != "osm":
-            raise BadInput(f"{self.path}, line {line}: the file begins with <{tag}>, not <osm>; give a map in "
-                           "OpenStreetMap's XML, as its export, Overpass ([out:xml]) or JOSM make it")
+            raise BadInput(f"{self.path}, line {line}: the file begins with <{tag}>, not <osm>; "
+                           "give a map in OpenStreetMap's XML, as its export, Overpass "
+                           "([out:xml]) or JOSM make it")
         if self.depth == 2:
             self.open = None
             if attributes.get("action") != "delete" and attributes.get("visible") != "false":
@@ -43,8 +53,9 @@ class _Reader:
 
     def _element(self, tag: str, attributes: dict[str, str], line: int) -> None:
         if tag == "node":
-            place = self._degrees(attributes, "lon", 180, line), self._degrees(attributes, "lat", 90, line)
-            self.elements.places[self._integer(attributes, "id", line)] = place
+            position = (self._degrees(attributes, "lon", 180, line),
+                        self._degrees(attributes, "lat", 90, line))
+            self.elements.positions[self._integer(attributes, "id", line)] = position
         elif tag == "way":
             self.open = self.elements.ways[self._integer(attributes, "id", line)] = Way([])
         elif tag == "relation":
@@ -56,22 +67,24 @@ class _Reader:
             self.open.tags[attributes.get("k", "")] = attributes.get("v", "")
         elif tag == "nd" and isinstance(self.open, Way):
             self.open.nodes.append(self._integer(attributes, "ref", line))
-        elif tag == "member" and isinstance(self.open, Relation) and attributes.get("type") == "way":
-            self.open.members.append((self._integer(attributes, "ref", line), attributes.get("role", "")))
+        elif (tag == "member" and isinstance(self.open, Relation)
+              and attributes.get("type") == "way"):
+            way = self._integer(attributes, "ref", line)
+            self.open.members.append((way, attributes.get("role", "")))
 
     def _integer(self, attributes: dict[str, str], name: str, line: int) -> int:
         try:
             return int(attributes[name])
         except (KeyError, ValueError):
-            raise BadInput(f"{self.path}, line {line}: {name}={attributes.get(name)!r} is not a whole number; export "
-                           "the map again") from None
+            raise BadInput(f"{self.path}, line {line}: {name}={attributes.get(name)!r} is not a "
+                           "whole number; export the map again") from None
 
-    def _degrees(self, attributes: dict[str, str], name: str, most: float, line: int) -> float:
+    def _degrees(self, attributes: dict[str, str], name: str, limit: float, line: int) -> float:
         try:
             value = float(attributes[name])
         except (KeyError, ValueError):
             value = math.nan
-        if not -most <= value <= most:
-            raise BadInput(f"{self.path}, line {line}: a node has {name}={attributes.get(name)!r}; allowed is -{most} "
-                           f"to {most} degrees; export the map again")
+        if not -limit <= value <= limit:
+            raise BadInput(f"{self.path}, line {line}: a node has {name}={attributes.get(name)!r}; "
+                           f"allowed is -{limit} to {limit} degrees; export the map again")
         return value

@@ -1,4 +1,4 @@
-"""Buildings of an area from OpenStreetMap's data base, over the network (Overpass API [1]).
+"""Download of an area's buildings from OpenStreetMap's database (Overpass API [1]).
 
 [1] https://wiki.openstreetmap.org/wiki/Overpass_API
 """
@@ -11,14 +11,17 @@ from pathlib import Path
 
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.files import atomic_path
+from radiotwin.footprints.features import BUILDING_KEYS
 
 SERVER = "https://overpass-api.de/api/interpreter"
-TIMEOUT_S = 180
-MOST_KM2 = 100.0  # what a public server is fairly asked for at once
+TIMEOUT_S = 180  # [s], the default of Overpass itself
+MAX_AREA_KM2 = 100.0  # [km²], chosen so that one request does not burden a public server
 
 
-def download_osm(path: Path, bbox_deg: tuple[float, float, float, float], server: str = SERVER) -> None:
-    """Write the buildings of an area as an `.osm` file.
+def download_osm(
+    path: Path, bbox_deg: tuple[float, float, float, float], server: str = SERVER
+) -> None:
+    """Download the buildings of an area to an `.osm` file.
 
     Args:
         path: `.osm` file that does not exist yet.
@@ -34,22 +37,27 @@ def download_osm(path: Path, bbox_deg: tuple[float, float, float, float], server
     if path.suffix.lower() != ".osm":
         raise BadInput(f"--overpass writes {path}, which is not called .osm; choose such a name")
     if path.exists():
-        raise BadInput(f"{path} exists already; leave --overpass out to build from it, or choose another name")
+        raise BadInput(f"{path} exists already; leave --overpass out to build from it, or choose "
+                       "another name")
     south, west, north, east = bbox_deg
-    area_m2, _ = Geod(ellps="WGS84").polygon_area_perimeter([west, east, east, west], [south, south, north, north])
-    if abs(area_m2) > MOST_KM2 * 1e6:
-        raise BadInput(f"--overpass: {abs(area_m2) / 1e6:.0f} km² are too much for a public server, {MOST_KM2:g} km² "
-                       "are allowed; make --bbox smaller, or download an extract (.osm.pbf)")
+    area_m2, _ = Geod(ellps="WGS84").polygon_area_perimeter(
+        [west, east, east, west], [south, south, north, north])
+    if abs(area_m2) > MAX_AREA_KM2 * 1e6:
+        raise BadInput(f"--overpass: {abs(area_m2) / 1e6:.0f} km² are too much for a public "
+                       f"server, {MAX_AREA_KM2:g} km² are allowed; make --bbox smaller, or "
+                       "download an extract (.osm.pbf)")
     box = ",".join(f"{value:.7f}" for value in bbox_deg)
-    kinds = "".join(f'{kind}["{key}"]({box});' for kind in ("way", "relation") for key in ("building", "building:part"))
-    query = f"[out:xml][timeout:{TIMEOUT_S}];({kinds});(._;>;);out body;"
-    request = urllib.request.Request(server, urllib.parse.urlencode({"data": query}).encode(),
-                                     {"User-Agent": "radiotwin (https://pypi.org/project/radiotwin)"})
+    selectors = "".join(f'{kind}["{key}"]({box});' for kind in ("way", "relation")
+                        for key in BUILDING_KEYS)
+    query = f"[out:xml][timeout:{TIMEOUT_S}];({selectors});(._;>;);out body;"
+    request = urllib.request.Request(
+        server, urllib.parse.urlencode({"data": query}).encode(),
+        {"User-Agent": "radiotwin (https://pypi.org/project/radiotwin)"})
     try:
-        with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer, atomic_path(path) as temporary:
-            with open(temporary, "wb") as file:
-                shutil.copyfileobj(answer, file)
+        with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer, \
+                atomic_path(path) as temporary, open(temporary, "wb") as file:
+            shutil.copyfileobj(answer, file)
     except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
         reason = getattr(error, "reason", error)
-        raise RunFailed(f"--overpass needs a network, and {server} did not answer ({reason}); try again later, or "
-                        "download an extract and give the file") from None
+        raise RunFailed(f"--overpass needs a network, and {server} did not answer ({reason}); try "
+                        "again later, or download an extract and give the file") from None

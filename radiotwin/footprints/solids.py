@@ -1,36 +1,41 @@
-"""Areas with tags -> upright prisms in the local frame, and everything that was wrong with them."""
+"""Prisms in the local frame from areas with tags, and a report of their defects."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import shapely
+from shapely.geometry.base import BaseGeometry
 
-from radiotwin.footprints.features import Feature
+from radiotwin.footprints.features import Feature, problems_of
 from radiotwin.footprints.heights import Height, height_of
 from radiotwin.footprints.material_table import MaterialTable
 from radiotwin.geodesy import to_local
 from radiotwin.scene.materials import Material
-from radiotwin.scene.problems import Problem, Severity, listed
+from radiotwin.scene.problems import Problem, Severity
 from radiotwin.tables import Origin
 
-GRID_M = 0.01  # corners are rounded to it, so that walls that are meant to lie on one another do
-SLIVER_AREA_M2 = 1.0
-SLIVER_WIDTH_M = 0.3  # mean width; the thickness of one wall
-OVERLAP_M2 = 1.0
-WHOLE = 0.9  # of an outline that its parts cover for it to be left out
-PINCH_M = 0.01  # taken off an area whose outline touches itself, so that it does not
+GRID_M = 0.01  # [m], corners are rounded to it, so that walls meant to coincide do
+SLIVER_AREA_M2 = 1.0  # [m²]
+SLIVER_WIDTH_M = 0.3  # [m], mean width; the thickness of one wall
+OVERLAP_M2 = 1.0  # [m²], smaller overlaps are not reported
+MIN_COVERED_SHARE = 0.9  # of an outline that its parts cover for it to be left out
+SHRINK_M = 0.01  # [m], removed from an area whose outline touches itself, to separate its rings
+
+Area = tuple[Feature, shapely.MultiPolygon]
 
 
 @dataclass(frozen=True, eq=False)
 class Prism:
-    """A solid with an upright wall around it and a flat roof.
+    """A solid with vertical walls and a flat roof.
 
     Attributes:
-        name: of the feature; several prisms may have one.
+        name: of the feature; several prisms may share one.
         area: one valid polygon in the local frame [m].
-        height: bottom and top, and how they are known.
-        material, material_from: and the tag that says so, or `default`.
+        height: bottom and top, and their source.
+        material: of its surfaces.
+        material_from: the tag that the material follows from, or `default`.
     """
 
     name: str
@@ -39,135 +44,162 @@ class Prism:
     material: Material
     material_from: str
 
-    def meets(self, other: "Prism", slack_m: float = 0.0) -> bool:
-        """Whether both stand at one height somewhere; with slack, also where one stands on the other."""
-        return (min(self.height.top_m, other.height.top_m) - max(self.height.bottom_m, other.height.bottom_m)
-                > -slack_m)
+    def overlaps_in_height(self, other: "Prism", slack_m: float = 0.0) -> bool:
+        """Return whether both share some height; with slack, also where one is on the other."""
+        top_m = min(self.height.top_m, other.height.top_m)
+        return top_m - max(self.height.bottom_m, other.height.bottom_m) > -slack_m
 
 
-def make_prisms(features: Sequence[Feature], origin: Origin, table: MaterialTable, default_height_m: float
-                ) -> tuple[list[Prism], list[Problem]]:
-    """Prisms of buildings and their parts.
+def make_prisms(
+    features: Sequence[Feature], origin: Origin, table: MaterialTable, default_height_m: float
+) -> tuple[list[Prism], list[Problem]]:
+    """Make prisms from buildings and their parts.
 
     Args:
         features: buildings and parts.
         origin: of the local frame.
-        table: what tags are made of.
-        default_height_m: of a building that says nothing about its height.
+        table: materials by tag.
+        default_height_m: of a building whose tags give no height [m].
+
+    Returns:
+        The prisms, parts first, and the defects that were found.
     """
-    notes = _Notes()
-    areas = [_clean(feature, origin, notes) for feature in features]
-    wholes = [(feature, area) for feature, area in zip(features, areas) if area is not None and not feature.is_part]
-    parts = [(feature, area) for feature, area in zip(features, areas) if area is not None and feature.is_part]
+    defects = _Defects()
+    areas = [(feature, area) for feature in features
+             if (area := _clean(feature, origin, defects)) is not None]
+    wholes = [(feature, area) for feature, area in areas if not feature.is_part]
+    parts = [(feature, area) for feature, area in areas if feature.is_part]
     prisms = []
-    for feature, area in _without_parts(wholes, parts, notes):
+    for feature, area in _resolve_parts(wholes, parts, defects):
         height = height_of(feature.tags, default_height_m)
         if height.unusable:
-            notes.add("height", f"{feature.name}: {', '.join(height.unusable)}")
+            defects.add("height", f"{feature.name}: {', '.join(height.unusable)}")
         if height.bottom_m >= height.top_m:
-            notes.add("upside down", feature.name)
+            defects.add("upside down", feature.name)
             continue
         unknown = table.unknown(feature.tags)
         if unknown:
-            notes.add("material", f"{feature.name}: {unknown}")
+            defects.add("material", f"{feature.name}: {unknown}")
         material, material_from = table.material_of(feature.tags)
-        prisms += [Prism(feature.name, polygon, height, material, material_from) for polygon in shapely.get_parts(area)]
-    return prisms, notes.problems()
+        prisms += [Prism(feature.name, polygon, height, material, material_from)
+                   for polygon in shapely.get_parts(area)]
+    return prisms, defects.problems()
 
 
-class _Notes:
-    """Findings of one kind, gathered."""
+class _Defects:
+    """Defects of features, gathered by kind."""
 
-    _KINDS: dict[str, tuple[Severity, str]] = {
+    _KINDS: ClassVar[dict[str, tuple[Severity, str]]] = {
         "invalid": ("fixed", "outline(s) cut or touched themselves: taken apart"),
         "no area": ("warning", "building(s) have no area: left out"),
-        "sliver": ("warning", f"sliver(s), under {SLIVER_AREA_M2:g} m² or {SLIVER_WIDTH_M:g} m wide: left out"),
-        "height": ("warning", "building(s) have a height, a level or a bottom that cannot be; the next tag, or the "
-                              "default, was taken"),
-        "upside down": ("warning", "building(s) begin (min_height) no lower than they end: left out"),
-        "material": ("warning", "building(s) have a building:material that the table does not know; the default was "
-                                "taken. Name it in --material-table or with --material NAME=ITU"),
-        "rest": ("warning", f"outline(s) are covered to less than {WHOLE:.0%} by their parts: the rest stands at the "
-                            "outline's own height"),
+        "sliver": ("warning", f"sliver(s), under {SLIVER_AREA_M2:g} m² or {SLIVER_WIDTH_M:g} m "
+                              "wide: left out"),
+        "height": ("warning", "building(s) have an impossible height, level or bottom; the next "
+                              "tag, or the default, was taken"),
+        "upside down": ("warning", "building(s) begin (min_height) no lower than they end: left "
+                                   "out"),
+        "material": ("warning", "building(s) have a building:material that is not in the table; "
+                                "the default was taken. Name it in --material-table or with "
+                                "--material NAME=ITU"),
+        "rest": ("warning", f"outline(s) are covered to less than {MIN_COVERED_SHARE:.0%} by their "
+                            "parts: the rest keeps the outline's own height"),
     }
 
-    def __init__(self):
+    def __init__(self) -> None:
         self.names: dict[str, list[str]] = {}
 
     def add(self, kind: str, name: str) -> None:
         self.names.setdefault(kind, []).append(name)
 
     def problems(self) -> list[Problem]:
-        return [Problem(severity, "", f"{len(self.names[kind])} {text} ({listed(self.names[kind])})")
-                for kind, (severity, text) in self._KINDS.items() if kind in self.names]
+        return [problem for kind, (severity, text) in self._KINDS.items()
+                for problem in problems_of(self.names.get(kind, ()), text, severity)]
 
 
-def _clean(feature: Feature, origin: Origin, notes: _Notes):
-    """The valid area in the local frame, a polygon or several; None where nothing is left."""
-    area = shapely.transform(feature.area, lambda places: np.column_stack(to_local(origin, *places.T)))
+def _clean(feature: Feature, origin: Origin, defects: _Defects) -> shapely.MultiPolygon | None:
+    """Return the valid area in the local frame; None where nothing is left."""
+    def to_metres(points: np.ndarray) -> np.ndarray:
+        return np.column_stack(to_local(origin, *points.T))
+
+    area = shapely.transform(feature.area, to_metres)
     invalid = not area.is_valid
     area = _polygons(shapely.make_valid(area))
     if area.area < GRID_M**2:
-        notes.add("no area", feature.name)
+        defects.add("no area", feature.name)
         return None
     area = _polygons(shapely.set_precision(area, GRID_M))
     if any(_touches_itself(polygon) for polygon in shapely.get_parts(area)):
-        area, invalid = _polygons(shapely.set_precision(area.buffer(-PINCH_M, join_style="mitre"), GRID_M / 2)), True
-    kept = [polygon for polygon in shapely.get_parts(area)
-            if polygon.area >= SLIVER_AREA_M2 and 2 * polygon.area / polygon.length >= SLIVER_WIDTH_M]
+        shrunk = area.buffer(-SHRINK_M, join_style="mitre")
+        area, invalid = _polygons(shapely.set_precision(shrunk, GRID_M / 2)), True
+    kept = [polygon for polygon in shapely.get_parts(area) if polygon.area >= SLIVER_AREA_M2
+            and 2 * polygon.area / polygon.length >= SLIVER_WIDTH_M]
     if len(kept) < shapely.get_num_geometries(area):
-        notes.add("sliver", feature.name)
+        defects.add("sliver", feature.name)
     if invalid:
-        notes.add("invalid", feature.name)
+        defects.add("invalid", feature.name)
     return shapely.MultiPolygon(kept) if kept else None
 
 
-def _polygons(area):
-    """The polygons of any geometry, as one MultiPolygon."""
+def _polygons(area: BaseGeometry) -> shapely.MultiPolygon:
+    """Return the polygons of any geometry."""
     flat = shapely.get_parts(shapely.get_parts(area))
     return shapely.MultiPolygon([part for part in flat if part.geom_type == "Polygon"])
 
 
 def _touches_itself(polygon: shapely.Polygon) -> bool:
-    """Whether two rings, or one ring twice, go through one point."""
-    places = np.concatenate([shapely.get_coordinates(ring)[:-1] for ring in (polygon.exterior, *polygon.interiors)])
-    return len(np.unique(places, axis=0)) < len(places)
+    """Return whether two rings, or one ring twice, go through one point."""
+    rings = (polygon.exterior, *polygon.interiors)
+    points = np.concatenate([shapely.get_coordinates(ring)[:-1] for ring in rings])
+    return len(np.unique(points, axis=0)) < len(points)
 
 
-def _without_parts(wholes, parts, notes: _Notes):
-    """Parts, with what they do not say taken from their building, and buildings without what their parts stand for."""
+def _resolve_parts(wholes: list[Area], parts: list[Area], defects: _Defects) -> list[Area]:
+    """Return parts with inherited tags, and buildings without the areas of their parts."""
     tree = shapely.STRtree([area for _, area in wholes])
-    of_whole: dict[int, list] = {}
-    result = []
+    parts_of: dict[int, list[shapely.MultiPolygon]] = {}
+    resolved = []
     for feature, area in parts:
-        middle = area.representative_point()
-        owners = [int(index) for index in tree.query(middle, predicate="within")]
+        inside = area.representative_point()
+        owners = [int(index) for index in tree.query(inside, predicate="within")]
         if owners:
             owner = min(owners, key=lambda index: wholes[index][1].area)
-            of_whole.setdefault(owner, []).append(area)
-            inherited = {key: value for key, value in wholes[owner][0].tags.items() if key not in ("min_height",
-                                                                                                   "building:min_level")}
-            if "building:levels" in feature.tags and "height" not in feature.tags:
-                inherited.pop("height", None)
-            feature = replace(feature, tags=inherited | dict(feature.tags))
-        result.append((feature, area))
+            parts_of.setdefault(owner, []).append(area)
+            feature = _inherit(feature, wholes[owner][0])
+        resolved.append((feature, area))
     for index, (feature, area) in enumerate(wholes):
-        if index in of_whole:
-            rest = _polygons(area.difference(shapely.union_all(of_whole[index])))
-            if rest.area <= (1 - WHOLE) * area.area:
+        if index in parts_of:
+            rest = _polygons(area.difference(shapely.union_all(parts_of[index])))
+            if rest.area <= (1 - MIN_COVERED_SHARE) * area.area:
                 continue
-            notes.add("rest", feature.name)
-            area = shapely.MultiPolygon([polygon for polygon in rest.geoms if polygon.area >= SLIVER_AREA_M2])
-        result.append((feature, area))
-    return result
+            defects.add("rest", feature.name)
+            area = shapely.MultiPolygon([polygon for polygon in rest.geoms
+                                         if polygon.area >= SLIVER_AREA_M2])
+        resolved.append((feature, area))
+    return resolved
+
+
+def _inherit(part: Feature, whole: Feature) -> Feature:
+    """Return a part with the tags of its building that it lacks, except the bottom."""
+    tags = {key: value for key, value in whole.tags.items()
+            if key not in ("min_height", "building:min_level")}
+    if "building:levels" in part.tags and "height" not in part.tags:
+        tags.pop("height", None)  # which would take precedence over the part's own levels
+    return replace(part, tags=tags | dict(part.tags))
 
 
 def find_overlaps(prisms: Sequence[Prism]) -> list[tuple[Prism, Prism, float]]:
-    """Pairs of prisms of different buildings that stand in one another, with the area they share [m²]."""
+    """Find prisms of different buildings that overlap.
+
+    Args:
+        prisms: of all buildings.
+
+    Returns:
+        Pairs of prisms, with the area they share [m²].
+    """
     found = []
-    for a, b in _pairs(prisms):
+    for a, b in _touching_pairs(prisms):
         first, second = prisms[a], prisms[b]
-        if first.name == second.name or not first.meets(second):
+        if first.name == second.name or not first.overlaps_in_height(second):
             continue
         shared_m2 = first.area.intersection(second.area).area
         if shared_m2 > OVERLAP_M2:
@@ -176,17 +208,20 @@ def find_overlaps(prisms: Sequence[Prism]) -> list[tuple[Prism, Prism, float]]:
 
 
 def neighbours(prisms: Sequence[Prism]) -> list[tuple[int, int]]:
-    """Pairs of prisms that share a piece of wall, of roof or of their inside; not those that touch in a corner only."""
-    pairs = []
-    for a, b in _pairs(prisms):
-        if prisms[a].meets(prisms[b], slack_m=GRID_M):
-            shared = prisms[a].area.intersection(prisms[b].area)
-            if shared.length > GRID_M:
-                pairs.append((a, b))
-    return pairs
+    """Find prisms that share part of a wall, a roof or their inside, and not only a corner.
+
+    Args:
+        prisms: of all buildings.
+
+    Returns:
+        Pairs of indices, the lower one first.
+    """
+    return [(a, b) for a, b in _touching_pairs(prisms)
+            if prisms[a].overlaps_in_height(prisms[b], slack_m=GRID_M)
+            and prisms[a].area.intersection(prisms[b].area).length > GRID_M]
 
 
-def _pairs(prisms: Sequence[Prism]) -> list[tuple[int, int]]:
+def _touching_pairs(prisms: Sequence[Prism]) -> list[tuple[int, int]]:
     areas = [prism.area for prism in prisms]
     a, b = shapely.STRtree(areas).query(areas, predicate="intersects") if areas else ([], [])
     return [(int(i), int(j)) for i, j in zip(a, b) if i < j]

@@ -1,4 +1,4 @@
-"""The power that reflected and diffracted paths carry, from the geometry of a 3D map alone."""
+"""Power of reflected and diffracted paths, computed from the geometry of a 3D map alone."""
 
 from radiotwin.paths.edges import Edges, extract_edges
 from radiotwin.paths.facets import Facets, extract_facets

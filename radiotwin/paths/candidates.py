@@ -1,95 +1,116 @@
-"""Sequences of turns that are worth trying from one device."""
+"""Sequences of interactions that are tried from one device."""
 
+from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
 
 from radiotwin.paths.edges import extract_edges
-from radiotwin.paths.facets import checked_topology, extract_facets
+from radiotwin.paths.facets import extract_facets
 from radiotwin.paths.images import Candidates
-from radiotwin.paths.shooting import Chains, device_chains, edge_views
+from radiotwin.paths.shooting import FacetSequences, device_sequences, edge_sequences
 from radiotwin.paths.surfaces import OFFSET, pack
+from radiotwin.paths.topology import build_topology, expand
 from radiotwin.scene.citymap import CityMap
 
 DEVICE_RAYS = 100_000  # half a degree apart
-# What lies behind an edge is seen from many of its points, so fewer rays do. A second mirror behind the edge would
-# double the time for 0.01 dB.
-EDGE_RAYS, EDGE_STEP_M, BEHIND_EDGE = 300, 20.0, 1
+# The surroundings of an edge are seen from many of its points, so fewer rays do
+EDGE_RAYS, EDGE_STEP_M = 300, 20.0
+MAX_AFTER_EDGE = 1  # reflections; a second one would double the time for 0.01 dB
 
 
 @lru_cache(maxsize=4)
-def search_of(city: CityMap, depth: int) -> "CandidateSearch":
-    """The search of a city, made once: what lies behind its edges is seen once for all devices."""
+def candidate_search(city: CityMap, depth: int) -> "CandidateSearch":
+    """Return the search of a city, made once: it keeps the surroundings of edges it has seen."""
     return CandidateSearch(city, depth)
 
 
 class CandidateSearch:
-    """Candidates of devices in one city; what does not depend on the device is found once.
+    """Search for the candidates of devices in one city.
 
     Args:
-        city: the map.
-        depth: most turns of a path, at least 1.
+        city: 3D map.
+        depth: maximum number of interactions of a path, at least 1.
 
     Attributes:
-        facets, edges, surfaces: of the city.
+        facets: of the city.
+        edges: of the city.
+        surfaces: both, for compiled code.
         ground: row of the ground in `surfaces.planes`.
     """
 
-    def __init__(self, city: CityMap, depth: int):
-        topology = checked_topology(city)
+    def __init__(self, city: CityMap, depth: int) -> None:
+        topology = build_topology(city)
         self.facets = extract_facets(city, topology)
         self.edges = extract_edges(city, self.facets, topology)
         self.surfaces = pack(self.facets, self.edges)
         self.ground = len(self.facets)
         self._city, self._depth = city, depth
-        self._behind = min(BEHIND_EDGE, depth - 1)
-        self._views: dict[int, Chains] = {}
-        pairs = np.column_stack([self.edges.facet.ravel(), np.repeat(np.arange(len(self.edges)), 2)])
-        pairs = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
-        self._edge_of_facet = pairs[:, 1]
-        self._first_edge = np.searchsorted(pairs[:, 0], np.arange(len(self.facets) + 2))
+        self._after = min(MAX_AFTER_EDGE, depth - 1)
+        self._from_edge: dict[int, FacetSequences] = {}
+        facet = self.edges.facet.ravel()
+        edge = np.repeat(np.arange(len(self.edges)), 2)
+        order = np.lexsort((edge, facet))
+        self._edge_of_facet = edge[order]
+        self._first_edge = np.searchsorted(facet[order], np.arange(len(self.facets) + 2))
 
     def candidates(self, device_m: np.ndarray) -> Candidates:
-        """Sequences from a device at (3,) [m], those without an edge first."""
-        normal, offset_m = self.surfaces.planes[:, :3], self.surfaces.planes[:, OFFSET]
-        chains = device_chains(self._city, self.facets, normal, device_m, self._depth, DEVICE_RAYS)
-        facing = np.flatnonzero(normal @ device_m > offset_m)
-        alone = np.full((len(facing), self._depth), -1)
-        alone[:, 0] = facing
-        mirrors = np.unique(np.concatenate([chains.facets[chains.order > 0], alone]), axis=0)
-        none = np.full((len(mirrors), max(self._behind, 1)), -1)
-        rows = [(mirrors, none[:, 0], none), *self._over_edges(*self._edges_behind(chains, facing))]
-        before, edge, behind = (np.concatenate(part) for part in zip(*rows))
-        turns = (before >= 0).sum(axis=1) + (edge >= 0) + (behind >= 0).sum(axis=1)
-        keep = turns <= self._depth
-        return Candidates(np.ascontiguousarray(before[keep]), edge[keep], np.ascontiguousarray(behind[keep]))
+        """Find the sequences from a device, those without an edge first.
 
-    def _over_edges(self, before: np.ndarray, edge: np.ndarray):
-        """Each sequence up to an edge with each sequence behind that edge."""
-        views = [self._view(row) for row in edge]
-        for order in range(self._behind + 1):
-            behind = [view.facets[view.order == order] for view in views]
-            repeats = [len(part) for part in behind]
+        Args:
+            device_m: (3,) position [m].
+
+        Returns:
+            All sequences of up to `depth` interactions that are worth trying.
+        """
+        normal, offset_m = self.surfaces.planes[:, :3], self.surfaces.planes[:, OFFSET]
+        sequences = device_sequences(self._city, self.facets, normal, device_m, self._depth,
+                                     DEVICE_RAYS)
+        facing = np.flatnonzero(normal @ device_m > offset_m)
+        single = np.full((len(facing), self._depth), -1)
+        single[:, 0] = facing
+        reflections = np.unique(np.concatenate([sequences.facets[sequences.order > 0], single]),
+                                axis=0)
+        none = np.full((len(reflections), max(self._after, 1)), -1)
+        over_edges = self._over_edges(*self._to_edges(sequences, facing))
+        rows = [(reflections, none[:, 0], none), *over_edges]
+        before, edge, after = (np.concatenate(part) for part in zip(*rows))
+        interactions = (before >= 0).sum(axis=1) + (edge >= 0) + (after >= 0).sum(axis=1)
+        keep = interactions <= self._depth
+        return Candidates(np.ascontiguousarray(before[keep]), edge[keep],
+                          np.ascontiguousarray(after[keep]))
+
+    def _over_edges(
+        self, before: np.ndarray, edge: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Combine each sequence up to an edge with each sequence after that edge."""
+        seen = [self._sequences_from_edge(row) for row in edge]
+        for order in range(self._after + 1):
+            after = [sequences.facets[sequences.order == order] for sequences in seen]
+            repeats = [len(part) for part in after]
             if sum(repeats):
-                facets = np.concatenate(behind)
-                padded = np.full((len(facets), max(self._behind, 1)), -1)
+                facets = np.concatenate(after)
+                padded = np.full((len(facets), max(self._after, 1)), -1)
                 padded[:, :facets.shape[1]] = facets
                 yield np.repeat(before, repeats, axis=0), np.repeat(edge, repeats), padded
 
-    def _edges_behind(self, chains: Chains, facing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Facets before an edge (n, depth) and the edge (n,): the edges of all facets that rays hit."""
+    def _to_edges(
+        self, sequences: FacetSequences, facing: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return facets (n, depth) and edge (n,) of the ways to the edges of all facets hit."""
         direct = np.column_stack([np.zeros(len(facing), dtype=int), facing])
-        pairs = np.concatenate([direct, chains.next_facets[chains.next_facets[:, 0] > 0]])
-        pairs = pairs[chains.order[pairs[:, 0]] < self._depth]
+        reflected = sequences.next_facets[sequences.next_facets[:, 0] > 0]
+        pairs = np.concatenate([direct, reflected])
+        pairs = pairs[sequences.order[pairs[:, 0]] < self._depth]
         first = self._first_edge[pairs[:, 1]]
-        repeats = self._first_edge[pairs[:, 1] + 1] - first
-        within = np.arange(repeats.sum()) - np.repeat(np.cumsum(repeats) - repeats, repeats)
-        both = np.unique(np.column_stack([np.repeat(pairs[:, 0], repeats),
-                                          self._edge_of_facet[np.repeat(first, repeats) + within]]), axis=0)
-        return chains.facets[both[:, 0]], both[:, 1]
+        row, within = expand(self._first_edge[pairs[:, 1] + 1] - first)
+        both = np.unique(np.column_stack([pairs[row, 0], self._edge_of_facet[first[row] + within]]),
+                         axis=0)
+        return sequences.facets[both[:, 0]], both[:, 1]
 
-    def _view(self, edge: int) -> Chains:
-        if edge not in self._views:
-            self._views[edge] = edge_views(self._city, self.facets, self.edges, edge, EDGE_RAYS, EDGE_STEP_M,
-                                           self.surfaces.planes[:, :3], self._behind)
-        return self._views[edge]
+    def _sequences_from_edge(self, edge: int) -> FacetSequences:
+        if edge not in self._from_edge:
+            self._from_edge[edge] = edge_sequences(
+                self._city, self.facets, self.surfaces.planes[:, :3], self.edges, edge, self._after,
+                EDGE_RAYS, EDGE_STEP_M)
+        return self._from_edge[edge]

@@ -1,18 +1,33 @@
-"""Whether anything stands in the way of a path."""
+"""Test of paths for obstacles."""
 
 import numpy as np
 from numba import njit
 
+from radiotwin.paths.images import Candidates, PathBuffer, sequence_length
+from radiotwin.paths.surfaces import NORMAL_0, NORMAL_N, Surfaces
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
 
-def clear_paths(city: CityMap, surfaces, candidates, buffer, found: int) -> np.ndarray:
-    """Rows of the first `found` paths of a buffer whose legs are all clear.
+def clear_paths(
+    city: CityMap, surfaces: Surfaces, candidates: Candidates, buffer: PathBuffer, found: int
+) -> np.ndarray:
+    """Return the rows of the paths in a buffer that nothing blocks.
 
-    Turns are pulled off the surface by `SKIN_M`, so that no leg is blocked by what it turns on.
+    Points of interaction are moved off their surface by `SKIN_M`, so that no surface blocks the
+    path that it reflects or diffracts.
+
+    Args:
+        city: 3D map.
+        surfaces: of the map.
+        candidates: that the paths were found with.
+        buffer: the paths.
+        found: number of paths in the buffer.
+
+    Returns:
+        (m,) rows of the buffer, ascending.
     """
     points_m = np.empty((found, *buffer.points_m.shape[1:]))
-    _pulled_off(surfaces, candidates, buffer, SKIN_M, points_m)
+    _move_off_surfaces(surfaces, candidates, buffer, SKIN_M, points_m)
     legs = buffer.count[:found] - 1
     rows = np.arange(found)
     for leg in range(int(legs.max()) if found else 0):
@@ -25,20 +40,22 @@ def clear_paths(city: CityMap, surfaces, candidates, buffer, found: int) -> np.n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _pulled_off(surfaces, candidates, buffer, skin_m, points_m):
+def _move_off_surfaces(
+    surfaces: Surfaces, candidates: Candidates, buffer: PathBuffer, skin_m: float,
+    points_m: np.ndarray,
+) -> None:
     for path in range(len(points_m)):
         row, last = buffer.candidate[path], buffer.count[path] - 1
-        before = 0
-        while before < candidates.before.shape[1] and candidates.before[row, before] >= 0:
-            before += 1
+        before = sequence_length(candidates.before, row)
         points_m[path] = buffer.points_m[path]
         for k in range(1, last):
             if k == before + 1:
                 edge = candidates.edge[row]
-                outward = surfaces.edges[edge, 10:13] + surfaces.edges[edge, 13:16]
+                outward = surfaces.edges[edge, NORMAL_0:NORMAL_0 + 3] \
+                    + surfaces.edges[edge, NORMAL_N:NORMAL_N + 3]
                 outward /= np.sqrt((outward ** 2).sum())
             elif k <= before:
                 outward = surfaces.planes[candidates.before[row, k - 1], :3]
             else:
-                outward = surfaces.planes[candidates.behind[row, k - before - 2], :3]
+                outward = surfaces.planes[candidates.after[row, k - before - 2], :3]
             points_m[path, k] += skin_m * outward

@@ -1,8 +1,8 @@
-"""The edges of a city that diffract: roof edges and corners of buildings.
+"""Edges of a city that diffract: roof edges and corners of buildings.
 
-Around a segment the triangles that meet there are sorted by angle; an open sector of more than 180 degrees between
-two of them is a wedge. This also holds where several buildings touch: a shared wall that is built over leaves no
-wedge.
+Around a segment the triangles that meet there are sorted by angle; an open sector of more than
+180 degrees between two of them is a wedge. This also holds where several buildings touch: a shared
+wall that is built over leaves no wedge.
 """
 
 from dataclasses import dataclass
@@ -10,28 +10,31 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from radiotwin.paths.facets import COPLANAR_M, Facets, checked_topology, extract_facets
-from radiotwin.paths.topology import Topology
+from radiotwin.paths.facets import COPLANAR_M, Facets, extract_facets
+from radiotwin.paths.topology import Topology, build_topology
 from radiotwin.paths.vectors import cross
+from radiotwin.scene.citymap import CityMap
 
-FLAT_RAD = 0.1  # folds flatter than this bend nothing worth counting: they approximate curved surfaces
+FLAT_RAD = 0.1  # [rad], flatter folds approximate curved surfaces and diffract too little to count
 
 
 @dataclass(frozen=True, eq=False)
 class Edges:
     """Convex edges between two facets.
 
-    Where a building leans on a higher one without sharing its corners, the edge of its roof in that wall is listed
-    too; it lies inside the other building, so nothing sees it. The open space is what a half plane passes over when
-    it is turned from face 0 by `exterior_rad` towards `normal_0`.
+    Where a building leans on a higher one without sharing its corners, the edge of its roof in
+    that wall is listed, too; it lies inside the other building, so no ray reaches it. A half plane
+    sweeps the open space when it is turned from face 0 by `exterior_rad` towards `normal_0`.
 
     Attributes:
-        start_m, end_m: (e, 3) ends [m].
+        start_m: (e, 3) starts [m].
+        end_m: (e, 3) ends [m].
         direction: (e, 3) unit vectors from start to end.
         facet: (e, 2) face 0 and face n, rows of `Facets`.
-        tangent_0: (e, 3) unit vectors in face 0, at right angles to the edge, pointing into the face.
-        normal_0, normal_n: (e, 3) outward unit normals of the two faces.
-        exterior_rad: (e,) angle of the open space [rad], between pi and 2 pi.
+        tangent_0: (e, 3) unit vectors in face 0, at right angles to the edge, into the face.
+        normal_0: (e, 3) outward unit normals of face 0.
+        normal_n: (e, 3) outward unit normals of face n.
+        exterior_rad: (e,) angle of the open space [rad], π to 2 π.
     """
 
     start_m: np.ndarray
@@ -47,23 +50,30 @@ class Edges:
         return len(self.start_m)
 
 
-def extract_edges(city, facets: Facets | None = None, topology: Topology | None = None) -> Edges:
-    """Find the convex edges of a `CityMap`: roof edges and corners; edges on the ground plane are left out.
+def extract_edges(
+    city: CityMap, facets: Facets | None = None, topology: Topology | None = None
+) -> Edges:
+    """Find the convex edges of a city: roof edges and corners, without those on the ground.
 
     Args:
-        city: the map.
-        facets, topology: of this city, where they are known already.
+        city: 3D map.
+        facets: of this city; None: extracted here.
+        topology: of this city; None: built here.
+
+    Returns:
+        The edges, sorted by their facets.
 
     Raises:
-        BadInput: a corner that is not finite.
+        BadInput: a corner is not finite.
     """
-    topology = topology or checked_topology(city)
+    topology = topology or build_topology(city)
     facets = facets or extract_facets(city, topology)
     if not len(facets):
         none = np.empty((0, 3))
-        return Edges(none, none, none, np.empty((0, 2), dtype=int), none, none, none, np.empty(0))
-    found = _wedges(topology.vertices_m, topology.triangles, topology.normal, topology.segments, topology.owner,
-                    topology.group, np.pi + FLAT_RAD)
+        no_facets = np.empty((0, 2), dtype=int)
+        return Edges(none, none, none, no_facets, none, none, none, np.empty(0))
+    found = _wedges(topology.vertices_m, topology.triangles, topology.normal, topology.segments,
+                    topology.owner, topology.group, np.pi + FLAT_RAD)
     segment = topology.segments[found[:, 0]]
     pair = np.sort(facets.of_face[topology.source[found[:, 1:]]], axis=1)
     keep = pair[:, 0] != pair[:, 1]
@@ -71,9 +81,11 @@ def extract_edges(city, facets: Facets | None = None, topology: Topology | None 
     direction = end_m - start_m
     direction /= np.maximum(np.linalg.norm(direction, axis=1), 1e-12)[:, None]
     normal_0, normal_n = facets.normal[pair[:, 0]], facets.normal[pair[:, 1]]
-    # Both faces bend away from the open space, so each runs against the other's normal.
-    tangent_0, tangent_n = _tangent(direction, normal_0, normal_n), _tangent(direction, normal_n, normal_0)
-    sine, cosine = np.einsum("ij,ij->i", tangent_n, normal_0), np.einsum("ij,ij->i", tangent_n, tangent_0)
+    # At a convex edge each face runs against the normal of the other
+    tangent_0 = _tangent(direction, normal_0, normal_n)
+    tangent_n = _tangent(direction, normal_n, normal_0)
+    sine = np.einsum("ij,ij->i", tangent_n, normal_0)
+    cosine = np.einsum("ij,ij->i", tangent_n, tangent_0)
     exterior_rad = np.mod(np.arctan2(sine, cosine), 2 * np.pi)
     return Edges(start_m, end_m, direction, pair, tangent_0, normal_0, normal_n, exterior_rad)
 
@@ -84,8 +96,8 @@ def _tangent(direction: np.ndarray, normal: np.ndarray, other: np.ndarray) -> np
     return tangent * np.where(sign == 0, 1.0, sign)[:, None]
 
 
-def _join(ends_m: np.ndarray, pair: np.ndarray):
-    """Put the pieces of an edge together: pieces between the same two facets that follow one another."""
+def _join(ends_m: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Join consecutive pieces between the same two facets; return starts, ends and facets."""
     if not len(pair):
         return np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 2), dtype=int)
     order = np.lexsort((pair[:, 1], pair[:, 0]))
@@ -101,7 +113,8 @@ def _join(ends_m: np.ndarray, pair: np.ndarray):
         pieces = np.where(flip[:, None, None], pieces[:, ::-1], pieces)
         by_start = np.argsort(at_m[:, 0], kind="stable")
         pieces, at_m = pieces[by_start], at_m[by_start]
-        breaks = np.flatnonzero(at_m[1:, 0] > np.maximum.accumulate(at_m[:, 1])[:-1] + COPLANAR_M) + 1
+        reached_m = np.maximum.accumulate(at_m[:, 1])[:-1]
+        breaks = np.flatnonzero(at_m[1:, 0] > reached_m + COPLANAR_M) + 1
         for c, d in zip(np.append(0, breaks), np.append(breaks, len(pieces))):
             start_m.append(pieces[c, 0])
             end_m.append(pieces[c + np.argmax(at_m[c:d, 1]), 1])
@@ -110,8 +123,11 @@ def _join(ends_m: np.ndarray, pair: np.ndarray):
 
 
 @njit(cache=True)
-def _wedges(vertices_m, triangles, normal, segments, owner, group, least_rad):
-    """(w, 3): row of `segments` and the two triangles of each open sector of more than `least_rad`."""
+def _wedges(
+    vertices_m: np.ndarray, triangles: np.ndarray, normal: np.ndarray, segments: np.ndarray,
+    owner: np.ndarray, group: np.ndarray, min_rad: float,
+) -> np.ndarray:
+    """Return (w, 3) row of `segments` and the two triangles of each open sector over `min_rad`."""
     found = []
     for g in range(len(group) - 1):
         a, n = group[g], group[g + 1] - group[g]
@@ -123,7 +139,8 @@ def _wedges(vertices_m, triangles, normal, segments, owner, group, least_rad):
         angle, opens = np.empty(n), np.empty(n)
         for i in range(n):
             corners = triangles[owner[a + i]]
-            middle = (vertices_m[corners[0]] + vertices_m[corners[1]] + vertices_m[corners[2]]) / 3.0 - start
+            middle = (vertices_m[corners[0]] + vertices_m[corners[1]] + vertices_m[corners[2]]) \
+                / 3.0 - start
             middle = middle - (middle * axis).sum() * axis
             if i == 0:
                 x = middle / np.sqrt((middle * middle).sum())
@@ -132,12 +149,12 @@ def _wedges(vertices_m, triangles, normal, segments, owner, group, least_rad):
             angle[i] = np.arctan2(sine, cosine)
             turn = cosine * y - sine * x  # towards a larger angle
             opens[i] = (turn * normal[owner[a + i]]).sum()
-        # Where two faces lie on one another, the one that looks back comes first: nothing is open between them.
+        # Of two coincident faces the one that looks back comes first: no space opens between them
         order = np.argsort(angle + np.where(opens > 0, 1e-4, -1e-4))
         for k in range(n):
             i, j = order[k], order[(k + 1) % n]
             width = (angle[j] - angle[i]) % (2 * np.pi)
-            if opens[i] > 0 and opens[j] < 0 and least_rad < width < 2 * np.pi - 1e-3:
+            if opens[i] > 0 and opens[j] < 0 and min_rad < width < 2 * np.pi - 1e-3:
                 found.append((a, owner[a + i], owner[a + j]))
     out = np.empty((len(found), 3), dtype=np.int64)
     for k in range(len(found)):

@@ -1,21 +1,19 @@
-"""The flat surfaces of a city: triangles that share a segment and lie in one plane, however a wall is subdivided."""
+"""Planar facets of a city: triangles that share a segment and lie in one plane."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from radiotwin.errors import BadInput
 from radiotwin.paths.topology import Topology, build_topology
+from radiotwin.scene.citymap import CityMap
 
-COPLANAR_M = 0.005  # how far a neighbour's corner may lie off the plane
-COPLANAR_COS = np.cos(np.radians(0.5))
-WALL_SINE = 0.2  # walls lean by at most about 12 degrees
+COPLANAR_M = 0.005  # [m], maximum distance of a neighbour's corner from the plane
+COPLANAR_COS = np.cos(np.radians(0.5))  # minimum cosine between the normals of coplanar triangles
 RECTANGLE_SHARE = 1 - 1e-6  # of the bounding rectangle that a facet fills to be called one
-MOST_AROUND = 12  # triangles that may meet at a segment
-SIDES_TRIED = 16  # longest ones, along which the bounding rectangle may lie
+MAX_TRIANGLES_AT_SEGMENT = 12  # triangles that may meet at one segment
+SIDES_TRIED = 16  # longest sides along which the bounding rectangle is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,13 +24,13 @@ class Facets:
         normal: (f, 3) outward unit normals.
         offset_m: (f,) distances of the planes from the origin [m].
         origin_m: (f, 3) a corner of the bounding rectangle [m].
-        axis_u, axis_v: (f, 3) unit vectors along its sides; u × v = normal.
-        size_m: (f, 2) lengths of its sides [m].
-        full: (f,) bool: the facet is its bounding rectangle.
+        axis_u: (f, 3) unit vectors along one side of it.
+        axis_v: (f, 3) unit vectors along the other; u × v = normal.
+        size_m: (f, 2) lengths of the sides [m].
+        full: (f,) bool: the facet fills its bounding rectangle.
         first: (f + 1,) first row in `triangle_uv_m` of each facet.
         triangle_uv_m: (t, 6) corners u, v, u, v, u, v of the triangles in the plane [m].
-        wall: (f,) bool: upright.
-        of_face: (city faces,) facet of each face of the city, -1: a sliver, or on the ground.
+        of_face: (city faces,) facet of each face of the city; -1: a sliver, or on the ground.
     """
 
     normal: np.ndarray
@@ -44,55 +42,51 @@ class Facets:
     full: np.ndarray
     first: np.ndarray
     triangle_uv_m: np.ndarray
-    wall: np.ndarray
     of_face: np.ndarray
 
     def __len__(self) -> int:
         return len(self.normal)
 
 
-def extract_facets(city, topology: Topology | None = None) -> Facets:
-    """Merge the triangles of a `CityMap` to facets; faces on the ground plane z = 0 are left out.
+def extract_facets(city: CityMap, topology: Topology | None = None) -> Facets:
+    """Merge the triangles of a city to facets; faces on the ground plane z = 0 are left out.
 
     Args:
-        city: the map.
-        topology: of this city, where it is known already.
+        city: 3D map.
+        topology: of this city; None: built here.
+
+    Returns:
+        The facets, in the order of their first triangle.
 
     Raises:
-        BadInput: a corner that is not finite.
+        BadInput: a corner is not finite.
     """
-    topology = topology or checked_topology(city)
+    topology = topology or build_topology(city)
     label = _coplanar_groups(topology)
     count = int(label.max()) + 1 if len(label) else 0
     order = np.argsort(label, kind="stable")
     first = np.searchsorted(label[order], np.arange(count + 1))
     corners_m = topology.vertices_m[topology.triangles[order]]
     cross = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
-    frames = np.array([_frame(corners_m[a:b], cross[a:b]) for a, b in zip(first[:-1], first[1:])]).reshape(-1, 15)
-    normal, origin_m, axis_u, axis_v = frames[:, :3], frames[:, 3:6], frames[:, 6:9], frames[:, 9:12]
-    size_m, full = frames[:, 12:14], frames[:, 14] > 0
+    frames = np.array([_frame(corners_m[a:b], cross[a:b]) for a, b in zip(first[:-1], first[1:])])
+    normal, origin_m, axis_u, axis_v, size_m, full = np.split(
+        frames.reshape(-1, 15), [3, 6, 9, 12, 14], axis=1)
     of_row = label[order]
     offset_m = corners_m - origin_m[of_row, None]
-    uv_m = np.stack([np.einsum("ikj,ij->ik", offset_m, axis[of_row]) for axis in (axis_u, axis_v)], axis=2)
+    uv_m = np.stack([np.einsum("ikj,ij->ik", offset_m, axis[of_row]) for axis in (axis_u, axis_v)],
+                    axis=2)
     of_face = np.full(len(city.faces), -1)
     of_face[topology.source] = label
-    return Facets(normal, np.einsum("ij,ij->i", normal, origin_m), origin_m, axis_u, axis_v, size_m, full, first,
-                  uv_m.reshape(-1, 6), np.abs(normal[:, 2]) < WALL_SINE, of_face)
-
-
-def checked_topology(city) -> Topology:
-    """`build_topology`, but BadInput for corners that are not finite."""
-    if not np.isfinite(city.vertices).all():
-        raise BadInput("the city has corners that are not finite numbers [m]; repair its meshes")
-    return build_topology(city)
+    return Facets(normal, np.einsum("ij,ij->i", normal, origin_m), origin_m, axis_u, axis_v,
+                  size_m, full[:, 0] > 0, first, uv_m.reshape(-1, 6), of_face)
 
 
 def _coplanar_groups(topology: Topology) -> np.ndarray:
-    """(t,) facet of each triangle."""
+    """Return the facet (t,) of each triangle."""
     size = np.diff(topology.group)
     pairs = [np.empty((0, 2), dtype=int)]
-    for i in range(MOST_AROUND):
-        for j in range(i + 1, MOST_AROUND):
+    for i in range(MAX_TRIANGLES_AT_SEGMENT):
+        for j in range(i + 1, MAX_TRIANGLES_AT_SEGMENT):
             first = topology.group[:-1][size > j]
             pairs.append(np.column_stack([topology.owner[first + i], topology.owner[first + j]]))
     a, b = np.concatenate(pairs).T
@@ -102,29 +96,37 @@ def _coplanar_groups(topology: Topology) -> np.ndarray:
     for one, other in ((a, b), (b, a)):
         off_m = np.einsum("ikj,ij->ik", corners_m[other] - corners_m[one][:, :1], normal[one])
         same &= (np.abs(off_m) < COPLANAR_M).all(axis=1)
-    n = len(topology.triangles)
-    return connected_components(coo_matrix((np.ones(same.sum()), (a[same], b[same])), shape=(n, n)),
-                                directed=False)[1]
+    graph = coo_matrix((np.ones(same.sum()), (a[same], b[same])), shape=(len(normal),) * 2)
+    return connected_components(graph, directed=False)[1]
 
 
 def _frame(corners_m: np.ndarray, cross: np.ndarray) -> np.ndarray:
-    """(15,) normal, origin and axes of the least bounding rectangle, its size, and whether it is full, of one facet."""
+    """Return the plane of one facet and its smallest bounding rectangle.
+
+    Args:
+        corners_m: (t, 3, 3) triangles [m].
+        cross: (t, 3) outward normals of the triangles, twice as long as their areas [m²].
+
+    Returns:
+        (15,) normal, origin, axes u and v, size, and whether the facet fills the rectangle.
+    """
     normal = cross.sum(axis=0)
     area_m2 = np.linalg.norm(normal) / 2
     normal = normal / (2 * area_m2)
     sides = (np.roll(corners_m, -1, axis=1) - corners_m).reshape(-1, 3)
     longest = np.argsort(-np.linalg.norm(sides, axis=1), kind="stable")[:SIDES_TRIED]
-    best: Any = None
+    min_area_m2 = np.inf
     for side in sides[longest]:
-        axis_u = side - (side @ normal) * normal
-        axis_u /= np.linalg.norm(axis_u)
-        axis_v = np.cross(normal, axis_u)
-        uv_m = corners_m.reshape(-1, 3) @ np.column_stack([axis_u, axis_v])
-        low_m, size_m = uv_m.min(axis=0), np.ptp(uv_m, axis=0)
-        if best is None or size_m.prod() < best[-1].prod() * (1 - 1e-9):
-            best = axis_u, axis_v, low_m, size_m
-    axis_u, axis_v, low_m, size_m = best
-    distance_m = np.average((corners_m @ normal).mean(axis=1), weights=np.linalg.norm(cross, axis=1))
+        along = side - (side @ normal) * normal
+        along /= np.linalg.norm(along)
+        across = np.cross(normal, along)
+        uv_m = corners_m.reshape(-1, 3) @ np.column_stack([along, across])
+        extent_m = np.ptp(uv_m, axis=0)
+        if extent_m.prod() < min_area_m2 * (1 - 1e-9):
+            axis_u, axis_v, low_m, size_m = along, across, uv_m.min(axis=0), extent_m
+            min_area_m2 = size_m.prod()
+    distance_m = np.average((corners_m @ normal).mean(axis=1),
+                            weights=np.linalg.norm(cross, axis=1))
     origin_m = low_m[0] * axis_u + low_m[1] * axis_v + distance_m * normal
-    full = area_m2 >= RECTANGLE_SHARE * size_m.prod()
+    full = area_m2 >= RECTANGLE_SHARE * min_area_m2
     return np.concatenate([normal, origin_m, axis_u, axis_v, size_m, [full]])

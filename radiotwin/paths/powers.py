@@ -1,4 +1,4 @@
-"""The power that paths carry between devices and receivers."""
+"""Power of the paths between devices and receivers."""
 
 from dataclasses import dataclass, fields
 
@@ -6,38 +6,43 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
-from radiotwin.paths.candidates import search_of
+from radiotwin.paths.candidates import candidate_search
 from radiotwin.paths.clearance import clear_paths
 from radiotwin.paths.coefficients import concrete_permittivity
 from radiotwin.paths.fields import AVERAGE, VERTICAL, path_gains
-from radiotwin.paths.images import MOST_TURNS, Buffer, Candidates, find_paths
+from radiotwin.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, find_paths
 from radiotwin.progress import progress
 from radiotwin.scene.citymap import CityMap
 
 POLARISATIONS = {"average": AVERAGE, "vertical": VERTICAL}
-# In the shadow of a dense city (scenes/rbm) gains scatter around a ray tracer's by 5.5, 2.5, 1.5 and 1.4 dB with up to
-# 2, 3, 4 and 5 turns, and each turn more takes about a third more time.
+# In the shadow of a dense city (scenes/rbm) gains differ from a ray tracer's by 5.5, 2.5, 1.5 and
+# 1.4 dB (standard deviation) with up to 2, 3, 4 and 5 interactions; each one more takes about a
+# third more time.
 DEPTH = 4
-CHUNK = 50_000  # paths at once: about 30 MB
-SECTORS = 24
+PATH_CHUNK = 50_000  # paths at once: about 30 MB
+SECTORS = 24  # of azimuth, 15 degrees each
 
 
 @dataclass(frozen=True, eq=False)
 class PathPowers:
-    """Linear power gains of links between isotropic antennas, by the kind of path; (n,) each, 0: no such path.
+    """Linear power gains (n,) of links between isotropic antennas, by the kind of path; 0: none.
 
-    A bounce off the ground counts as a reflection where there are other turns; alone it is `ground`. The kinds are
-    powers: where direct and reflected or diffracted rays nearly coincide, their fields would cancel or add.
+    A reflection by the ground counts as a reflection where there are other interactions; alone it
+    is `ground`. Powers are added, not fields: where direct and reflected or diffracted rays nearly
+    coincide, their fields would cancel or add up.
 
     Attributes:
-        direct: in free space; 0 where blocked.
-        reflected_1, reflected_2, reflected_more: by so many mirrors, at least one of them not the ground.
-        diffracted: over one edge, on either side of its shadow boundary.
-        reflected_diffracted: over one edge and by mirrors, before it or behind it.
-        ground: by the ground z = 0 alone.
-        departures, arrivals: (n, SECTORS, 3) power times the unit vector from the device (the receiver) along the path,
-            summed over all paths that leave the device (reach the receiver) within each sector of azimuth; the first
-            begins at east, they go on counter-clockwise.
+        direct: free space; 0 where blocked.
+        reflected_1: one reflection, not by the ground.
+        reflected_2: two reflections, at most one of them by the ground.
+        reflected_more: three or more reflections.
+        diffracted: one diffraction, on either side of the shadow boundary.
+        reflected_diffracted: one diffraction, and reflections before or after it.
+        ground: one reflection, by the ground z = 0.
+        departures: (n, SECTORS, 3) power times the unit vector from the device along the path,
+            summed over the paths that leave the device in each sector of azimuth; the first
+            sector begins at east, they go on counter-clockwise.
+        arrivals: (n, SECTORS, 3) the same at the receiver, from the receiver along the path.
     """
 
     direct: np.ndarray
@@ -52,36 +57,41 @@ class PathPowers:
 
     @property
     def total(self) -> np.ndarray:
-        """(n,) sum of all kinds."""
-        return sum(getattr(self, name) for name in COMPONENTS)
+        """Sum of all kinds, (n,) linear."""
+        return np.sum([getattr(self, name) for name in COMPONENTS], axis=0)
 
 
 COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-2]
 
 
-def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray, frequency_hz: float,
-                polarisation: str = "average", depth: int = DEPTH, chunk: int = CHUNK) -> PathPowers:
+def path_powers(
+    city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray,
+    frequency_hz: float, polarisation: str = "average", depth: int = DEPTH,
+) -> PathPowers:
     """Follow the paths from devices to receivers and add up their powers.
 
-    All surfaces are taken to be concrete. Ends within buildings are not refused; what is found for them means little.
+    All surfaces are concrete. Ends inside buildings are accepted, but their results mean little.
 
     Args:
-        city: the map.
-        device_m: (k, 3) [m]
-        receiver_m: (n, 3) [m]
+        city: 3D map.
+        device_m: (k, 3) positions of the devices [m].
+        receiver_m: (n, 3) positions of the receivers [m].
         device: (n,) row of `device_m` of each receiver.
-        frequency_hz: frequency [Hz].
-        polarisation: 'vertical' of both antennas, or 'average' over all.
-        depth: most turns of a path, 1 to 6.
-        chunk: paths worked on at once; changes the memory, not the result.
+        frequency_hz: carrier frequency [Hz].
+        polarisation: `vertical` of both antennas, or `average` over all.
+        depth: maximum number of interactions of a path, 1 to 6.
+
+    Returns:
+        The powers of the n links.
 
     Raises:
-        BadInput: arrays of other shapes, values that are not finite, rows that do not exist, or an argument out of
-            its range.
+        BadInput: an array has another shape, a value is not finite, a row does not exist, or an
+            argument is out of its range.
     """
-    device_m, receiver_m = np.asarray(device_m, dtype=float), np.ascontiguousarray(receiver_m, dtype=float)
+    device_m = np.asarray(device_m, dtype=float)
+    receiver_m = np.ascontiguousarray(receiver_m, dtype=float)
     device = np.asarray(device)
-    _check(device_m, receiver_m, device, frequency_hz, polarisation, depth, chunk)
+    _check(device_m, receiver_m, device, frequency_hz, polarisation, depth)
     wave_number = 2 * np.pi * frequency_hz / speed_of_light
     powers = np.zeros((len(COMPONENTS), len(receiver_m)))
     powers[0] = _direct(city, device_m[device], receiver_m, wave_number)
@@ -89,8 +99,8 @@ def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, dev
     straight_m = receiver_m - device_m[device]
     _add_rays(departures, np.arange(len(receiver_m)), straight_m, powers[0])
     _add_rays(arrivals, np.arange(len(receiver_m)), -straight_m, powers[0])
-    search = search_of(city, depth)
-    buffer = Buffer.of(chunk)
+    search = candidate_search(city, depth)
+    buffer = PathBuffer.allocate(PATH_CHUNK)
     permittivity = concrete_permittivity(frequency_hz)
     rows = np.unique(device)
     with progress("following paths", total=len(rows)) as advance:
@@ -100,57 +110,65 @@ def path_powers(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, dev
             kind = _kinds(candidates, search.ground)
             cursor, ends_m = 0, receiver_m[links]
             while cursor < len(candidates.edge) * len(links):
-                found, cursor = find_paths(search.surfaces, candidates, device_m[row], ends_m, cursor, buffer)
+                found, cursor = find_paths(search.surfaces, candidates, device_m[row], ends_m,
+                                           cursor, buffer)
                 clear = clear_paths(city, search.surfaces, candidates, buffer, found)
                 gain = np.empty(len(clear))
-                path_gains(search.surfaces, candidates, wave_number, permittivity, POLARISATIONS[polarisation],
-                           buffer, clear, gain)
-                mine, points_m = links[buffer.receiver[clear]], buffer.points_m[clear]
-                last = buffer.count[clear] - 1
-                every = np.arange(len(clear))
-                np.add.at(powers, (kind[buffer.candidate[clear]], mine), gain)
-                _add_rays(departures, mine, points_m[:, 1] - points_m[:, 0], gain)
-                _add_rays(arrivals, mine, points_m[every, last - 1] - points_m[every, last], gain)
+                path_gains(search.surfaces, candidates, wave_number, permittivity,
+                           POLARISATIONS[polarisation], buffer, clear, gain)
+                link, points_m = links[buffer.receiver[clear]], buffer.points_m[clear]
+                last, path = buffer.count[clear] - 1, np.arange(len(clear))
+                np.add.at(powers, (kind[buffer.candidate[clear]], link), gain)
+                _add_rays(departures, link, points_m[:, 1] - points_m[:, 0], gain)
+                _add_rays(arrivals, link, points_m[path, last - 1] - points_m[path, last], gain)
             advance(1)
-    return PathPowers(*powers, departures, arrivals)  # type: ignore[call-arg]  # a row of powers for each kind
+    return PathPowers(*powers, departures, arrivals)  # type: ignore[call-arg]  # a row a kind
 
 
 def _add_rays(sums: np.ndarray, link: np.ndarray, ray_m: np.ndarray, power: np.ndarray) -> None:
-    """Add power times direction of rays (p, 3) of some links (p,) to sums (n, SECTORS, 3)."""
-    sector = (np.arctan2(ray_m[:, 1], ray_m[:, 0]) % (2 * np.pi) * (SECTORS / (2 * np.pi))).astype(int) % SECTORS
+    """Add power times direction of rays (p, 3) of links (p,) to sums (n, SECTORS, 3)."""
+    azimuth_rad = np.arctan2(ray_m[:, 1], ray_m[:, 0]) % (2 * np.pi)
+    sector = (azimuth_rad * (SECTORS / (2 * np.pi))).astype(int) % SECTORS
     length_m = np.maximum(np.linalg.norm(ray_m, axis=1, keepdims=True), 1e-9)
     np.add.at(sums, (link, sector), ray_m / length_m * power[:, None])
 
 
-def _direct(city: CityMap, from_m: np.ndarray, to_m: np.ndarray, wave_number: float) -> np.ndarray:
-    """(n,) Friis' gains (ITU-R P.525-4, eq. 4), 0 where blocked."""
+def _direct(
+    city: CityMap, from_m: np.ndarray, to_m: np.ndarray, wave_number: float
+) -> np.ndarray:
+    """Return the free-space gains (n,) (ITU-R P.525-4, eq. 4), 0 where blocked."""
     distance_m = np.linalg.norm(to_m - from_m, axis=1)
-    return np.where(city.line_of_sight(from_m, to_m), 1 / np.maximum(2 * wave_number * distance_m, 1e-9) ** 2, 0.0)
+    gain = 1 / np.maximum(2 * wave_number * distance_m, 1e-9) ** 2
+    return np.where(city.line_of_sight(from_m, to_m), gain, 0.0)
 
 
 def _kinds(candidates: Candidates, ground: int) -> np.ndarray:
-    """(c,) row of COMPONENTS of each candidate."""
-    mirrors = (candidates.before >= 0).sum(axis=1) + (candidates.behind >= 0).sum(axis=1)
+    """Return the row of COMPONENTS (c,) of each candidate."""
+    reflections = (candidates.before >= 0).sum(axis=1) + (candidates.after >= 0).sum(axis=1)
     only_ground = ((candidates.before >= 0) <= (candidates.before == ground)).all(axis=1)
-    over_edge = np.where(mirrors > 0, COMPONENTS.index("reflected_diffracted"), COMPONENTS.index("diffracted"))
-    by_mirrors = np.where(only_ground, COMPONENTS.index("ground"), np.minimum(mirrors, 3))
-    return np.where(candidates.edge >= 0, over_edge, by_mirrors)
+    over_edge = np.where(reflections > 0, COMPONENTS.index("reflected_diffracted"),
+                         COMPONENTS.index("diffracted"))
+    reflected = np.where(only_ground, COMPONENTS.index("ground"), np.minimum(reflections, 3))
+    return np.where(candidates.edge >= 0, over_edge, reflected)
 
 
-def _check(device_m, receiver_m, device, frequency_hz, polarisation, depth, chunk) -> None:
+def _check(
+    device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray, frequency_hz: float,
+    polarisation: str, depth: int,
+) -> None:
     for name, points_m in (("device_m", device_m), ("receiver_m", receiver_m)):
         if points_m.ndim != 2 or points_m.shape[1] != 3 or not np.isfinite(points_m).all():
-            raise BadInput(f"{name} must hold finite positions [m] of shape (n, 3), it has the shape {points_m.shape}")
+            raise BadInput(f"{name} must hold finite positions [m] of shape (n, 3), it has the "
+                           f"shape {points_m.shape}")
     if device.shape != (len(receiver_m),) or device.dtype.kind not in "iu":
-        raise BadInput(f"device must hold one row of device_m for each of {len(receiver_m)} receivers; it has the "
-                       f"shape {device.shape} and holds {device.dtype}")
+        raise BadInput(f"device must hold one row of device_m for each of {len(receiver_m)} "
+                       f"receivers; it has the shape {device.shape} and holds {device.dtype}")
     if len(device) and not (0 <= device.min() and device.max() < len(device_m)):
-        raise BadInput(f"device holds rows from {device.min()} to {device.max()}, device_m has {len(device_m)}")
+        raise BadInput(f"device holds rows from {device.min()} to {device.max()}, device_m has "
+                       f"{len(device_m)}")
     if not 0 < frequency_hz < np.inf:
         raise BadInput(f"frequency_hz is {frequency_hz}; it must be positive")
     if polarisation not in POLARISATIONS:
         raise BadInput(f"polarisation is {polarisation!r}; allowed are {', '.join(POLARISATIONS)}")
-    if not 1 <= depth <= MOST_TURNS:
-        raise BadInput(f"depth is {depth}; allowed are 1 to {MOST_TURNS}")
-    if chunk < 1:
-        raise BadInput(f"chunk is {chunk}; it must be positive")
+    if not 1 <= depth <= MAX_INTERACTIONS:
+        raise BadInput(f"depth is {depth}; allowed are 1 to {MAX_INTERACTIONS}")

@@ -1,46 +1,72 @@
-"""Where a ray turns on an edge, and what becomes of its field there.
+"""Diffraction of a ray at an edge: the position along it, and the field after it.
 
-It turns where its angle to the edge stays the same (Keller's law), which is where it is straight once both sides are
-folded into one plane around the edge.
+By Keller's law the angle between ray and edge stays the same. The ray is therefore straight once
+the half planes before and after the edge are folded into one.
 """
 
 import numpy as np
 from numba import njit
 
 from radiotwin.paths.coefficients import wedge_coefficients
-from radiotwin.paths.surfaces import ALONG, EXTERIOR, NORMAL_0, NORMAL_N
+from radiotwin.paths.surfaces import ALONG, EXTERIOR, NORMAL_0, NORMAL_N, START, TANGENT
 from radiotwin.paths.vectors import cross, dot
 
-OPEN_SINE = 1e-4  # a ray this close along a face of a wedge is not followed
+MIN_SINE = 1e-4  # of the angle between ray and face; rays closer to a face are not followed
 
 
 @njit(cache=True, error_model="numpy")
-def around_edge(edges, edge, x, y, z):
-    """A point as its edge sees it: (in the open space, metres along, metres across the edge)."""
-    x, y, z = x - edges[edge, 0], y - edges[edge, 1], z - edges[edge, 2]
+def around_edge(
+    edges: np.ndarray, edge: int, x: float, y: float, z: float
+) -> tuple[bool, float, float]:
+    """Return whether a point is in an edge's open space, and its cylindrical coordinates.
+
+    Args:
+        edges: of `Surfaces`.
+        edge: row of `edges`.
+        x: position of the point, east [m].
+        y: north [m].
+        z: up [m].
+
+    Returns:
+        Whether it is in the open space, its distance along the edge from the start [m], and its
+        distance from the edge's line [m].
+    """
+    x, y, z = x - edges[edge, START], y - edges[edge, START + 1], z - edges[edge, START + 2]
     along_m = x * edges[edge, ALONG] + y * edges[edge, ALONG + 1] + z * edges[edge, ALONG + 2]
     across_m = np.sqrt(max(x * x + y * y + z * z - along_m * along_m, 1e-12))
-    least_m = OPEN_SINE * across_m
-    is_open = x * edges[edge, NORMAL_0] + y * edges[edge, NORMAL_0 + 1] + z * edges[edge, NORMAL_0 + 2] > least_m \
-        or x * edges[edge, NORMAL_N] + y * edges[edge, NORMAL_N + 1] + z * edges[edge, NORMAL_N + 2] > least_m
+    min_m = MIN_SINE * across_m
+    is_open = x * edges[edge, NORMAL_0] + y * edges[edge, NORMAL_0 + 1] \
+        + z * edges[edge, NORMAL_0 + 2] > min_m \
+        or x * edges[edge, NORMAL_N] + y * edges[edge, NORMAL_N + 1] \
+        + z * edges[edge, NORMAL_N + 2] > min_m
     return is_open, along_m, across_m
 
 
 @njit(cache=True, error_model="numpy")
-def diffract(edges, edge, direction_in, direction, before_m, behind_m, wave_number, permittivity, field):
-    """Turn the field of a ray on an edge (Kouyoumjian and Pathak, eq. 9-13), all but its spreading.
+def diffract(
+    edges: np.ndarray, edge: int, direction_in: np.ndarray, direction: np.ndarray, before_m: float,
+    after_m: float, wave_number: float, permittivity: complex, field: np.ndarray,
+) -> None:
+    """Diffract the field of a ray at an edge (Kouyoumjian and Pathak, eq. 9-13), without spreading.
 
     Args:
-        direction_in, direction: (3,) unit vectors of the ray before and behind the edge.
-        before_m, behind_m: lengths of the ray [m].
+        edges: of `Surfaces`.
+        edge: row of `edges`.
+        direction_in: (3,) unit vector of the ray before the edge.
+        direction: (3,) unit vector of the ray after the edge.
+        before_m: length of the path before the edge [m].
+        after_m: length of the path after the edge [m].
+        wave_number: 2 π / wavelength [1/m].
+        permittivity: complex relative permittivity of both faces.
         field: (3,) complex, changed in place.
     """
-    along, tangent, normal = edges[edge, 3:6], edges[edge, 7:10], edges[edge, 10:13]
+    along, tangent = edges[edge, ALONG:ALONG + 3], edges[edge, TANGENT:TANGENT + 3]
+    normal = edges[edge, NORMAL_0:NORMAL_0 + 3]
     phi_in = np.arctan2(-dot(direction_in, normal), -dot(direction_in, tangent)) % (2.0 * np.pi)
     phi = np.arctan2(dot(direction, normal), dot(direction, tangent)) % (2.0 * np.pi)
     across_in, across = cross(along, direction_in), cross(along, direction)
     sine = np.sqrt(dot(across, across))
-    distance_m = before_m * behind_m / (before_m + behind_m) * sine * sine
+    distance_m = before_m * after_m / (before_m + after_m) * sine * sine
     soft, hard = wedge_coefficients(phi, phi_in, sine, distance_m, wave_number,
                                     edges[edge, EXTERIOR] / np.pi, permittivity)
     across_in = -across_in / np.sqrt(dot(across_in, across_in))

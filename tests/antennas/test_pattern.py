@@ -23,8 +23,8 @@ def test_between_the_directions_of_the_grid():
 
 def test_mean_over_headings_is_of_power():
     half = Pattern(np.array([0.0, 180.0]), np.array([-90.0, 90.0]), np.array([[10.0, -40.0], [10.0, -40.0]]))
-    assert half.around().at(77.0, 3.0) == pytest.approx(10 * np.log10((10 + 1e-4) / 2), abs=1e-9)
-    assert ROUND.around().at(12.0, 45.0) == ROUND.at(200.0, 45.0) == pytest.approx(-4.0)
+    assert half.heading_mean().at(77.0, 3.0) == pytest.approx(10 * np.log10((10 + 1e-4) / 2), abs=1e-9)
+    assert ROUND.heading_mean().at(12.0, 45.0) == ROUND.at(200.0, 45.0) == pytest.approx(-4.0)
 
 
 @pytest.mark.parametrize(("azimuth_deg", "tilt_deg", "ray", "seen"), [

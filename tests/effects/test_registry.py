@@ -1,6 +1,8 @@
 """The catalogue: built-in effects, those of installed packages, and those that a script registers."""
 
+import re
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -69,6 +71,17 @@ def test_what_is_no_effect_is_refused(installed):
 def test_an_unknown_name_says_what_is_known(installed):
     with pytest.raises(BadInput, match="'hail'.*does not know.*antenna_pattern.*package"):
         effect_named("hail", "")
+
+
+def test_the_effect_of_the_guide_works(installed, make_links):
+    guide = (Path(__file__).parents[2] / "docs" / "add-an-effect.md").read_text(encoding="utf-8")
+    exec(re.search(r"```python\n(.*?)```", guide, re.DOTALL)[1], {})
+    effect, links = effect_named("altitude_loss", ""), make_links([[0.0, 0, 1.5]], [[0, 0, 50], [0, 0, 200]])
+    (params,) = effect.propose(None)
+    np.testing.assert_allclose(effect.term(links, params, None).offset_db, [-0.5, -2.0])
+    variation = effect.variation(params)
+    assert (variation.values, variation.low, variation.high) == (1.0, 0.0, 20.0)
+    assert effect.neg_log_prior(variation.params(np.array([6.0]))) == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("effect", registry.BUILT_IN, ids=lambda effect: effect.__name__)

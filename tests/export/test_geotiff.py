@@ -27,7 +27,7 @@ def test_a_band_for_each_device_and_altitude(file, radio_map):
     np.testing.assert_array_equal(file.read(), radio_map.gain_db.reshape(4, 3, 4)[:, ::-1])
 
 
-def test_values_lie_where_they_are_on_the_globe(file, radio_map, scene):
+def test_values_lie_at_their_position_on_the_globe(file, radio_map, scene):
     """A GIS asks by longitude and latitude: through the file's own reference system to row and column."""
     to_file = Transformer.from_crs("EPSG:4326", CRS.from_wkt(file.crs.to_wkt()), always_xy=True)
     for x_m, y_m in ((0.0, 0.0), (60.0, 40.0), (20.0, 40.0)):
@@ -51,7 +51,7 @@ def test_uneven_positions_make_no_picture(scene, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_missing_package_says_what_to_install(radio_map, scene, tmp_path, monkeypatch):
+def test_missing_package_names_what_to_install(radio_map, scene, tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "rasterio", None)
     with pytest.raises(BadInput, match=r"pip install 'radiotwin\[gis\]'"):
         write_geotiff(radio_map, scene, tmp_path / "map.tif")

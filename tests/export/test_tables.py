@@ -1,4 +1,4 @@
-"""Every form with numbers, read back by other programs' readers: the same numbers to the bit."""
+"""Every format with numbers, read back by other programs: the same numbers to the bit."""
 
 import numpy as np
 import pandas as pd

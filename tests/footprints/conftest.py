@@ -7,7 +7,7 @@ TOWN = Path(__file__).with_name("town.osm")
 
 @pytest.fixture
 def town_osm():
-    """A map made by hand with all that is wrong in real extracts."""
+    """A map made by hand with all the defects of real extracts."""
     return TOWN
 
 

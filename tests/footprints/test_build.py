@@ -32,7 +32,7 @@ def test_names():
     assert map_name("data/old town.osm.pbf") == "old_town" and map_name("area.v2.geojson") == "area.v2"
 
 
-def test_every_height_says_where_it_is_from(table, report):
+def test_every_height_has_its_source(table, report):
     tops = {name: (row["top_m"], row["height_from"]) for name, row in table.iterrows()}
     assert tops["way/101"] == (12, "height") and tops["way/102"] == (12, "building:levels")
     assert tops["way/103"] == (10, "default") and tops["way/104"] == (10.058, "height")
@@ -43,7 +43,7 @@ def test_every_height_says_where_it_is_from(table, report):
     assert facts["buildings"] == "15 in 14 blocks"
 
 
-def test_what_is_wrong_is_reported(report):
+def test_defects_are_reported(report):
     said = "\n".join(problem.message for problem in report.problems)
     for part in ("'way/116'", "'way/115'", "no area: left out ('way/107')", "0.3 m wide: left out ('way/118')",
                  "way/105: height=-5", "way/119: straw", "way/113 and way/114: 30 m²", "taken apart ('way/106')"):
@@ -51,7 +51,7 @@ def test_what_is_wrong_is_reported(report):
     assert not report.tracing_would_fail
 
 
-def test_the_scene_stands_where_the_map_says(report, table):
+def test_the_scene_lies_where_the_map_says(report, table):
     scene = Scene.load(report.folder)
     assert scene.config.crs == local_crs(scene.config.origin)
     # way/101 as drawn: 20 x 12 m about latitude 47.49983, longitude 8.69934; the map's own degrees, projected
@@ -91,7 +91,7 @@ def test_a_box_of_degrees(tmp_path):
     assert x_max - x_min < x_m[1] - x_m[0] + 40 and report.extent_m == scene.config.extent.bounds
 
 
-def test_a_scene_gives_way_to_a_new_one_and_nothing_else_does(tmp_path, empty_map):
+def test_only_a_scene_is_replaced(tmp_path, empty_map):
     path = empty_map.box(0, 0, 20, 20, height="5").write(tmp_path / "a.osm")
     for _ in range(2):
         build_scene_from_map(path, tmp_path / "out")
@@ -102,10 +102,11 @@ def test_a_scene_gives_way_to_a_new_one_and_nothing_else_does(tmp_path, empty_ma
         build_scene_from_map(path, tmp_path)
 
 
-def test_the_table_of_materials_counts(tmp_path):
-    from radiotwin.footprints import STANDARD_TABLE, with_pairs
+def test_the_table_of_materials_is_used(tmp_path):
+    from radiotwin.footprints import with_pairs
+    from radiotwin.footprints.material_table import STANDARD
 
-    options = MapOptions(materials=with_pairs(STANDARD_TABLE, {"straw": "itu_wood", "ground": "wet_ground"}))
+    options = MapOptions(materials=with_pairs(STANDARD, {"straw": "itu_wood", "ground": "wet_ground"}))
     report = build_scene_from_map(TOWN, tmp_path / "unused", options, check_only=True)
     assert {use.name: use.shapes for use in report.materials}["wood"] == 2
     assert "wet_ground" in {use.name for use in report.materials} and not (tmp_path / "unused").exists()
@@ -138,7 +139,7 @@ def test_a_ring_of_three_points_is_no_building(tmp_path):
     assert "2 building(s) have no area" in report.problems[0].message
 
 
-def test_nothing_usable_says_why(tmp_path, empty_map):
+def test_nothing_usable_gives_the_reasons(tmp_path, empty_map):
     path = empty_map.box(0, 0, 0, 20).write(tmp_path / "a.osm")
     with pytest.raises(BadInput, match="none of its 1 buildings can be used:\n.*have no area"):
         build_scene_from_map(path, tmp_path / "out")

@@ -30,7 +30,7 @@ def test_columns_are_tags(tmp_path):
     assert one.area.bounds == pytest.approx((8.7, 47.5, 8.7002, 47.5001))
 
 
-def test_where_buildings_are_marked_nothing_else_counts(tmp_path):
+def test_where_buildings_are_marked_other_rows_are_ignored(tmp_path):
     found = read(tmp_path, collection(feature(building="yes"), feature(leisure="park"), feature(building="no"),
                                       {**feature(building="yes"), "geometry": None}))
     assert [one.name for one in found.features] == ["feature 1"]
@@ -87,7 +87,7 @@ def test_broken_geopackage(tmp_path, data):
         read_geopackage(tmp_path / "a.gpkg")
 
 
-def test_missing_package_says_what_to_install(package, monkeypatch):
+def test_missing_package_names_what_to_install(package, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pyogrio", None)
     with pytest.raises(BadInput, match=r"pip install 'radiotwin\[gis\]'"):
         read_geopackage(package)

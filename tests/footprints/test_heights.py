@@ -13,7 +13,7 @@ def test_lengths(text, metres):
 
 
 @pytest.mark.parametrize("text", ["", "tall", "12,5", "12;14", "1e3", "12 km", "nan", "inf", "12 34", "'", "٣x"])
-def test_what_is_no_length(text):
+def test_invalid_lengths(text):
     assert math.isnan(parse_length_m(text))
 
 
@@ -32,5 +32,5 @@ def test_what_is_no_length(text):
     ({"height": "20", "building:min_level": "2"}, Height(6, 20, "height")),
     ({"height": "20", "min_height": "-1"}, Height(0, 20, "height", ["min_height=-1"])),
 ])
-def test_height_and_where_it_is_from(tags, height):
+def test_height_and_its_source(tags, height):
     assert height_of(tags, 10.0) == height

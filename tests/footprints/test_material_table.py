@@ -45,7 +45,7 @@ def test_pairs_of_the_command_line():
 
 @pytest.mark.parametrize(("text", "message"), [
     ("=", "not valid TOML"), ('default = "cheese"', "default: there is no ITU material 'cheese'"),
-    ("default = 7", "default = 7"), ('brick = "wood"', "brick = 'wood' stands alone"),
+    ("default = 7", "default = 7"), ('brick = "wood"', "brick = 'wood' is in no table"),
     ('["building:material"]\nbrick = ["wood"]', r"\[building:material\] brick"),
     ('[building]\nbarn = "hay"', r"\[building\] barn: there is no ITU material 'hay'")])
 def test_bad_tables(tmp_path, text, message):

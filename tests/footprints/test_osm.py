@@ -17,7 +17,7 @@ def test_ways_make_rings(chains, rings):
 
 
 @pytest.mark.parametrize("chains", [[[1, 2, 3]], [[1, 2, 3], [3, 4]]])
-def test_ways_that_leave_an_end_over(chains):
+def test_ways_with_an_open_end(chains):
     assert stitch(chains) is None
 
 
@@ -88,7 +88,7 @@ def test_broken_pbf(tmp_path, data):
             raise BadInput("holds no")
 
 
-def test_missing_package_says_what_to_install(tmp_path, monkeypatch):
+def test_missing_package_names_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "osmium", None)
     with pytest.raises(BadInput, match=r"pip install 'radiotwin\[gis\]'"):
         read_osm_pbf(tmp_path / "a.osm.pbf")

@@ -60,7 +60,7 @@ def test_a_courtyard_that_touches_the_outside_wall():
     (shapely.Polygon([(0, 0), (0, 0), (0, 0), (0, 0)]), "no area"),
     (shapely.box(0, 0, 30, 0.1), "sliver"),
     (shapely.box(0, 0, 0.9, 0.9), "sliver")])
-def test_what_is_left_out_is_said(area, message):
+def test_omissions_are_reported(area, message):
     prisms, problems = prisms_of(feature(area), feature(shapely.box(50, 50, 60, 60), "way/2"))
     assert {prism.name for prism in prisms} == {"way/2"}
     assert len(problems) == 1 and message in problems[0].message and "'way/1'" in problems[0].message
@@ -100,7 +100,7 @@ def part(area, name, **tags):
     return feature(area, name, building=None, building__part="yes", height=tags.pop("height", None), **tags)
 
 
-def test_parts_stand_for_their_outline():
+def test_parts_replace_their_outline():
     prisms, problems = prisms_of(
         feature(shapely.box(0, 0, 30, 10), height="40", building__material="glass"),
         part(shapely.box(0, 0, 10, 10), "way/2", height="40"),
@@ -114,7 +114,7 @@ def test_parts_stand_for_their_outline():
     assert not block.mesh.contains([[15, 5, 2]])[0]  # the passage
 
 
-def test_the_rest_of_an_outline_is_kept_and_said():
+def test_the_rest_of_an_outline_is_kept_and_reported():
     prisms, problems = prisms_of(feature(shapely.box(0, 0, 30, 10), height="8"),
                                  part(shapely.box(0, 0, 10, 10), "way/2", height="20"))
     assert {(prism.name, round(prism.area.area)) for prism in prisms} == {("way/1", 200), ("way/2", 100)}

@@ -1,4 +1,4 @@
-"""Cities of boxes, turned as one likes."""
+"""Cities of boxes, turned by any angle."""
 
 import mapbox_earcut
 import numpy as np

@@ -4,7 +4,12 @@ import numpy as np
 import pytest
 from scipy.special import modfresnelm
 
-from radiotwin.paths.coefficients import concrete_permittivity, fresnel, transition, wedge_coefficients
+from radiotwin.paths.coefficients import (
+    concrete_permittivity,
+    fresnel,
+    transition,
+    wedge_coefficients,
+)
 
 CONDUCTOR = complex(np.inf, 0)
 CONCRETE = concrete_permittivity(2.4e9)
@@ -31,20 +36,20 @@ def test_transition_function(x):
 
 def field(phi, phi_in, n, permittivity, soft):
     """Direct, reflected and diffracted field of a line source's ray across a wedge, over that of free space."""
-    before_m, behind_m = 40.0, 70.0
+    before_m, after_m = 40.0, 70.0
     row = 0 if soft else 1
-    total = wedge_coefficients(phi, phi_in, 1.0, before_m * behind_m / (before_m + behind_m), WAVE_NUMBER, n,
-                               permittivity)[row] / np.sqrt(before_m * behind_m * (before_m + behind_m))
-    total *= np.exp(-1j * WAVE_NUMBER * (before_m + behind_m))
+    total = wedge_coefficients(phi, phi_in, 1.0, before_m * after_m / (before_m + after_m), WAVE_NUMBER, n,
+                               permittivity)[row] / np.sqrt(before_m * after_m * (before_m + after_m))
+    total *= np.exp(-1j * WAVE_NUMBER * (before_m + after_m))
     for seen, angle in ((phi < np.pi + phi_in, phi - phi_in), (phi < np.pi - phi_in, phi + phi_in)):
         if seen:
-            length_m = np.sqrt(before_m ** 2 + behind_m ** 2 - 2 * before_m * behind_m * np.cos(angle))
+            length_m = np.sqrt(before_m ** 2 + after_m ** 2 - 2 * before_m * after_m * np.cos(angle))
             image = 1.0
             if angle == phi + phi_in:
-                sine = before_m * np.sin(phi_in) / length_m + behind_m * np.sin(phi) / length_m
+                sine = before_m * np.sin(phi_in) / length_m + after_m * np.sin(phi) / length_m
                 image = (-1.0, 1.0)[row] if np.isinf(permittivity.real) else fresnel(sine, permittivity)[row]
             total += image * np.exp(-1j * WAVE_NUMBER * length_m) / length_m
-    return total * (before_m + behind_m)
+    return total * (before_m + after_m)
 
 
 @pytest.mark.parametrize("permittivity", [CONDUCTOR, CONCRETE])
@@ -55,8 +60,8 @@ def test_the_field_has_no_step_at_the_boundaries(permittivity, soft, n):
     for boundary in (np.pi + phi_in, np.pi - phi_in):
         # Across the boundary, and from its limiting form to the full one.
         for low, high in ((-1e-7, 1e-7), (0.99e-5, 1.01e-5), (-1.01e-5, -0.99e-5)):
-            before, behind = (field(boundary + step, phi_in, n, permittivity, soft) for step in (low, high))
-            assert abs(before - behind) < 2e-3
+            before, after = (field(boundary + step, phi_in, n, permittivity, soft) for step in (low, high))
+            assert abs(before - after) < 2e-3
     at_shadow = wedge_coefficients(np.pi + phi_in + 1e-7, phi_in, 1.0, 25.0, WAVE_NUMBER, n, permittivity)
     assert np.allclose(np.abs(at_shadow) / np.sqrt(25.0), 0.5, atol=0.06)  # half the free-space field
 

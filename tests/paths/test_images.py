@@ -1,4 +1,4 @@
-"""Turns of paths against plane geometry."""
+"""Points of interaction of paths against plane geometry."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from radiotwin.paths.candidates import CandidateSearch
 from radiotwin.paths.coefficients import concrete_permittivity, fresnel
 from radiotwin.paths.fields import VERTICAL, path_gains
-from radiotwin.paths.images import Buffer, Candidates, find_paths
+from radiotwin.paths.images import Candidates, PathBuffer, find_paths
 
 WAVE_NUMBER = 2 * np.pi * 2.4e9 / 299_792_458.0
 
@@ -20,9 +20,9 @@ def inner_corner(city_of):
         int(np.argmax((normal[:, 1] > 0.9) & np.isclose(search.facets.offset_m, 0)))
 
 
-def solve(search, before, edge, behind, device_m, receiver_m):
-    candidates = Candidates(np.array([before]), np.array([edge]), np.array([behind]))
-    buffer = Buffer.of(5)
+def solve(search, before, edge, after, device_m, receiver_m):
+    candidates = Candidates(np.array([before]), np.array([edge]), np.array([after]))
+    buffer = PathBuffer.allocate(5)
     found, _ = find_paths(search.surfaces, candidates, np.array(device_m), np.array([receiver_m]), 0, buffer)
     gain = np.empty(found)
     path_gains(search.surfaces, candidates, WAVE_NUMBER, concrete_permittivity(2.4e9), VERTICAL, buffer,
@@ -44,7 +44,7 @@ def test_two_walls_of_a_corner(inner_corner):
     assert gain[0] == pytest.approx(abs(te_x * te_y) ** 2 / (2 * WAVE_NUMBER * length_m) ** 2, rel=1e-9)
 
 
-def test_the_other_order_is_no_path(inner_corner):
+def test_the_other_order_has_no_path(inner_corner):
     """Over a corner of 90 degrees one of the two orders exists."""
     search, wall_x, wall_y = inner_corner
     assert not solve(search, [wall_x, wall_y], -1, [-1], [20.0, 4.0, 5.0], [3.0, 30.0, 5.0])[0]
@@ -58,7 +58,7 @@ def test_beside_the_wall_is_no_reflection(inner_corner):
     assert not solve(search, [wall_x], -1, [-1], [-20.0, 50.0, 5.0], [20.0, 55.0, 5.0])[0]
 
 
-def test_keller_and_mirror_behind_an_edge(city_of):
+def test_diffraction_and_reflection_after_the_edge(city_of):
     """Over a roof edge to a higher wall and back: angles to the edge are equal, and so are those to the wall."""
     search = CandidateSearch(city_of((0, -50, 5, 50, 10), (60, -50, 70, 50, 40)), depth=3)
     edges, facets = search.edges, search.facets
@@ -73,14 +73,14 @@ def test_keller_and_mirror_behind_an_edge(city_of):
     assert np.isclose(paths[0][2, 0], 60) and np.allclose(legs[1] * [-1, 1, 1], legs[2])
 
 
-def test_a_full_buffer_goes_on_where_it_was(inner_corner):
+def test_a_full_buffer_goes_on_from_the_cursor(inner_corner):
     search, _, _ = inner_corner
     device_m = np.array([20.0, 4.0, 5.0])
     receiver_m = np.random.default_rng(1).uniform([1, 1, 1], [40, 40, 30], (50, 3))
     candidates = search.candidates(device_m)
     rows = {}
     for capacity in (3, 10_000):
-        buffer, cursor, rows[capacity] = Buffer.of(capacity), 0, []
+        buffer, cursor, rows[capacity] = PathBuffer.allocate(capacity), 0, []
         while cursor < len(candidates.edge) * len(receiver_m):
             found, cursor = find_paths(search.surfaces, candidates, device_m, receiver_m, cursor, buffer)
             rows[capacity] += list(zip(buffer.candidate[:found], buffer.receiver[:found]))
