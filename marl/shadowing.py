@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.fft import fft2, next_fast_len
 
-from radiotwin.channel.likelihood import standardised
-from radiotwin.channel.regression_kriging import RegressionKriging
+from radiotwin.inference.gaussian import standardised
 from radiotwin.channel.residual_field import ResidualField
 from radiotwin.measurements import Measurements
 from radiotwin.radiomap import RadioMap

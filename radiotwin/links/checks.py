@@ -1,4 +1,6 @@
-"""What may be wrong with measured data: levels that say nothing, names, places and units that may not be meant."""
+"""Checks of measured data: levels, names, positions and units that are probably not meant."""
+
+from collections.abc import Iterable
 
 import numpy as np
 import pandas as pd
@@ -7,109 +9,148 @@ from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 
-MIN_LINKS = 60
+MIN_LINKS = 60  # that anything can be learnt from; half of them detected
 MIN_LINKS_OF_RECEIVER = 5
-CLOSE_M, MIN_PLACES = 0.1, 3  # so many places so close to each other are hardly in metres
-MAX_NAMED = 5
+CLOSE_M, MIN_POSITIONS = 0.1, 3  # so many positions so close to each other are hardly in metres
+MAX_NAMED = 5  # names in a message
 MAX_OUTSIDE = 0.5  # share of the links
 
 
 def refuse_empty_levels(level_db: np.ndarray, column: str) -> None:
-    """Raise BadInput where levels say nothing."""
+    """Check that levels (n,) of a column hold something to explain.
+
+    Raises:
+        BadInput: nothing was detected, or all levels are equal.
+    """
     if not np.isfinite(level_db).any():
-        raise BadInput(f"nothing was detected: {column} is empty in all {len(level_db):,} rows, and at least "
-                       f"{MIN_LINKS // 2} links need a level. Check that column, and that devices were in range")
+        raise BadInput(f"nothing was detected: {column} is empty in all {len(level_db):,} rows, and "
+                       f"at least {MIN_LINKS // 2} links need a level. Check that column, and that "
+                       "devices were in range")
     if len(level_db) > MIN_LINKS_OF_RECEIVER and np.nanmin(level_db) == np.nanmax(level_db):
-        raise BadInput(f"all levels are {np.nanmin(level_db):g}, so there is nothing to explain; check the column "
-                       f"{column}")
+        raise BadInput(f"all levels are {np.nanmin(level_db):g}, so there is nothing to explain; "
+                       f"check the column {column}")
 
 
 def check_names(measurements: Measurements) -> list[str]:
-    """Names that may not be meant, a remark each."""
+    """Return a note on each set of names that are probably not meant."""
     notes = []
     for what, names in (("receivers", measurements.table["receiver"].unique()),
-                        ("devices", measurements.devices["device"]), ("flights", measurements.flights)):
+                        ("devices", measurements.devices["device"]),
+                        ("flights", measurements.flights)):
         names = pd.Series(names, dtype=str)
         alike = names[names.str.casefold().duplicated(keep=False)]
         if len(alike):
-            notes.append(f"{what} {_some(alike)} differ in upper and lower case only; they are taken for different "
-                           "ones")
-    idle = measurements.devices["device"][~np.isin(np.arange(len(measurements.devices)), measurements.device_index)]
+            notes.append(f"{what} {_shortened(alike)} differ in upper and lower case only; they are "
+                         "taken for different ones")
+    used = np.isin(np.arange(len(measurements.devices)), measurements.device_index)
+    idle = measurements.devices["device"][~used]
     if len(idle):
-        notes.append(f"no link is to device {_some(idle)}")
+        notes.append(f"no link is to device {_shortened(idle)}")
     return notes
 
 
-def check_positions(receiver_m: np.ndarray, device_m: np.ndarray, scene: Scene | None) -> list[str]:
-    """Positions (n, 3), (k, 3) that may be in another unit or frame, a remark each.
+def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
+                    scene: Scene | None) -> list[str]:
+    """Return a note on each set of positions that are probably in another unit or frame.
+
+    Args:
+        receiver_m: (n, 3) [m].
+        device_m: (k, 3) [m].
+        scene: the 3D map, if there is one.
 
     Raises:
-        BadInput: receivers and devices are all at one place but for millimetres.
+        BadInput: all receivers and devices are within millimetres, or most receivers are outside the
+            map.
     """
     both = "receivers and devices"
     notes = {}
-    for what, place_m in (("receivers", receiver_m), ("devices", device_m), (both, np.vstack([receiver_m, device_m]))):
-        places = np.unique(place_m[np.isfinite(place_m[:, :2]).all(axis=1), :2], axis=0)
-        if len(places) >= MIN_PLACES and np.ptp(places, axis=0).max() < CLOSE_M:
-            notes[what] = (f"all {len(places):,} places of {what} lie within {np.ptp(places, axis=0).max():.2g} m: "
-                             "positions are to be in metres; degrees are not converted")
+    for what, position_m in (("receivers", receiver_m), ("devices", device_m),
+                             (both, np.vstack([receiver_m, device_m]))):
+        known = np.isfinite(position_m[:, :2]).all(axis=1)
+        different = np.unique(position_m[known, :2], axis=0)
+        if len(different) >= MIN_POSITIONS and np.ptp(different, axis=0).max() < CLOSE_M:
+            notes[what] = (f"all {len(different):,} positions of {what} lie within "
+                           f"{np.ptp(different, axis=0).max():.2g} m: positions are to be in metres; "
+                           "degrees are not converted")
     if both in notes:
         raise BadInput(notes[both])
-    return [*notes.values(), *(_beside_the_map(receiver_m, scene) if scene is not None else [])]
+    return [*notes.values(), *(_off_the_map(receiver_m, scene) if scene is not None else [])]
 
 
-def _beside_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
+def _off_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
     known = np.isfinite(receiver_m).all(axis=1)
     inside = np.zeros(len(receiver_m), dtype=bool)
     inside[known] = scene.city.inside(receiver_m[known])
-    low, high = scene.city.vertices.min(axis=0)[:2], scene.city.vertices.max(axis=0)[:2]
+    corners_m = scene.city.vertices[:, :2]
+    low, high = corners_m.min(axis=0), corners_m.max(axis=0)
     outside = ((receiver_m[:, :2] < low) | (receiver_m[:, :2] > high)).any(axis=1)
     if outside.mean() > MAX_OUTSIDE:
         raise BadInput(
-            f"{outside.sum():,} of {len(outside):,} links have their receiver outside the 3D map, which goes from "
-            f"{_place(low)} to {_place(high)} m: give measurements and scene in one frame, in metres; feet and degrees "
-            "are not converted")
-    return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}: do measurements and scene share one "
-            "frame and unit?" for odd, where in ((inside, "inside a building"), (outside, "outside the 3D map"))
+            f"{outside.sum():,} of {len(outside):,} links have their receiver outside the 3D map, "
+            f"which goes from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) m: give "
+            "measurements and scene in one frame, in metres; feet and degrees are not converted")
+    return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}: do measurements and "
+            "scene share one frame and unit?"
+            for odd, where in ((inside, "inside a building"), (outside, "outside the 3D map"))
             if odd.any()]
 
 
-def _place(corner_m: np.ndarray) -> str:
-    return f"({corner_m[0]:.0f}, {corner_m[1]:.0f})"
+def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,
+                      keep: np.ndarray) -> list[tuple[np.ndarray, str]]:
+    """Return links of receivers that say nothing, and why.
 
+    Args:
+        table: n measurements.
+        level_db: (n,) [dB]; NaN = not detected.
+        keep: (n,) bool, links that count.
 
-def useless_receivers(table: pd.DataFrame, level_db: np.ndarray, keep: np.ndarray) -> list[tuple[np.ndarray, str]]:
-    """Links (n,) of receivers that tell nothing, and why; only the links `keep` (n,) count."""
+    Returns:
+        masks (n,), each with its reason.
+    """
     end, names = pd.factorize(table["receiver"], sort=True)
     links = np.bincount(end[keep], minlength=len(names))
     seen = keep & np.isfinite(level_db)
     low, high = np.full(len(names), np.inf), np.full(len(names), -np.inf)
     np.minimum.at(low, end[seen], level_db[seen])
     np.maximum.at(high, end[seen], level_db[seen])
-    heard = np.bincount(end[seen], minlength=len(names))  # one that heard once among many blanks is not stuck
-    dead, stuck = (links > 0) & np.isinf(low), (heard > MIN_LINKS_OF_RECEIVER) & (low == high)
+    heard = np.bincount(end[seen], minlength=len(names))
+    dead = (links > 0) & np.isinf(low)
+    stuck = (heard > MIN_LINKS_OF_RECEIVER) & (low == high)  # not one that heard once
     few = (links > 0) & (links < MIN_LINKS_OF_RECEIVER) & ~dead
     count = f"{links[few].max(initial=0)} {'only' if few.sum() < 2 else 'at most'}"
-    return [(dead[end], f"receiver {_some(names[dead])} never detected anything"),
-            (stuck[end], f"receiver {_some(names[stuck])} always reads {_some([f'{v:g}' for v in low[stuck]])}"),
-            (few[end], f"receiver {_some(names[few])} has {count}; {MIN_LINKS_OF_RECEIVER} are needed")]
+    values = _shortened([f"{value:g}" for value in low[stuck]])
+    return [(dead[end], f"receiver {_shortened(names[dead])} never detected anything"),
+            (stuck[end], f"receiver {_shortened(names[stuck])} always reads {values}"),
+            (few[end], f"receiver {_shortened(names[few])} has {count}; "
+                       f"{MIN_LINKS_OF_RECEIVER} are needed")]
 
 
-def unheard_devices(table: pd.DataFrame, level_db: np.ndarray, keep: np.ndarray) -> tuple[np.ndarray, str]:
-    """Links (n,) of devices that nobody detected although many tried, and what is said of them.
+def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
+                    keep: np.ndarray) -> tuple[np.ndarray, str]:
+    """Return links of devices that nobody detected although many tried, and a note on them.
 
-    A device that is off would pass for one with a huge loss. One with few links may be a place of a device that moves,
-    and then its blanks are worth as much as anybody's.
+    A device that is off would pass for one with a huge loss. One with few links may be a position of
+    a device that moves, and then its blanks are as good as any.
+
+    Args:
+        table, level_db, keep: as of `useless_receivers`.
+
+    Returns:
+        mask (n,), and its reason.
     """
     end, names = pd.factorize(table["device"], sort=True)
-    links, heard = (np.bincount(end[rows], minlength=len(names)) for rows in (keep, keep & np.isfinite(level_db)))
+    links, heard = (np.bincount(end[rows], minlength=len(names))
+                    for rows in (keep, keep & np.isfinite(level_db)))
     dead = (links >= MIN_LINKS) & (heard == 0)
-    return dead[end], f"device {_some(names[dead])} was never detected; is it on, and in range?"
+    return dead[end], f"device {_shortened(names[dead])} was never detected; is it on, and in range?"
 
 
 def find_fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
-    """The lowest value and its share, where it stands for "not detected": far more often there than a tail would be,
-    and with a gap, or a heap, that no tail has."""
+    """Return the lowest of levels (n,) and its share, where it means "not detected".
+
+    It occurs far more often than a tail would have it, and with a gap, or a heap, that no tail has.
+    None where there is no such value.
+    """
     seen = level_db[np.isfinite(level_db)]
     if len(seen) < MIN_LINKS:
         return None, 0.0
@@ -122,6 +163,7 @@ def find_fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
     return (float(values[0]), counts[0] / len(seen)) if heap or gap else (None, 0.0)
 
 
-def _some(names) -> str:
-    names = [str(name) for name in names]
-    return ", ".join(names[:MAX_NAMED]) + (f" and {len(names) - MAX_NAMED:,} more" if len(names) > MAX_NAMED else "")
+def _shortened(names: Iterable[object]) -> str:
+    texts = [str(name) for name in names]
+    more = f" and {len(texts) - MAX_NAMED:,} more" if len(texts) > MAX_NAMED else ""
+    return ", ".join(texts[:MAX_NAMED]) + more

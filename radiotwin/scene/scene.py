@@ -93,7 +93,7 @@ class Scene:
     def uav_antenna(self) -> Antenna | None:
         """Antenna of all UAVs, averaged over all headings; None: isotropic."""
         names = {uav.antenna for uav in self.config.uavs if uav.antenna is not None}
-        return Antenna(self._pattern(names.pop()).around()) if names else None
+        return Antenna(self._pattern(names.pop()).heading_mean()) if names else None
 
     def copy_antennas(self, folder: Path) -> None:
         """Copy the files of all antennas into another scene folder, under the same names.

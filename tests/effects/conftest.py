@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import radiotwin as rt
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
 from tests.closeloop.conftest import open_ground
@@ -43,11 +44,8 @@ def view():
 @pytest.fixture
 def loop():
     """Close the loop over measurements without a map: names of the effects found, and the first one's parameters."""
-    from radiotwin.closeloop.report import make_report
-    from radiotwin.closeloop.run import close_loop
-
     def run(measurements):
-        report = make_report(close_loop(measurements, None, "log-distance", 0, lambda text: None))
+        report = rt.make_report(rt.close_loop(measurements, base="log-distance"))
         parameters = report["effects"][0]["parameters"] if report["effects"] else {}
         return SimpleNamespace(report=report, names=[effect["name"] for effect in report["effects"]],
                                first={name: SimpleNamespace(**parameter) for name, parameter in parameters.items()})

@@ -1,4 +1,4 @@
-"""Levels that belong to another time than positions: the level changes as the law says of where the receiver was."""
+"""Levels and positions of different times: the level changes as the law says of where the receiver was."""
 
 import numpy as np
 import pytest
@@ -21,30 +21,31 @@ def position_m(time_s, receiver, flight):
 
 @pytest.fixture
 def links(make_links):
-    """Of two receivers on two flights."""
+    """Links of two receivers on two flights."""
     time_s, flight, receiver = (each.ravel() for each in np.meshgrid(
         np.arange(SLOTS, dtype=float), np.arange(FLIGHTS), np.arange(2), indexing="ij"))
     receiver, flight, time_s = (np.repeat(each, len(DEVICES_M)) for each in (receiver, flight, time_s))
     every = slice(None, None, len(DEVICES_M))
     return make_links(DEVICES_M, position_m(time_s, receiver, flight)[every], receiver=receiver, flight=flight,
-                 time_s=1000.0 * flight + time_s)
+                      time_s=1000.0 * flight + time_s)
 
 
 def late_db(links, offset_s):
-    """What is measured if receiver 1 is where its track has it so much later."""
+    """Level by the law if receiver 1 is where its track has it that much later."""
     there_m = position_m(links.time_s - 1000.0 * links.flight + offset_s * (links.receiver == 1), links.receiver,
-                      links.flight)
+                         links.flight)
     return -40 - 22 * np.log10(np.linalg.norm(there_m - DEVICES_M[links.device], axis=1))
 
 
 def test_the_level_is_that_of_where_the_receiver_is_at_the_other_time(links):
-    term = ReceiverClockOffset().term(links, ReceiverClockOffset.Params(receiver=1, offset_s=2.5, speed_m_s=SPEED_M_S), law_db)
+    params = ReceiverClockOffset.Params(receiver=1, offset_s=2.5, speed_m_s=SPEED_M_S)
+    term = ReceiverClockOffset().term(links, params, law_db)
     assert np.abs(term.offset_db[links.receiver == 0]).max() == 0
-    inside = links.time_s % 1000 < SLOTS - 3  # behind the end of its track nobody knows where it was
+    inside = links.time_s % 1000 < SLOTS - 3  # beyond the end of its track its position is unknown
     np.testing.assert_allclose(term.offset_db[inside], (late_db(links, 2.5) - law_db(links))[inside], atol=0.05)
     assert np.abs(term.offset_db[inside]).max() > 1
-    part = links.select(np.arange(0, len(links), 7))  # gaps in what is asked for are none in the tracks
-    some = ReceiverClockOffset().term(part, ReceiverClockOffset.Params(receiver=1, offset_s=2.5, speed_m_s=SPEED_M_S), law_db)
+    part = links.select(np.arange(0, len(links), 7))  # gaps in the selection are none in the tracks
+    some = ReceiverClockOffset().term(part, params, law_db)
     np.testing.assert_allclose(some.offset_db, term.offset_db[::7], atol=1e-9)
 
 
@@ -61,7 +62,7 @@ def test_where_clocks_agree_nothing_is_proposed(links, view):
     assert ReceiverClockOffset().propose(view(links, law_db(links), 0.5, law_db)) == []
 
 
-def test_without_times_or_without_a_way_it_is_not_looked_for(make_links):
+def test_without_times_or_movement_it_is_not_looked_for(make_links):
     assert "time_s" in ReceiverClockOffset().unavailable(make_links(DEVICES_M, np.ones((80, 3))))
     still = make_links(DEVICES_M, np.ones((80, 3)), time_s=np.repeat(np.arange(80.0), 3))
     assert "moves" in ReceiverClockOffset().unavailable(still)

@@ -28,7 +28,7 @@ def test_the_sector_looks_up_or_down_by_its_tilt():
 
 @pytest.mark.parametrize("boresight_deg", [90.0, 30.0])
 def test_a_hidden_receiver_hears_the_antenna_in_the_direction_of_the_reflection(make_links, boresight_deg):
-    """A screen north of the device blocks the link, and a long wall east of it reflects: all paths leave to the wall."""
+    """A screen north of the device blocks the link, a long wall east of it reflects: all paths leave to the wall."""
     walls = [trimesh.creation.box(extents=extents) for extents in ([30, 2, 60], [2, 400, 60])]
     for wall, middle in zip(walls, ([0, 20, 30], [30, 0, 30])):
         wall.apply_translation(middle)
@@ -43,7 +43,8 @@ def test_a_hidden_receiver_hears_the_antenna_in_the_direction_of_the_reflection(
 
 def test_patterns_that_version_0_1_wrote_are_read():
     params = SectorAntenna.Params.model_validate({"devices": {"3": [40, 65, 25, -6, 15, -35]}})
-    pattern = SectorPattern(azimuth_deg=40, beamwidth_deg=65, front_to_back_db=25, tilt_deg=-6, vertical_beamwidth_deg=15)
+    pattern = SectorPattern(azimuth_deg=40, beamwidth_deg=65, front_to_back_db=25, tilt_deg=-6,
+                            vertical_beamwidth_deg=15, scattered_db=-35)
     assert params == SectorAntenna.Params(devices={3: pattern})
     assert SectorAntenna.Params.model_validate_json(params.model_dump_json()) == params
     dipole = TiltedDipole.Params.model_validate({"receivers": {"1": [20.0, 90.0, -30.0]}}).receivers[1]

@@ -35,7 +35,8 @@ def test_a_device_elsewhere_changes_its_own_links(links):
 
 
 def test_a_receiver_elsewhere_changes_its_own_links(links):
-    term = ReceiverPositionError().term(links, ReceiverPositionError.Params(receiver=0, move_m=(0.0, 5.0, -25.0)), law_db)
+    params = ReceiverPositionError.Params(receiver=0, move_m=(0.0, 5.0, -25.0))
+    term = ReceiverPositionError().term(links, params, law_db)
     position_m = links.receiver_m + np.where(links.receiver == 0, 1.0, 0.0)[:, None] * (0, 5, -25)
     np.testing.assert_allclose(term.offset_db, moved_db(links, DEVICES_M[links.device], position_m), atol=1e-9)
 
