@@ -38,7 +38,7 @@ def close_loop(
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
     from radiotwin.progress import progress
-    from radiotwin.report import summary, write_closeloop_figures, write_closeloop_page
+    from radiotwin.report import closeloop_summary, write_closeloop_figures, write_closeloop_page
     from radiotwin.scene import Scene
     from radiotwin.twin import check_twin_target
 
@@ -72,7 +72,7 @@ def close_loop(
                                     "high": "right", "unit": "left"},
                [[effect["name"], name, *(float("nan") if p[k] is None else p[k] for k in ("value", "low", "high")),
                  p["unit"]] for effect in report["effects"] for name, p in effect["parameters"].items()])
-    say(summary(report))
+    say(closeloop_summary(report))
     say(f"wrote {out / 'closeloop.html'}")
     if write_scene is not None and world is not None:
         changes = write_corrected_scene(loop, world, write_scene)

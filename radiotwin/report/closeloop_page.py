@@ -62,7 +62,7 @@ def write_closeloop_page(report: dict, folder: Path | str, title: str) -> None:
         "closeloop": closeloop_context(report, folder)})
 
 
-def summary(report: dict) -> str:
+def closeloop_summary(report: dict) -> str:
     """Summarise the result of a close-loop in one to three sentences.
 
     Args:
@@ -102,7 +102,7 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         verdict += join_names(_cause_names(report))
     pictures = [read_picture(folder / name, title, text) for name, title, text in FIGURES]
     return {
-        "lead": summary(report), "verdict": verdict, "cards": _cards(report),
+        "lead": closeloop_summary(report), "verdict": verdict, "cards": _cards(report),
         "figures": [picture for picture in pictures if picture],
         "effects": _effects(report, folder),
         "errors": _error_table(report, ("los",)),
