@@ -95,8 +95,18 @@ def test_a_last_resort_is_not_called_an_explanation(tmp_path):
     assert "which explains nothing, brings the RMSE to 3.00 dB" in closeloop_summary(filled)
     filled = report("effect", effects=[DRIFT, shadowing])
     filled["error"]["after"] |= {"rmse_db": 1.5}
-    assert "lacked receiver drift. With it the RMSE on held-out links falls from 3.00 to 2.00 dB" in closeloop_summary(filled)
-    assert "brings the RMSE to 1.50 dB" in closeloop_summary(filled) and "found: receiver drift<" in page(filled, tmp_path)
+    text = closeloop_summary(filled)
+    assert "lacked receiver drift. With it the RMSE on held-out links falls from 3.00 to 2.00 dB" in text
+    assert "brings the RMSE to 1.50 dB" in text and "found: receiver drift<" in page(filled, tmp_path)
+
+
+def test_a_figure_outside_the_folder_is_not_read(tmp_path):
+    folder = tmp_path / "run"
+    (folder / "effect_1_").mkdir(parents=True)
+    (tmp_path / "private.png").write_bytes(b"private")
+    (folder / "waterfall.png").symlink_to(tmp_path / "private.png")
+    stranger = report(effects=[DRIFT | {"name": "/../../private"}])
+    assert "data:image/png" not in page(stranger, folder)
 
 
 def test_names_in_words():
