@@ -47,7 +47,7 @@ def close_loop(
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
     from radiotwin.progress import progress
-    from radiotwin.report import summary, write_closeloop_figures, write_closeloop_page
+    from radiotwin.report import closeloop_summary, write_closeloop_figures, write_closeloop_page
     from radiotwin.scene import Scene
     from radiotwin.twin import check_twin_target
 
@@ -67,7 +67,7 @@ def close_loop(
     corrected_twin(loop, world).save(out / "twin")
     write_closeloop_page(report, out, f"Close-loop report of {measurements.name}")
     _print(report)
-    say(summary(report))
+    say(closeloop_summary(report))
     say(f"wrote {out / 'closeloop.html'}")
     if write_scene is not None and world is not None:
         changes = write_corrected_scene(loop, world, write_scene)

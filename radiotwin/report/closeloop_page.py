@@ -62,7 +62,7 @@ def write_closeloop_page(report: dict, folder: Path | str, title: str) -> None:
         "closeloop": closeloop_context(report, folder)})
 
 
-def summary(report: dict) -> str:
+def closeloop_summary(report: dict) -> str:
     """Summarise the result of a close-loop in one to three sentences.
 
     Args:
@@ -100,9 +100,9 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
     verdict = BADGES[report["verdict"]]
     if report["verdict"] == "effect":
         verdict += join_names(_cause_names(report))
-    pictures = [read_picture(folder / name, title, text) for name, title, text in FIGURES]
+    pictures = [read_picture(folder, name, title, text) for name, title, text in FIGURES]
     return {
-        "lead": summary(report), "verdict": verdict, "cards": _cards(report),
+        "lead": closeloop_summary(report), "verdict": verdict, "cards": _cards(report),
         "figures": [picture for picture in pictures if picture],
         "effects": _effects(report, folder),
         "errors": _error_table(report, ("los",)),
@@ -126,7 +126,7 @@ def _cards(report: dict) -> list[tuple[str, str]]:
 
 
 def _effects(report: dict, folder: Path) -> dict[str, list[dict]]:
-    """Return the effects by the heading that they stand under."""
+    """Return the effects grouped by their heading."""
     sections: dict[str, list[dict]] = {}
     for effect in report["effects"]:
         name, label = effect["name"], name_label(effect["name"])
@@ -135,7 +135,7 @@ def _effects(report: dict, folder: Path) -> dict[str, list[dict]]:
                 for key, p in effect["parameters"].items()]
         sections.setdefault(heading, []).append({
             "rank": effect["rank"], "name": name, "label": label, "evidence": _evidence(effect),
-            "picture": read_picture(folder / f"effect_{effect['rank']}_{name}.png", label),
+            "picture": read_picture(folder, f"effect_{effect['rank']}_{name}.png", label),
             "parameters": Table(("parameter", "value", "90 % interval", "unit"), rows)})
     return sections
 

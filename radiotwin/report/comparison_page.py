@@ -24,7 +24,7 @@ def comparison_context(comparison: Comparison, folder: Path) -> dict[str, Any]:
         comparison: scores and located devices.
         folder: of the figures.
     """
-    pictures = [read_picture(folder / name, title, text) for name, title, text in FIGURES]
+    pictures = [read_picture(folder, name, title, text) for name, title, text in FIGURES]
     return {"lead": _summary(comparison),
             "tables": [Table(list(columns), rows, title)
                        for title, columns, rows in comparison.tables()],

@@ -42,9 +42,10 @@ class Picture:
     text: str = ""
 
 
-def read_picture(path: Path, title: str, text: str = "") -> Picture | None:
-    """Read a PNG file to be put into a page; None where there is none."""
-    if not path.is_file():
+def read_picture(folder: Path, name: str, title: str, text: str = "") -> Picture | None:
+    """Read a PNG file of a folder to be put into a page; None where the folder does not hold it."""
+    path = (folder / name).resolve()
+    if path.parent != folder.resolve() or not path.is_file():  # a name may come with the run
         return None
     data = base64.b64encode(path.read_bytes()).decode()
     return Picture(title, f"data:image/png;base64,{data}", text)

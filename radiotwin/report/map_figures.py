@@ -67,7 +67,8 @@ def radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
             ax.set(xlabel="", xticklabels=[])
     figure.colorbar(image, ax=axes, label="channel gain [dB]", shrink=0.7)
     source = radio_map.dataset.attrs.get("source", "")
-    figure.suptitle(f"{source} at {radio_map.lattice.z_m[0]:g} m (triangle: device)")
+    figure.suptitle(f"{source} at {radio_map.lattice.z_m[0]:g} m (triangle: device; white: not "
+                    "detected)")
     return figure
 
 

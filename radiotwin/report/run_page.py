@@ -79,8 +79,8 @@ def _planning(run: Run) -> dict[str, Any] | None:
     columns = ("method", "trained in", "real episodes", "collected in the truth")
     return {"table": Table(columns, rows, "Share of all data that is collected in the truth", 2),
             "pictures": [
-                read_picture(run.folder / "curve.png", "Collected data over real episodes"),
-                read_picture(run.folder / "trajectories.png", "Trajectories of one flight")]}
+                read_picture(run.folder, "curve.png", "Collected data over real episodes"),
+                read_picture(run.folder, "trajectories.png", "Trajectories of one flight")]}
 
 
 def _estimates(run: Run) -> Table | None:

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from radiotwin.report.closeloop_page import summary, write_closeloop_page
+from radiotwin.report.closeloop_page import closeloop_summary, write_closeloop_page
 from radiotwin.report.labels import join_names, parameter_label, variable_label
 
 SCORES = {"n": 900, "bias_db": 0.04, "std_db": 3.0, "correlation": 0.9, "rmse_db": 3.0, "mae_db": 2.2, "nll": 2.5}
@@ -85,18 +85,28 @@ def test_what_an_effect_may_be_taken_for_is_said(tmp_path):
 def test_numbers_that_are_not_known_are_dashes(tmp_path):
     unknown = report("none", baselines={"log_distance": NOTHING}, structure_before=[])
     unknown["error"] |= {"before": NOTHING, "after": NOTHING}
-    assert "(– dB RMSE)" in summary(unknown)
+    assert "(– dB RMSE)" in closeloop_summary(unknown)
     assert "None" not in page(unknown, tmp_path) and "nan" not in page(unknown, tmp_path)
 
 
 def test_a_last_resort_is_not_called_an_explanation(tmp_path):
     shadowing = DRIFT | {"name": "correlated_shadowing", "rank": 2}
     filled = report("unexplained", effects=[shadowing])
-    assert "which explains nothing, brings the RMSE to 3.00 dB" in summary(filled)
+    assert "which explains nothing, brings the RMSE to 3.00 dB" in closeloop_summary(filled)
     filled = report("effect", effects=[DRIFT, shadowing])
     filled["error"]["after"] |= {"rmse_db": 1.5}
-    assert "lacked receiver drift. With it the RMSE on held-out links falls from 3.00 to 2.00 dB" in summary(filled)
-    assert "brings the RMSE to 1.50 dB" in summary(filled) and "found: receiver drift<" in page(filled, tmp_path)
+    text = closeloop_summary(filled)
+    assert "lacked receiver drift. With it the RMSE on held-out links falls from 3.00 to 2.00 dB" in text
+    assert "brings the RMSE to 1.50 dB" in text and "found: receiver drift<" in page(filled, tmp_path)
+
+
+def test_a_figure_outside_the_folder_is_not_read(tmp_path):
+    folder = tmp_path / "run"
+    (folder / "effect_1_").mkdir(parents=True)
+    (tmp_path / "private.png").write_bytes(b"private")
+    (folder / "waterfall.png").symlink_to(tmp_path / "private.png")
+    stranger = report(effects=[DRIFT | {"name": "/../../private"}])
+    assert "data:image/png" not in page(stranger, folder)
 
 
 def test_names_in_words():
