@@ -9,7 +9,6 @@ import pandas as pd
 from radiotwin.antennas.pattern import Pattern
 from radiotwin.errors import BadInput
 
-DIPOLE_DBI = 2.15  # [dBi], gain of a half-wave dipole: 0 dBd
 MAX_GAIN_DBI = 60.0  # [dBi], about that of a dish of 20 m at 5 GHz; more is taken for an error
 AZIMUTH_DEG = np.arange(0.0, 360.0)  # grid of the patterns between two cuts
 ELEVATION_DEG = np.arange(-90.0, 91.0)
@@ -91,7 +90,7 @@ def _read_msi(path: Path) -> Pattern:
                 raise BadInput(f"{path}, row {row}: {line.strip()!r} is not GAIN, a number, and "
                                "dBd or dBi")
             is_dbi = (found[2] or "dBd").lower() == "dbi"
-            gain_dbi = float(found[1]) + (0.0 if is_dbi else DIPOLE_DBI)
+            gain_dbi = float(found[1]) + (0.0 if is_dbi else 2.15)  # 0 dBd: a half-wave dipole
         elif key in cuts:
             cut = cuts[key]
         elif cut is not None:

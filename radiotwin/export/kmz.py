@@ -28,8 +28,6 @@ from radiotwin.scene import Scene
 KML, GX = "http://www.opengis.net/kml/2.2", "http://www.google.com/kml/ext/2.2"
 COLOURS = "viridis"
 OPACITY = 190  # of 255
-MIN_PIXELS = 512  # of a picture's longer side: viewers blur what they enlarge
-DATE = (1980, 1, 1, 0, 0, 0)  # of all files in the archive, so that equal maps give equal bytes
 
 
 def write_kmz(radio_map: RadioMap, scene: Scene, path: Path) -> None:
@@ -76,7 +74,8 @@ def write_kmz(radio_map: RadioMap, scene: Scene, path: Path) -> None:
     text = ET.tostring(document, encoding="utf-8", xml_declaration=True)
     with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
         for name, data in {"doc.kml": text, **pictures}.items():  # doc.kml must be the first
-            archive.writestr(zipfile.ZipInfo(name, DATE), data, zipfile.ZIP_DEFLATED)
+            # Without the time of writing, so that equal maps give equal bytes
+            archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
 
 
 def _add(parent: ET.Element, tag: str, space: str = KML, **texts: str) -> ET.Element:
@@ -101,7 +100,7 @@ def _picture(gain_db: np.ndarray, norm: Normalize) -> bytes:
     """Return the PNG of (ny, nx) gains, north up, transparent where not detected."""
     pixels = colormaps[COLOURS](norm(np.nan_to_num(gain_db)), bytes=True)
     pixels[..., 3] = np.where(np.isfinite(gain_db), OPACITY, 0)
-    times = -(-MIN_PIXELS // max(gain_db.shape))
+    times = -(-512 // max(gain_db.shape))  # at least 512 pixels: viewers blur what they enlarge
     enlarged = pixels[::-1].repeat(times, axis=0).repeat(times, axis=1)
     data = io.BytesIO()
     Image.fromarray(enlarged).save(data, "PNG", optimize=True)

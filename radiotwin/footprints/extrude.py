@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 import trimesh
 from manifold3d import Manifold, Mesh64, OpType
 from scipy.sparse import coo_matrix
@@ -76,26 +75,16 @@ def make_blocks(prisms: Sequence[Prism]) -> list[Block]:
     return blocks
 
 
-def extrude(area: shapely.Polygon, bottom_m: float, top_m: float) -> trimesh.Trimesh:
-    """Return a watertight prism over a polygon, triangulated by earcut.
-
-    Args:
-        area: footprint [m].
-        bottom_m: lower end [m].
-        top_m: upper end [m].
-    """
-    mesh = trimesh.creation.extrude_polygon(area, height=top_m - bottom_m, engine="earcut")
-    mesh.apply_translation([0, 0, bottom_m])
-    return mesh
-
-
 def _union(solids: list[Manifold]) -> Manifold:
     return Manifold.batch_boolean(solids, OpType.Add)
 
 
 def _solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
+    """Return a prism, with all its faces moved outwards by `wider_m`."""
     area = prism.area.buffer(wider_m, join_style="mitre") if wider_m else prism.area
-    mesh = extrude(area, prism.height.bottom_m - wider_m, prism.height.top_m + wider_m)
+    bottom_m, top_m = prism.height.bottom_m - wider_m, prism.height.top_m + wider_m
+    mesh = trimesh.creation.extrude_polygon(area, height=top_m - bottom_m, engine="earcut")
+    mesh.apply_translation([0, 0, bottom_m])
     vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
     return Manifold(Mesh64(vertices, mesh.faces.astype(np.uint64)))
 

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 LEVEL_M = 3.0  # [m], a usual storey
-FOOT_M, INCH_M = 0.3048, 0.0254  # [m]
 MAX_HEIGHT_M = 1000.0  # [m], the tallest building has 828 m
 _METRES = re.compile(r"([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*(?:m|meters?|metres?)?", re.IGNORECASE)
 _FEET = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*(?:'|′|’|ft\.?|feet|foot)\s*"
@@ -34,8 +33,9 @@ def parse_length_m(text: str) -> float:
     if found := _METRES.fullmatch(text):
         return float(found[1])
     if found := _FEET.fullmatch(text):
-        length_m = abs(float(found[1])) * FOOT_M + float(found[2] or 0) * INCH_M
-        return math.copysign(length_m, float(found[1]))
+        feet, inches = float(found[1]), float(found[2] or 0)
+        length_m = abs(feet) * 0.3048 + inches * 0.0254
+        return math.copysign(length_m, feet)
     return math.nan
 
 

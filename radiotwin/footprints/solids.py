@@ -19,9 +19,7 @@ from radiotwin.tables import Origin
 GRID_M = 0.01  # [m], corners are rounded to it, so that walls meant to coincide do
 SLIVER_AREA_M2 = 1.0  # [m²]
 SLIVER_WIDTH_M = 0.3  # [m], mean width; the thickness of one wall
-OVERLAP_M2 = 1.0  # [m²], smaller overlaps are not reported
 MIN_COVERED_SHARE = 0.9  # of an outline that its parts cover for it to be left out
-SHRINK_M = 0.01  # [m], removed from an area whose outline touches itself, to separate its rings
 
 Area = tuple[Feature, shapely.MultiPolygon]
 
@@ -129,7 +127,7 @@ def _clean(feature: Feature, origin: Origin, defects: _Defects) -> shapely.Multi
         return None
     area = _polygons(shapely.set_precision(area, GRID_M))
     if any(_touches_itself(polygon) for polygon in shapely.get_parts(area)):
-        shrunk = area.buffer(-SHRINK_M, join_style="mitre")
+        shrunk = area.buffer(-0.01, join_style="mitre")  # [m], enough to separate the rings
         area, invalid = _polygons(shapely.set_precision(shrunk, GRID_M / 2)), True
     kept = [polygon for polygon in shapely.get_parts(area) if polygon.area >= SLIVER_AREA_M2
             and 2 * polygon.area / polygon.length >= SLIVER_WIDTH_M]
@@ -194,7 +192,7 @@ def find_overlaps(prisms: Sequence[Prism]) -> list[tuple[Prism, Prism, float]]:
         prisms: of all buildings.
 
     Returns:
-        Pairs of prisms, with the area they share [m²].
+        Pairs of prisms, with the area they share, if it is more than 1 m² [m²].
     """
     found = []
     for a, b in _touching_pairs(prisms):
@@ -202,7 +200,7 @@ def find_overlaps(prisms: Sequence[Prism]) -> list[tuple[Prism, Prism, float]]:
         if first.name == second.name or not first.overlaps_in_height(second):
             continue
         shared_m2 = first.area.intersection(second.area).area
-        if shared_m2 > OVERLAP_M2:
+        if shared_m2 > 1.0:
             found.append((first, second, shared_m2))
     return found
 

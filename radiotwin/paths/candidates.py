@@ -13,9 +13,6 @@ from radiotwin.paths.surfaces import OFFSET, pack
 from radiotwin.paths.topology import build_topology, expand
 from radiotwin.scene.citymap import CityMap
 
-DEVICE_RAYS = 100_000  # half a degree apart
-# The surroundings of an edge are seen from many of its points, so fewer rays do
-EDGE_RAYS, EDGE_STEP_M = 300, 20.0
 MAX_AFTER_EDGE = 1  # reflections; a second one would double the time for 0.01 dB
 
 
@@ -64,8 +61,7 @@ class CandidateSearch:
             All sequences of up to `depth` interactions that are worth trying.
         """
         normal, offset_m = self.surfaces.planes[:, :3], self.surfaces.planes[:, OFFSET]
-        sequences = device_sequences(self._city, self.facets, normal, device_m, self._depth,
-                                     DEVICE_RAYS)
+        sequences = device_sequences(self._city, self.facets, normal, device_m, self._depth)
         facing = np.flatnonzero(normal @ device_m > offset_m)
         single = np.full((len(facing), self._depth), -1)
         single[:, 0] = facing
@@ -111,6 +107,5 @@ class CandidateSearch:
     def _sequences_from_edge(self, edge: int) -> FacetSequences:
         if edge not in self._from_edge:
             self._from_edge[edge] = edge_sequences(
-                self._city, self.facets, self.surfaces.planes[:, :3], self.edges, edge, self._after,
-                EDGE_RAYS, EDGE_STEP_M)
+                self._city, self.facets, self.surfaces.planes[:, :3], self.edges, edge, self._after)
         return self._from_edge[edge]

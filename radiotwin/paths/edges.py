@@ -15,8 +15,6 @@ from radiotwin.paths.topology import Topology, build_topology
 from radiotwin.paths.vectors import cross
 from radiotwin.scene.citymap import CityMap
 
-FLAT_RAD = 0.1  # [rad], flatter folds approximate curved surfaces and diffract too little to count
-
 
 @dataclass(frozen=True, eq=False)
 class Edges:
@@ -72,8 +70,9 @@ def extract_edges(
         none = np.empty((0, 3))
         no_facets = np.empty((0, 2), dtype=int)
         return Edges(none, none, none, no_facets, none, none, none, np.empty(0))
+    # Folds flatter than 0.1 rad approximate curved surfaces and diffract too little to count
     found = _wedges(topology.vertices_m, topology.triangles, topology.normal, topology.segments,
-                    topology.owner, topology.group, np.pi + FLAT_RAD)
+                    topology.owner, topology.group, np.pi + 0.1)
     segment = topology.segments[found[:, 0]]
     pair = np.sort(facets.of_face[topology.source[found[:, 1:]]], axis=1)
     keep = pair[:, 0] != pair[:, 1]

@@ -10,10 +10,7 @@ from radiotwin.paths.topology import Topology, build_topology
 from radiotwin.scene.citymap import CityMap
 
 COPLANAR_M = 0.005  # [m], maximum distance of a neighbour's corner from the plane
-COPLANAR_COS = np.cos(np.radians(0.5))  # minimum cosine between the normals of coplanar triangles
-RECTANGLE_SHARE = 1 - 1e-6  # of the bounding rectangle that a facet fills to be called one
 MAX_TRIANGLES_AT_SEGMENT = 12  # triangles that may meet at one segment
-SIDES_TRIED = 16  # longest sides along which the bounding rectangle is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +89,7 @@ def _coplanar_groups(topology: Topology) -> np.ndarray:
     a, b = np.concatenate(pairs).T
     corners_m = topology.vertices_m[topology.triangles]
     normal = topology.normal
-    same = np.einsum("ij,ij->i", normal[a], normal[b]) > COPLANAR_COS
+    same = np.einsum("ij,ij->i", normal[a], normal[b]) > np.cos(np.radians(0.5))
     for one, other in ((a, b), (b, a)):
         off_m = np.einsum("ikj,ij->ik", corners_m[other] - corners_m[one][:, :1], normal[one])
         same &= (np.abs(off_m) < COPLANAR_M).all(axis=1)
@@ -102,6 +99,8 @@ def _coplanar_groups(topology: Topology) -> np.ndarray:
 
 def _frame(corners_m: np.ndarray, cross: np.ndarray) -> np.ndarray:
     """Return the plane of one facet and its smallest bounding rectangle.
+
+    The rectangle is tried along the 16 longest sides of the triangles.
 
     Args:
         corners_m: (t, 3, 3) triangles [m].
@@ -114,7 +113,7 @@ def _frame(corners_m: np.ndarray, cross: np.ndarray) -> np.ndarray:
     area_m2 = np.linalg.norm(normal) / 2
     normal = normal / (2 * area_m2)
     sides = (np.roll(corners_m, -1, axis=1) - corners_m).reshape(-1, 3)
-    longest = np.argsort(-np.linalg.norm(sides, axis=1), kind="stable")[:SIDES_TRIED]
+    longest = np.argsort(-np.linalg.norm(sides, axis=1), kind="stable")[:16]
     min_area_m2 = np.inf
     for side in sides[longest]:
         along = side - (side @ normal) * normal
@@ -128,5 +127,5 @@ def _frame(corners_m: np.ndarray, cross: np.ndarray) -> np.ndarray:
     distance_m = np.average((corners_m @ normal).mean(axis=1),
                             weights=np.linalg.norm(cross, axis=1))
     origin_m = low_m[0] * axis_u + low_m[1] * axis_v + distance_m * normal
-    full = area_m2 >= RECTANGLE_SHARE * min_area_m2
+    full = area_m2 >= (1 - 1e-6) * min_area_m2
     return np.concatenate([normal, origin_m, axis_u, axis_v, size_m, [full]])

@@ -15,7 +15,6 @@ from radiotwin.paths.edges import Edges
 from radiotwin.paths.facets import Facets
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
-FAR_M = 1e5  # [m], length of a ray: beyond any city
 RAY_CHUNK = 200_000  # rays at once: about 60 MB
 
 
@@ -43,9 +42,11 @@ def sphere(count: int) -> np.ndarray:
 
 
 def device_sequences(
-    city: CityMap, facets: Facets, normal: np.ndarray, device_m: np.ndarray, depth: int, rays: int
+    city: CityMap, facets: Facets, normal: np.ndarray, device_m: np.ndarray, depth: int
 ) -> FacetSequences:
     """Find the sequences of facets that rays from a device visit.
+
+    Rays are about half a degree apart.
 
     Args:
         city: 3D map.
@@ -53,21 +54,22 @@ def device_sequences(
         normal: (f + 1, 3) of `Surfaces`.
         device_m: (3,) position [m].
         depth: maximum number of facets of a sequence.
-        rays: number of rays.
 
     Returns:
         The sequences of up to `depth` facets.
     """
-    direction = sphere(rays)
+    direction = sphere(100_000)
     start_m = np.broadcast_to(device_m, direction.shape)
     return _shoot(city, facets, normal, start_m, direction, depth)
 
 
 def edge_sequences(
-    city: CityMap, facets: Facets, normal: np.ndarray, edges: Edges, edge: int, depth: int,
-    rays: int, step_m: float,
+    city: CityMap, facets: Facets, normal: np.ndarray, edges: Edges, edge: int, depth: int
 ) -> FacetSequences:
     """Find the sequences of facets that rays from an edge visit.
+
+    Rays start at most 20 m apart along the edge. The surroundings of an edge are seen from many
+    starts, so fewer rays do than from a device.
 
     Args:
         city: 3D map.
@@ -76,19 +78,17 @@ def edge_sequences(
         edges: of the city.
         edge: row of `edges`.
         depth: maximum number of facets of a sequence.
-        rays: number of rays from each start, over the whole sphere.
-        step_m: maximum distance between starts along the edge [m].
 
     Returns:
         The sequences of up to `depth` facets.
     """
     length_m = np.linalg.norm(edges.end_m[edge] - edges.start_m[edge])
-    count = max(int(np.ceil(length_m / step_m)), 1)
+    count = max(int(np.ceil(length_m / 20.0)), 1)
     outward = edges.normal_0[edge] + edges.normal_n[edge]
     along_m = ((np.arange(count) + 0.5) / count * length_m)[:, None]
     start_m = edges.start_m[edge] + along_m * edges.direction[edge] \
         + SKIN_M * outward / np.linalg.norm(outward)
-    direction = sphere(rays)
+    direction = sphere(300)
     open_to = np.maximum(direction @ edges.normal_0[edge], direction @ edges.normal_n[edge]) > 0
     direction = direction[open_to]
     return _shoot(city, facets, normal, np.repeat(start_m, len(direction), axis=0),
@@ -133,7 +133,8 @@ def _first_facets(
     city: CityMap, facets: Facets, start_m: np.ndarray, direction: np.ndarray
 ) -> np.ndarray:
     """Return (2, n) distance [m] and facet that rays hit first; -1: none, or a face's back."""
-    distance_m, face, cosine = city.first_hits(start_m, start_m + FAR_M * direction)
+    end_m = start_m + 1e5 * direction  # beyond any city
+    distance_m, face, cosine = city.first_hits(start_m, end_m)
     facet = np.where(face >= 0, facets.of_face[face], -1)
     facet[(face >= 0) & (cosine >= 0)] = -1
     # The ground is infinite here; the city's mesh of it may end, or there may be none

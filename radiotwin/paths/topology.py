@@ -17,7 +17,6 @@ from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 
 WELD_M = 0.002  # [m], well above the single precision of PLY files: 0.06 mm at 1 km
-GROUND_M = 0.05  # [m], faces within this height of z = 0 are the ground
 QUERY_CHUNK = 2_000  # sides per query of the tree: bounds the memory
 
 
@@ -53,7 +52,7 @@ def build_topology(city: CityMap) -> Topology:
         city: 3D map.
 
     Returns:
-        The topology of all faces above the ground.
+        The topology of all faces but those of the ground, within 5 cm of z = 0.
 
     Raises:
         BadInput: a corner is not finite.
@@ -63,7 +62,7 @@ def build_topology(city: CityMap) -> Topology:
     vertices_m, index = _weld(city.vertices)
     corners = index[city.faces]
     normal, height_m = _normals_and_heights(vertices_m[corners])
-    on_ground = (np.abs(city.vertices[city.faces][:, :, 2]) < GROUND_M).all(axis=1)
+    on_ground = (np.abs(city.vertices[city.faces][:, :, 2]) < 0.05).all(axis=1)
     source = np.flatnonzero((height_m > WELD_M) & ~on_ground)
     triangles, normal = corners[source], normal[source]
     sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
