@@ -112,10 +112,7 @@ def build_scene_from_map(
     map_options.check()
     options.check()
     if not check_only:
-        check_target(out_folder)
-        if path.resolve().is_relative_to(out_folder.resolve()):
-            raise BadInput(f"{source} lies in {out_folder}, which the new scene would replace; "
-                           "choose another output folder")
+        check_target(out_folder, source=path)
     if not path.is_file():
         raise BadInput(f"{path} is not a file; give a map ({', '.join(READERS)})")
     suffix = map_suffix(path)

@@ -1,4 +1,4 @@
-"""Read the city of a scene folder: `city.xml` and its meshes, which may come from a stranger.
+"""Read the city of a scene folder: `city.xml` and its meshes, whose source may be unknown.
 
 All that uses a scene's geometry goes through here. The ray tracer loads a file that
 `radiotwin.scene.writer` writes from what was read here, never the scene's own.

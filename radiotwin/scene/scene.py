@@ -50,7 +50,7 @@ class Scene:
         for name in ("scene.toml", "city.xml"):
             require_within(folder, folder / name, str(folder))
         scene = cls(folder, read_config(folder / "scene.toml"))
-        scene.check_devices()
+        scene._check_devices()
         _ = scene.device_antennas, scene.uav_antenna  # report a broken file before any work
         return scene
 
@@ -110,7 +110,7 @@ class Scene:
         source = str(self.folder / "scene.toml")
         return read_pattern(require_within(self.folder, self.folder / name, source))
 
-    def check_devices(self) -> None:
+    def _check_devices(self) -> None:
         """Raise BadInput if a device is inside a building, or a UAV starts or ends in one."""
         path = self.folder / "scene.toml"
         for device, bad in zip(self.config.devices, self.city.inside(self.device_m)):

@@ -264,7 +264,7 @@ def add_house_in_two(town, roof_material):
     town.add("walls", (corners, faces[0:8])).add("cover", (corners, faces[10:12]), material=roof_material)
 
 
-def test_roof_of_another_material_is_told(town):
+def test_roof_of_another_material_is_reported(town):
     town.materials.append(
         '<bsdf type="itu-radio-material" id="tin"><string name="type" value="metal"/></bsdf>'
     )

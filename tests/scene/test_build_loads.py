@@ -1,4 +1,4 @@
-"""What `build_scene` writes is loaded by Sionna RT itself."""
+"""Sionna RT itself loads the output of `build_scene`."""
 
 import pytest
 

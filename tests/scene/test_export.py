@@ -1,4 +1,4 @@
-"""What other programs get: read back, it is the same city with the same gains."""
+"""Exports for other programs: read back, they are the same city with the same gains."""
 
 import json
 import shutil

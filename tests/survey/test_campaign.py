@@ -1,4 +1,4 @@
-"""Surveys: what is measured is the truth plus the declared noise, and no more is told than may be known."""
+"""Surveys: measurements are the truth plus the declared noise, without positions of unknown devices."""
 
 import dataclasses
 
@@ -53,7 +53,7 @@ def test_below_sensitivity_is_blank(small_scene, truth):
     assert len(measured.table) == len(survey(small_scene, truth).table), "no link is dropped"
 
 
-def test_positions_of_unknown_devices_are_not_told(small_scene, truth):
+def test_positions_of_unknown_devices_are_withheld(small_scene, truth):
     measured = survey(small_scene, truth)
     assert np.isnan(measured.device_m[~measured.is_anchor, :2]).all()
     np.testing.assert_array_equal(measured.device_m[measured.is_anchor], small_scene.device_m[measured.is_anchor])

@@ -1,4 +1,4 @@
-"""What a traced map may not look like."""
+"""Checks that every traced map must pass."""
 
 import numpy as np
 import pytest
