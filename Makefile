@@ -16,15 +16,17 @@ PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 	if $$python -c '$(NEW_ENOUGH)' 2> /dev/null; then echo $$python; break; fi; done)
 
 SUDO := $(if $(filter 0,$(shell id -u)),,sudo -n)
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist loadfile
 CAN_APT := command -v apt-get > /dev/null && $(SUDO) true 2> /dev/null
 APT_INSTALL := $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=120 install -y -q
 
-.PHONY: help demo test check docs bench llvm clean
+.PHONY: help demo test test-all check docs bench llvm clean
 
 help:
 	@echo "make demo    set up, then the whole chain on a small city"
-	@echo "make test    set up, then every test"
-	@echo "make check   ruff and mypy"
+	@echo "make test     set up, then every test but the slow ones (under ten minutes on two cores)"
+	@echo "make test-all every test: statistics over many seeds, real data where it is, long chains"
+	@echo "make check    ruff, mypy and the fast tests (under two minutes)"
 	@echo "make docs    the site, in site/; runs the examples"
 	@echo "make bench   what takes how long (the studies of docs/results.md are started one by one)"
 	@echo "make llvm    set up only: the package and a libLLVM for tracing"
@@ -36,11 +38,16 @@ demo: llvm
 test: $(INSTALLED)
 	@$(MAKE) --no-print-directory llvm \
 	|| echo "make test: without a libLLVM the tests that trace rays are skipped; all the others run." >&2
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist loadfile $(TESTS)
+	$(PYTEST) -m "not slow" $(TESTS)
+
+test-all: $(INSTALLED)
+	$(PYTEST) $(TESTS)
 
 check: $(INSTALLED)
 	$(BIN)/ruff check
 	$(BIN)/mypy
+	$(PYTEST) --ignore=tests/cli --ignore=tests/marl --ignore=tests/trace --ignore=tests/closeloop \
+		-m "not slow and not llvm" $(FAST_TESTS)
 
 # In a folder of its own, where the examples leave what they make.
 docs: $(INSTALLED)
@@ -49,7 +56,7 @@ docs: $(INSTALLED)
 	cd build/docs && OMP_NUM_THREADS=1 $(abspath $(BIN))/mkdocs build --strict -f $(CURDIR)/mkdocs.yml -d $(CURDIR)/site
 
 bench: llvm
-	$(BIN)/python benchmarks/run.py
+	$(BIN)/python -m studies speed
 
 # The second run does nothing, until what is to be installed has changed.
 $(INSTALLED): pyproject.toml constraints.txt
@@ -78,4 +85,4 @@ llvm: $(INSTALLED)
 
 clean:
 	rm -rf $(VENV) build dist site *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
-	find radiotwin marl tests benchmarks -name __pycache__ -prune -exec rm -rf {} +
+	find radiotwin marl tests studies -name __pycache__ -prune -exec rm -rf {} +

@@ -18,7 +18,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pandas as pd
@@ -28,7 +28,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 CASES = ("antenna_pattern:1", "device_position_error:1", "excess_attenuation:1", "foliage:1",
          "missing_obstacle:1", "receiver_drift:1", "receiver_saturation:1", "removed_obstacle:1",
          "receiver_clock_offset:1", "pairs:1", "nothing:1", "nothing:3")
-MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging", "raytrace")
+MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging",
+          "raytrace")
 REAL_SET = Path("../shared/data/powder_frs")
 EVERY = 12  # one transmitter position in so many of the real set
 TOLERANCE = {"rmse_db": 0.02, "bias_db": 0.02, "x_m": 0.05, "y_m": 0.05, "radius_m": 0.5}
@@ -50,7 +51,8 @@ def main() -> None:
     compare_parser.add_argument("after", type=Path)
     arguments = parser.parse_args()
     if arguments.command == "compare":
-        before, after = (json.loads(path.read_text()) for path in (arguments.before, arguments.after))
+        before, after = (json.loads(path.read_text())
+                         for path in (arguments.before, arguments.after))
         sys.exit(print_differences(before, after))
     run(arguments.tree.resolve(), arguments.inputs.resolve(), arguments.out, arguments.only)
 
@@ -66,7 +68,8 @@ def run(tree: Path, inputs: Path, out: Path, only: list[str] | None) -> None:
             before = resource.getrusage(resource.RUSAGE_CHILDREN)
             results[name] = step(tree, Path(scratch))
             after = resource.getrusage(resource.RUSAGE_CHILDREN)
-            results[name]["cpu_s"] = round(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime, 1)
+            started, ended = (each.ru_utime + each.ru_stime for each in (before, after))
+            results[name]["cpu_s"] = round(ended - started, 1)
             results[name]["peak_gib_so_far"] = round(after.ru_maxrss / 2**20, 2)
         out.write_text(json.dumps(results, indent=1), encoding="utf-8")
 
@@ -138,49 +141,58 @@ def call(tree: Path, scratch: Path, *words: object, module: str = "radiotwin.cli
     done = subprocess.run([sys.executable, "-c", program, *map(str, words)], cwd=scratch,
                           env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise SystemExit(f"{' '.join(map(str, words))}: status {done.returncode}\n{done.stdout}{done.stderr}")
+        raise SystemExit(f"{' '.join(map(str, words))}: status {done.returncode}\n"
+                         f"{done.stdout}{done.stderr}")
 
 
 def close_loop(tree: Path, scratch: Path, inputs: Path, *options: object) -> dict:
     """Verdict, names and errors of one loop."""
-    call(tree, scratch, "close-loop", inputs / "measurements.csv", *(options or ("--scene", inputs / "scene")),
-         "-o", "loop")
+    options = options or ("--scene", inputs / "scene")
+    call(tree, scratch, "close-loop", inputs / "measurements.csv", *options, "-o", "loop")
     report = json.loads((scratch / "loop" / "closeloop.json").read_text())
-    keep = {"rmse_db", "bias_db"}
+    # Version 1 had the bias as measured minus predicted.
+    sign = -1 if report["schema"].endswith("/1") else 1
+    keep = {"rmse_db": 1, "bias_db": sign}
     return {"base": report["base"], "verdict": report["verdict"],
             "names": [effect["name"] for effect in report["effects"]],
-            "parameters": {f"{effect['rank']} {name}": parameter["value"] for effect in report["effects"]
+            "parameters": {f"{effect['rank']} {name}": parameter["value"]
+                           for effect in report["effects"]
                            for name, parameter in effect["parameters"].items()},
-            "error": {when: {name: value for name, value in report["error"][when].items() if name in keep}
+            "error": {when: {name: keep[name] * value
+                             for name, value in report["error"][when].items() if name in keep}
                       for when in ("before", "after")},
-            "baselines": {name: {"rmse_db": each["rmse_db"]} for name, each in report["baselines"].items()}}
+            "baselines": {name: {"rmse_db": each["rmse_db"]}
+                          for name, each in report["baselines"].items()}}
 
 
 def fit(tree: Path, scratch: Path, inputs: Path, model: str) -> dict:
     """Positions of the devices by one channel model, and the mean of its radio map."""
     import xarray as xr
 
-    call(tree, scratch, "fit", inputs / "measurements.csv", "--scene", inputs / "scene", "--model", model, "-o", "twin")
+    call(tree, scratch, "fit", inputs / "measurements.csv", "--scene", inputs / "scene",
+         "--model", model, "-o", "twin")
     call(tree, scratch, "map", "twin", "--scene", inputs / "scene", "-o", "map.nc")
     twin = json.loads((scratch / "twin" / "twin.json").read_text())
     with xr.open_dataset(scratch / "map.nc") as radio_map:
         level_db = float(radio_map["gain_db"].mean())
     return {"devices": {each["device"]: {"x_m": each["x_m"], "y_m": each["y_m"],
-                                         "radius_m": each["credible_radius_m"]} for each in twin["devices"]},
+                                         "radius_m": each["credible_radius_m"]}
+                        for each in twin["devices"]},
             "map": {"bias_db": level_db}}
 
 
 def compare(tree: Path, scratch: Path, inputs: Path) -> dict:
     """Errors of every model on the held-out flight and the whole map."""
-    call(tree, scratch, "compare", inputs / "measurements.csv", "--scene", inputs / "scene", "--truth", "traced",
-         "-o", "comparison")
+    call(tree, scratch, "compare", inputs / "measurements.csv", "--scene", inputs / "scene",
+         "--truth", "traced", "-o", "comparison")
     return {"report": json.loads((scratch / "comparison" / "compare.json").read_text())}
 
 
 def locate(tree: Path, scratch: Path, inputs: Path) -> dict:
     """Names on the known days of the real set, and places of the last day's transmitters."""
     found = close_loop(tree, scratch, inputs / "known", "--base", "log-distance")
-    call(tree, scratch, "locate", inputs / "unknown" / "measurements.csv", "--twin", "loop/twin", "-o", "located.csv")
+    call(tree, scratch, "locate", inputs / "unknown" / "measurements.csv", "--twin", "loop/twin",
+         "-o", "located.csv")
     places = pd.read_csv(scratch / "located.csv").set_index("device")
     return found | {"places": places[["x_m", "y_m", "radius_m"]].to_dict("index")}
 
@@ -190,7 +202,8 @@ def marl(tree: Path, scratch: Path, scene: Path) -> dict:
     call(tree, scratch, "--scene", scene, "--real-episodes", 2, "--episodes", 40, "--flights", 16,
          "--planner-iterations", 2000, "--out", "run", module="marl.fedqmix")
     table = pd.read_csv(scratch / "run" / "comparison.csv")
-    return {"rows": table.drop(columns=[name for name in table if name.endswith("_s")]).to_dict("records")}
+    seconds = [name for name in table if name.endswith("_s")]
+    return {"rows": table.drop(columns=seconds).to_dict("records")}
 
 
 def print_differences(before: dict, after: dict) -> int:
@@ -211,7 +224,8 @@ def print_differences(before: dict, after: dict) -> int:
     return bad
 
 
-def differing(one: object, other: object, path: tuple[str, ...]):
+def differing(one: object, other: object,
+              path: tuple[str, ...]) -> Iterator[tuple[tuple[str, ...], object, object]]:
     """Yield (path, before, after) of values that differ by more than their tolerance."""
     if path and path[-1] in ("cpu_s", "peak_gib_so_far", "provenance", "seconds", "version"):
         return
@@ -222,7 +236,8 @@ def differing(one: object, other: object, path: tuple[str, ...]):
         for index, pair in enumerate(zip(one, other, strict=True)):
             yield from differing(*pair, (*path, str(index)))
     elif isinstance(one, float) and isinstance(other, (int, float)):
-        allowed = TOLERANCE.get(path[-1], 0.02 if path[-1].endswith("_db") else 1e-3 * abs(one) + 1e-9)
+        usual = 0.02 if path[-1].endswith("_db") else 1e-3 * abs(one) + 1e-9
+        allowed = TOLERANCE.get(path[-1], usual)
         if abs(one - other) > allowed:
             yield path, one, other
     elif one != other:

@@ -4,19 +4,27 @@ from collections.abc import Sequence
 
 import torch
 
-MEAN_RATE, SQUARE_RATE, EPSILON = 0.1, 0.001, 1e-8  # 1 - beta of the paper
+MEAN_RATE, SQUARE_RATE, EPSILON = 0.1, 0.001, 1e-8  # 1 - beta_1, 1 - beta_2, epsilon of the paper
 
 
 class Adam:
     """Kingma and Ba 2015, algorithm 1, with decoupled weight decay (Loshchilov and Hutter 2019).
 
     Attributes:
-        tensors: what is changed.
-        mean, square: moments of their gradients.
-        count: steps so far.
+        tensors: parameters, which `step` changes in place.
+        mean: first moments of their gradients, of the same shapes.
+        square: second moments.
+        count: steps taken.
     """
 
-    def __init__(self, tensors: Sequence[torch.Tensor], decay: Sequence[float] | None = None) -> None:
+    def __init__(self, tensors: Sequence[torch.Tensor],
+                 decay: Sequence[float] | None = None) -> None:
+        """Start at zero moments.
+
+        Args:
+            tensors: parameters to optimise.
+            decay: weight decay of each; None: none.
+        """
         self.tensors = list(tensors)
         self._decay = [0.0] * len(self.tensors) if decay is None else list(decay)
         self.mean = [torch.zeros_like(tensor) for tensor in self.tensors]
@@ -25,23 +33,30 @@ class Adam:
 
     @torch.no_grad()
     def step(self, gradients: Sequence[torch.Tensor], rate: float) -> None:
-        """Go down by some gradients."""
+        """Take one step downhill.
+
+        Args:
+            gradients: of the loss, one for each of `tensors`.
+            rate: learning rate.
+        """
         self.count += 1
         unbias_mean = 1.0 - (1.0 - MEAN_RATE) ** self.count
         unbias_square = 1.0 - (1.0 - SQUARE_RATE) ** self.count
-        for tensor, gradient, mean, square, decay in zip(self.tensors, gradients, self.mean, self.square, self._decay,
-                                                         strict=True):
+        for tensor, gradient, mean, square, decay in zip(
+                self.tensors, gradients, self.mean, self.square, self._decay, strict=True):
             mean.lerp_(gradient, MEAN_RATE)
             square.lerp_(gradient.square(), SQUARE_RATE)
             tensor.mul_(1.0 - rate * decay)
-            tensor.addcdiv_(mean, (square / unbias_square).sqrt_().add_(EPSILON), value=-rate / unbias_mean)
+            tensor.addcdiv_(mean, (square / unbias_square).sqrt_().add_(EPSILON),
+                            value=-rate / unbias_mean)
 
     def state_dict(self) -> dict:
-        """Everything that going down goes on from."""
+        """Return the count and the moments, from which training can be resumed."""
         return {"count": self.count, "mean": self.mean, "square": self.square}
 
     @torch.no_grad()
     def load_state_dict(self, state: dict) -> None:
+        """Resume from what `state_dict` returned for tensors of the same shapes."""
         self.count = state["count"]
         for name in ("mean", "square"):
             for mine, given in zip(getattr(self, name), state[name], strict=True):

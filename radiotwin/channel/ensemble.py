@@ -1,4 +1,4 @@
-"""A small ensemble of networks, trained together, each stopped early on links that it does not train on."""
+"""A small ensemble of networks, trained together, each stopped early on links held out from it."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from radiotwin.channel.adam import Adam
 from radiotwin.inference.gaussian import gaussian_nll_torch
 from radiotwin.progress import progress
 
-WEIGHTS = ("w1", "b1", "w2", "b2", "w3", "b3")
-INPUTS = 4
-MEMBERS = 8
-HIDDEN = 24
-LEARNING_RATE = 1e-2
-WEIGHT_DECAY = 1e-2
-BATCH = 256
-STEPS = 1200
-CHECK_EVERY = 20
+WEIGHTS = ("w1", "b1", "w2", "b2", "w3", "b3")  # names of the tensors, as stored
+INPUTS = 4  # see TrainingData.inputs
+MEMBERS = 8  # networks, each with an eighth of the links held out
+HIDDEN = 24  # units of each hidden layer
+LEARNING_RATE = 1e-2  # at the first step; a cosine lowers it to a fiftieth
+WEIGHT_DECAY = 1e-2  # of weights, not of biases
+BATCH = 256  # links a step
+STEPS = 1200  # at most
+CHECK_EVERY = 20  # steps between two evaluations of the held-out loss
 PATIENCE = 300  # steps without a better member, then training ends
 
 
@@ -30,9 +30,12 @@ PATIENCE = 300  # steps without a better member, then training ends
 class TrainingData:
     """n links in the units of the network.
 
-    inputs: (n, INPUTS); target: (n,) residual over the line in class sigmas, or the limit's where
-    `censored`; los: (n,);
-    fold: (n,) in 0..MEMBERS-1, the member that does not train on the link.
+    Attributes:
+        inputs: (n, INPUTS), each of about unit range.
+        target: (n,) residual in standard deviations of its class; where `censored`, the limit's.
+        censored: (n,) bool, links that were not detected.
+        los: (n,) bool, line of sight.
+        fold: (n,) in 0..MEMBERS-1, the member that does not train on the link.
     """
 
     inputs: np.ndarray
@@ -44,7 +47,10 @@ class TrainingData:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """One torch thread: the layers are too small to share, and sums in one order repeat bit for bit."""
+    """Restrict torch to one thread, so that sums have one order and repeat bit for bit.
+
+    The layers are too small to gain by more threads.
+    """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -54,14 +60,22 @@ def one_thread() -> Iterator[None]:
 
 
 def forward(weights: dict[str, torch.Tensor], inputs: torch.Tensor) -> torch.Tensor:
-    """(members, n) output of every member for inputs (n, INPUTS): two tanh layers and a linear one."""
+    """Return the output of every member: two tanh layers and a linear one.
+
+    Args:
+        weights: tensors by the names in WEIGHTS, each with the members as first dimension.
+        inputs: (n, INPUTS).
+
+    Returns:
+        (MEMBERS, n) residual in standard deviations of its class.
+    """
     hidden = torch.tanh(torch.baddbmm(weights["b1"], inputs.expand(MEMBERS, -1, -1), weights["w1"]))
     hidden = torch.tanh(torch.baddbmm(weights["b2"], hidden, weights["w2"]))
     return torch.baddbmm(weights["b3"], hidden, weights["w3"])[..., 0]
 
 
 def _start(generator: torch.Generator) -> dict[str, torch.Tensor]:
-    """Random hidden layers and an output of zero: every member starts as the line, and can only be better."""
+    """Return random hidden layers and an output of zero: every member starts as the line."""
     shapes = {"w1": (INPUTS, HIDDEN), "w2": (HIDDEN, HIDDEN)}
     weights = {
         name: torch.randn((MEMBERS, *shape), generator=generator) / shape[0] ** 0.5
@@ -75,16 +89,25 @@ def _start(generator: torch.Generator) -> dict[str, torch.Tensor]:
 
 
 def train(data: TrainingData, seed: int) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Weights by name, (members, ...) each, and the (n,) output for every link of the member that never saw it.
+    """Train all members and keep the weights of each that were best on its held-out links.
 
-    The loss is the censored Gaussian likelihood with one sigma per class and member, learned with the weights.
-    Equal data and seed give equal bits.
+    The loss is the censored Gaussian likelihood, with one standard deviation for each class and
+    member that is learned with the weights.
+
+    Args:
+        data: n links.
+        seed: of the first weights and the batches; equal data and seed give equal bits.
+
+    Returns:
+        weights by name, (MEMBERS, ...) each, and for every link the output (n,) of the member that
+        it was held out from.
     """
     with one_thread():
         return _train(data, torch.Generator().manual_seed(seed))
 
 
-def _train(data: TrainingData, generator: torch.Generator) -> tuple[dict[str, np.ndarray], np.ndarray]:
+def _train(data: TrainingData,
+           generator: torch.Generator) -> tuple[dict[str, np.ndarray], np.ndarray]:
     inputs = torch.as_tensor(data.inputs, dtype=torch.float32)
     target = torch.as_tensor(data.target, dtype=torch.float32)
     censored, fold = torch.as_tensor(data.censored), torch.as_tensor(data.fold)
@@ -92,9 +115,10 @@ def _train(data: TrainingData, generator: torch.Generator) -> tuple[dict[str, np
     held_out = fold[None, :] == torch.arange(MEMBERS)[:, None]
     share = held_out.sum(1).clamp(min=1)
 
-    weights, log_sigma = _start(generator), torch.zeros(MEMBERS, 2)
-    learnt = [tensor.requires_grad_() for tensor in (*weights.values(), log_sigma)]
-    optimiser = Adam(learnt, [WEIGHT_DECAY if name.startswith("w") else 0.0 for name in (*weights, "log_sigma")])
+    weights, log_sd = _start(generator), torch.zeros(MEMBERS, 2)
+    learnt = [tensor.requires_grad_() for tensor in (*weights.values(), log_sd)]
+    optimiser = Adam(learnt, [WEIGHT_DECAY if name.startswith("w") else 0.0
+                              for name in (*weights, "log_sd")])
     best = {name: tensor.detach().clone() for name, tensor in weights.items()}
     best_loss = torch.full((MEMBERS,), torch.inf)
     last_better = 0
@@ -102,7 +126,7 @@ def _train(data: TrainingData, generator: torch.Generator) -> tuple[dict[str, np
 
     def loss_of(rows: torch.Tensor | slice) -> torch.Tensor:
         output = forward(weights, inputs[rows])
-        return gaussian_nll_torch(target[rows], output, log_sigma[:, segment[rows]], censored[rows])
+        return gaussian_nll_torch(target[rows], output, log_sd[:, segment[rows]], censored[rows])
 
     with progress("training the channel", total=STEPS) as advance:
         for step in range(STEPS + 1):

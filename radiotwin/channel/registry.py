@@ -15,7 +15,7 @@ from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.channel.segmented_nn import SegmentedNN
 from radiotwin.errors import BadInput
 
-ENTRY_POINTS = "radiotwin.channels"
+ENTRY_POINTS = "radiotwin.channels"  # group of the packages' entry points
 BUILT_IN: tuple[type[ChannelModel], ...] = (
     LogDistance, SegmentedLogDistance, SegmentedNN, RegressionKriging, ImagePaths)
 ALIASES = {"raytrace": ImagePaths.name}  # as the command line calls it
@@ -25,6 +25,12 @@ _registered: dict[str, type[ChannelModel]] = {}
 
 def register(model: type[ChannelModel]) -> type[ChannelModel]:
     """Add a channel model to this process; usable as a decorator.
+
+    Args:
+        model: subclass of `ChannelModel`, with a name of its own.
+
+    Returns:
+        the class itself
 
     Raises:
         BadInput: not a channel model, or its name is taken.
@@ -55,6 +61,9 @@ def channel_models() -> dict[str, type[ChannelModel]]:
 
 def channel_named(name: str) -> type[ChannelModel]:
     """Return a channel model's class.
+
+    Args:
+        name: of the model, or an alias of it.
 
     Raises:
         BadInput: no such model is installed.

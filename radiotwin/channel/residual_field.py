@@ -1,4 +1,4 @@
-"""Interpolation of what a law leaves over: a Gaussian process over positions, one field for each series of points."""
+"""Interpolation of a law's residual: a Gaussian process over positions, one field a series."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-MAX_POINTS, MIN_POINTS = 2500, 30  # of a series, where there are more
-MAX_PAIRS = 36e6  # of all series: their matrices take 8 bytes a pair
-MAX_POINTS_TO_FIT, MAX_SERIES_TO_FIT = 300, 400  # MAX_PAIRS again
-SAME_POINT_M = 0.1
-COARSER = 1.5  # times, from one width of cells to the next
-BATCH = 2000
+MAX_PAIRS = 36e6  # points squared, over all series: their matrices take 8 bytes a pair
+MAX_POINTS, MIN_POINTS = 2500, 30  # range of the number of points that is kept of a longer series
+MAX_POINTS_TO_FIT, MAX_SERIES_TO_FIT = 300, 400  # for the correlation; at most MAX_PAIRS again
+SAME_POINT_M = 0.1  # points within a cell this wide are one [m]
+COARSER = 1.5  # ratio of one width of cells to the next
+BATCH = 2000  # points that are predicted at a time: bounds memory
 
 
 @dataclass(frozen=True)
 class _Field:
-    """What one series left over at p points.
+    """Residuals of one series at p points.
 
     Attributes:
-        position_m: (p, 3).
-        residual: (p,) in sigmas of the law, the mean of `count` measurements.
-        kind: (p,) what the measurements of a point have in common.
-        count: (p,).
+        position_m: (p, 3) [m].
+        residual: (p,) in standard deviations of the law, the mean of `count` measurements.
+        kind: (p,) index of the kind that the measurements of a point belong to.
+        count: (p,) measurements.
     """
 
     position_m: np.ndarray
@@ -36,13 +36,19 @@ class _Field:
 
 
 class ResidualField:
-    """A Gaussian process of unit variance for each series of points, such as the receivers' places for each device.
+    """A Gaussian process of unit variance for each series, such as each device's receiver positions.
 
-    Correlation a * exp(-r / length), the exponential model of shadowing (Gudmundson 1991, Electronics Letters 27), b
-    between measurements of one kind, such as those by one phone, wherever they are, and a nugget 1 - a - b for noise
-    and what changes between neighbouring points. `share` a, `kind_share` b and `length_m` are common to all series and
-    have the highest marginal likelihood on at most MAX_POINTS_TO_FIT points of each of at most MAX_SERIES_TO_FIT. Where
-    points are too many, neighbours become their mean.
+    Correlation a * exp(-r / length), the exponential model of shadowing (Gudmundson 1991,
+    Electronics Letters 27), b between measurements of one kind, such as those by one phone, wherever
+    they are, and a nugget 1 - a - b for noise and what changes between neighbouring points. The
+    parameters have the highest marginal likelihood on at most MAX_POINTS_TO_FIT points of each of at
+    most MAX_SERIES_TO_FIT series. Where points are too many, neighbours become their mean.
+
+    Attributes:
+        share: a, the same for all series.
+        kind_share: b.
+        length_m: correlation length [m].
+        fields: the points of each series, by its index.
     """
 
     def __init__(self) -> None:
@@ -51,67 +57,79 @@ class ResidualField:
 
     def fit(self, series: np.ndarray, position_m: np.ndarray, residual: np.ndarray, seed: int,
             kind: np.ndarray | None = None) -> Self:
-        """Learn from points.
+        """Fit the correlation and store the points.
 
         Args:
             series: (n,) index of the series that a point belongs to.
             position_m: (n, 3) [m].
             residual: (n,) of unit variance.
-            seed: picks the points that share and length are fitted to.
+            seed: of the selection of points that the correlation is fitted to.
             kind: (n,) index of what has an error of its own in each series; None: nothing has.
+
+        Returns:
+            the field itself
         """
         rng = np.random.default_rng(seed)
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
         numbers = np.unique(series)
-        most = int(np.clip(np.sqrt(MAX_PAIRS / max(len(numbers), 1)), MIN_POINTS, MAX_POINTS))
+        limit = int(np.clip(np.sqrt(MAX_PAIRS / max(len(numbers), 1)), MIN_POINTS, MAX_POINTS))
         fitted = numbers
         if len(numbers) > MAX_SERIES_TO_FIT:
             fitted = np.sort(rng.choice(numbers, MAX_SERIES_TO_FIT, replace=False))
         order = np.argsort(series, kind="stable")
-        self.fields, some = {}, []
-        for number, mask in zip(numbers, np.split(order, np.searchsorted(series[order], numbers[1:])), strict=True):
-            points = position_m[mask], residual[mask], kind[mask]
-            every = _merged(*points, SAME_POINT_M)
+        rows_of_series = np.split(order, np.searchsorted(series[order], numbers[1:]))
+        self.fields, samples = {}, []
+        for number, rows in zip(numbers, rows_of_series, strict=True):
+            points = position_m[rows], residual[rows], kind[rows]
+            field = _merged(*points, SAME_POINT_M)
             if number in fitted:
-                some.append(_some(every, rng))
-            self.fields[int(number)] = every if len(every.residual) <= most else _coarsened(*points, most)
-        self._fit_correlation(some, len(np.unique(kind)) > 1)
+                samples.append(_sample(field, rng))
+            self.fields[int(number)] = (
+                field if len(field.residual) <= limit else _coarsened(*points, limit))
+        self._fit_correlation(samples, len(np.unique(kind)) > 1)
         self._factor()
         return self
 
     def predict(self, series: np.ndarray, position_m: np.ndarray,
                 kind: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (n,) and standard deviation (n,) of the residual; 0 and 1 far from all points and in unknown series.
+        """Return the conditional distribution of the residual; memory does not grow with n.
 
-        In batches of BATCH points, so that maps of any size fit.
+        Args:
+            series: (n,) index of each point's series.
+            position_m: (n, 3) [m].
+            kind: (n,) as for `fit`.
+
+        Returns:
+            (n,) mean and (n,) standard deviation: 0 and 1 far from points and in unknown series.
         """
-        mean, sigma = np.zeros(len(series)), np.ones(len(series))
+        mean, sd = np.zeros(len(series)), np.ones(len(series))
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
         for number, field in self.fields.items():
             factor, weights = self._solved[number]
             mine = np.flatnonzero(series == number)
             for start in range(0, len(mine), BATCH):
                 rows = mine[start : start + BATCH]
-                cross = self._correlation(cdist(field.position_m, position_m[rows]), field.kind, kind[rows])
+                cross = self._correlation(cdist(field.position_m, position_m[rows]), field.kind,
+                                          kind[rows])
                 mean[rows] = weights @ cross
-                explained = np.square(solve_triangular(factor, cross, lower=True, overwrite_b=True)).sum(axis=0)
-                sigma[rows] = np.sqrt(np.maximum(1.0 - explained, 0.0))
-        return mean, sigma
+                whitened = solve_triangular(factor, cross, lower=True, overwrite_b=True)
+                sd[rows] = np.sqrt(np.maximum(1.0 - np.square(whitened).sum(axis=0), 0.0))
+        return mean, sd
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Arrays by name, and what JSON can hold: all that `from_state` needs."""
+        """Return arrays by name, and settings that JSON can hold, for `from_state`."""
         arrays = {}
         for number, field in self.fields.items():
             arrays[f"position_m/{number}"] = field.position_m
             arrays[f"residual/{number}"] = field.residual
             arrays[f"kind/{number}"] = field.kind
             arrays[f"count/{number}"] = field.count
-        return arrays, {"devices": list(self.fields), "share": self.share, "kind_share": self.kind_share,
-                        "length_m": self.length_m}
+        return arrays, {"devices": list(self.fields), "share": self.share,
+                        "kind_share": self.kind_share, "length_m": self.length_m}
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
-        """What `state` gave."""
+        """Return the field that `state` described."""
         field = cls()
         field.share, field.kind_share = settings["share"], settings["kind_share"]
         field.length_m = settings["length_m"]
@@ -121,55 +139,62 @@ class ResidualField:
         field._factor()
         return field
 
-    def _correlation(self, distance_m: np.ndarray, kind: np.ndarray, other: np.ndarray) -> np.ndarray:
+    def _correlation(self, distance_m: np.ndarray, kind: np.ndarray,
+                     other: np.ndarray) -> np.ndarray:
         correlation = self.share * np.exp(-distance_m / self.length_m)
-        return correlation + self.kind_share * (kind[:, None] == other[None]) if self.kind_share else correlation
+        if self.kind_share:
+            return correlation + self.kind_share * (kind[:, None] == other[None])
+        return correlation
 
     def _covariance(self, field: _Field, distance_m: np.ndarray) -> np.ndarray:
         covariance = self._correlation(distance_m, field.kind, field.kind)
-        covariance[np.diag_indices(len(covariance))] += (1 - self.share - self.kind_share) / field.count + 1e-8
+        nugget = (1 - self.share - self.kind_share) / field.count
+        covariance[np.diag_indices(len(covariance))] += nugget + 1e-8  # keeps it positive definite
         return covariance
 
     def _fit_correlation(self, fields: list[_Field], kinds: bool) -> None:
-        """Shares and length of highest marginal likelihood (Rasmussen and Williams 2006, equation 5.8)."""
-        apart_m = [cdist(field.position_m, field.position_m) for field in fields]
-        greatest_m = max(float(distance.max()) for distance in apart_m)
-        if greatest_m == 0.0:
+        """Maximise the marginal likelihood of the points (Rasmussen and Williams 2006, eq. 5.8)."""
+        distances_m = [cdist(field.position_m, field.position_m) for field in fields]
+        max_m = max(float(distance_m.max()) for distance_m in distances_m)
+        if max_m == 0.0:
             return
 
-        def take(theta: np.ndarray) -> None:
-            of_place, of_kind = np.exp(theta[0]), np.exp(theta[2]) if kinds else 0.0
-            total = 1.0 + of_place + of_kind
-            self.share, self.kind_share = float(of_place / total), float(of_kind / total)
+        def assign(theta: np.ndarray) -> None:
+            """Set the parameters: variances over the nugget's and the length, as logarithms."""
+            of_position, of_kind = np.exp(theta[0]), np.exp(theta[2]) if kinds else 0.0
+            total = 1.0 + of_position + of_kind
+            self.share, self.kind_share = float(of_position / total), float(of_kind / total)
             self.length_m = float(np.exp(theta[1]))
 
         def objective(theta: np.ndarray) -> float:
-            take(theta)
+            assign(theta)
             value = 0.0
-            for field, distance in zip(fields, apart_m, strict=True):
-                factor = cholesky(self._covariance(field, distance), lower=True, overwrite_a=True)
+            for field, distance_m in zip(fields, distances_m, strict=True):
+                factor = cholesky(self._covariance(field, distance_m), lower=True, overwrite_a=True)
                 whitened = solve_triangular(factor, field.residual, lower=True)
                 value += 0.5 * whitened @ whitened + np.log(np.diag(factor)).sum()
             return value
 
         number = 2 + kinds
-        bounds = [(-4.0, 6.0), (np.log(1.0), np.log(max(2.0, 2.0 * greatest_m))), (-6.0, 4.0)][:number]
-        starts = [np.array([0.0, np.log(part * greatest_m), -1.0])[:number] for part in (0.02, 0.2)]
+        bounds = [(-4.0, 6.0), (np.log(1.0), np.log(max(2.0, 2.0 * max_m))), (-6.0, 4.0)][:number]
+        starts = [np.array([0.0, np.log(part * max_m), -1.0])[:number] for part in (0.02, 0.2)]
         start = min((np.clip(start, *np.transpose(bounds)) for start in starts), key=objective)
         simplex = np.vstack([start, start + np.diag([1.0, 0.7, 1.0])[:number, :number]])
         options = {"initial_simplex": simplex, "maxfev": 30 * number, "xatol": 0.05, "fatol": 0.1}
-        take(minimize(objective, start, method="Nelder-Mead", bounds=bounds, options=options).x)
+        assign(minimize(objective, start, method="Nelder-Mead", bounds=bounds, options=options).x)
 
     def _factor(self) -> None:
-        """What predictions need of every series: Cholesky factor (p, p) and weights (p,)."""
+        """Compute the Cholesky factor (p, p) and the weights (p,) of every series."""
         self._solved = {}
         for number, field in self.fields.items():
-            factor = cholesky(self._covariance(field, cdist(field.position_m, field.position_m)), lower=True)
+            distance_m = cdist(field.position_m, field.position_m)
+            factor = cholesky(self._covariance(field, distance_m), lower=True)
             self._solved[number] = factor, cho_solve((factor, True), field.residual)
 
 
-def _merged(position_m: np.ndarray, residual: np.ndarray, kind: np.ndarray, width_m: float) -> _Field:
-    """Visits of one cell become their mean."""
+def _merged(position_m: np.ndarray, residual: np.ndarray, kind: np.ndarray,
+            width_m: float) -> _Field:
+    """Return the mean of the measurements of one kind in each cell of a width [m]."""
     cells = np.column_stack([np.round(position_m / width_m), kind])
     _, cell, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
     cell = cell.ravel()
@@ -177,17 +202,18 @@ def _merged(position_m: np.ndarray, residual: np.ndarray, kind: np.ndarray, widt
     return _Field(np.column_stack(means[:3]), means[3], means[4].round().astype(int), count)
 
 
-def _coarsened(position_m: np.ndarray, residual: np.ndarray, kind: np.ndarray, most: int) -> _Field:
-    """The same in cells just wide enough for so many points."""
+def _coarsened(position_m: np.ndarray, residual: np.ndarray, kind: np.ndarray,
+               limit: int) -> _Field:
+    """Merge measurements in cells just wide enough that at most `limit` points are left."""
     width_m = SAME_POINT_M
     while True:
         width_m *= COARSER
         field = _merged(position_m, residual, kind, width_m)
-        if len(field.residual) <= most or width_m > np.ptp(position_m, axis=0).max():
+        if len(field.residual) <= limit or width_m > np.ptp(position_m, axis=0).max():
             return field
 
 
-def _some(field: _Field, rng: np.random.Generator) -> _Field:
+def _sample(field: _Field, rng: np.random.Generator) -> _Field:
     if len(field.residual) <= MAX_POINTS_TO_FIT:
         return field
     rows = np.sort(rng.choice(len(field.residual), MAX_POINTS_TO_FIT, replace=False))

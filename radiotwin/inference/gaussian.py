@@ -13,61 +13,106 @@ if TYPE_CHECKING:
 HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
 
 
-def gaussian_nll(
-    level_db: np.ndarray, mean_db: np.ndarray, sigma_db: np.ndarray, limit_db: float | None
-) -> np.ndarray:
-    """Negative log-likelihood of each level, in nats; the arguments broadcast against each other.
+def gaussian_nll(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
+                 limit_db: float | None) -> np.ndarray:
+    """Return the negative log-likelihood of each level [nats].
 
-    level_db [dB]: NaN = not detected, which counts as P(level < limit): -log Phi((limit - mean) / sigma)
-    (Tobin 1958, 'Estimation of relationships for limited dependent variables'), or as 0 where limit_db is None.
+    The arguments broadcast against each other. A level that was not detected counts as
+    P(level < limit): -log Phi((limit - mean) / sd) (Tobin 1958, 'Estimation of relationships for
+    limited dependent variables').
+
+    Args:
+        level_db: measured [dB]; NaN: not detected.
+        mean_db: expected [dB].
+        sd_db: standard deviation [dB].
+        limit_db: limit of detection [dB]; None: what was not detected counts 0.
+
+    Returns:
+        [nats], of the broadcast shape.
     """
     missing = np.isnan(level_db)
-    seen = 0.5 * ((level_db - mean_db) / sigma_db) ** 2 + np.log(sigma_db) + HALF_LOG_2PI
+    seen = 0.5 * ((level_db - mean_db) / sd_db) ** 2 + np.log(sd_db) + HALF_LOG_2PI
     if not missing.any():
         return seen
-    below = 0.0 if limit_db is None else -log_ndtr((limit_db - mean_db) / sigma_db)
+    below = 0.0 if limit_db is None else -log_ndtr((limit_db - mean_db) / sd_db)
     return np.where(missing, below, seen)
 
 
-def mean_if_detected(mean_db: np.ndarray, sigma_db: np.ndarray, limit_db: float) -> np.ndarray:
-    """Mean level [dB] of those links of a kind that are detected, that is, lie above the limit; broadcasts.
+def mean_if_detected(mean_db: np.ndarray, sd_db: np.ndarray, limit_db: float) -> np.ndarray:
+    """Return the mean of a level given that it lies above the limit.
 
-    What a prediction has to be compared with measured levels by: near the limit only the strong ones were measured,
-    and the mean of all lies below the mean of those. mean + sigma * phi(a) / Phi(-a), a = (limit - mean) / sigma
-    (the truncated normal distribution; Johnson, Kotz and Balakrishnan 1994, section 13.10.1).
+    Compare measured levels with this: near the limit only the strong ones were detected, whose mean
+    lies above the mean of all. mean + sd * phi(a) / Phi(-a), a = (limit - mean) / sd, of the
+    truncated normal distribution (Johnson, Kotz and Balakrishnan 1994, section 13.10.1).
+
+    Args:
+        mean_db: expected [dB]; all arguments broadcast.
+        sd_db: standard deviation [dB].
+        limit_db: limit of detection [dB]; -inf: everything is detected.
+
+    Returns:
+        [dB], of the broadcast shape.
     """
-    below = (limit_db - mean_db) / sigma_db
-    return mean_db + sigma_db * np.exp(-0.5 * below**2 - HALF_LOG_2PI - log_ndtr(-below))
+    below = (limit_db - mean_db) / sd_db
+    return mean_db + sd_db * np.exp(-0.5 * below**2 - HALF_LOG_2PI - log_ndtr(-below))
 
 
-def standardised(level_db: np.ndarray, mean_db: np.ndarray, sigma_db: np.ndarray, limit_db: float | None) -> np.ndarray:
-    """(level - mean) / sigma of each link (n,); of one that was not detected (NaN) the mean below the limit,
-    -phi(a) / Phi(a), a = (limit - mean) / sigma, as in `mean_if_detected`. limit_db: None where all were detected."""
-    residual = (level_db - mean_db) / sigma_db
+def standardised(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
+                 limit_db: float | None) -> np.ndarray:
+    """Return the standardised residual (level - mean) / sd of each link.
+
+    A link that was not detected gets its conditional mean below the limit, -phi(a) / Phi(a),
+    a = (limit - mean) / sd, as in `mean_if_detected`.
+
+    Args:
+        level_db: (n,) measured [dB]; NaN: not detected.
+        mean_db: (n,) expected [dB].
+        sd_db: (n,) standard deviation [dB].
+        limit_db: limit of detection [dB]; None only where all were detected.
+
+    Returns:
+        (n,) residual in standard deviations.
+    """
+    residual = (level_db - mean_db) / sd_db
     missing = np.isnan(residual)
     if missing.any():
-        below = (limit_db - mean_db[missing]) / sigma_db[missing]
+        below = (limit_db - mean_db[missing]) / sd_db[missing]
         residual[missing] = -np.exp(-0.5 * below**2 - HALF_LOG_2PI - log_ndtr(below))
     return residual
 
 
-def gaussian_nll_torch(
-    level: torch.Tensor, mean: torch.Tensor, log_sigma: torch.Tensor, censored: torch.Tensor
-) -> torch.Tensor:
-    """The same in torch, differentiable in mean and log_sigma.
+def gaussian_nll_torch(level: torch.Tensor, mean: torch.Tensor, log_sd: torch.Tensor,
+                       censored: torch.Tensor) -> torch.Tensor:
+    """Return `gaussian_nll` in torch, differentiable in mean and log_sd; everything broadcasts.
 
-    Where `censored` is True, `level` holds the limit of detection instead of a level. Everything broadcasts.
+    Args:
+        level: measured; where `censored`, the limit of detection instead.
+        mean: expected, in the unit of `level`.
+        log_sd: natural logarithm of the standard deviation.
+        censored: bool, what was not detected.
+
+    Returns:
+        [nats], of the broadcast shape.
     """
     import torch
 
-    z = (level - mean) * torch.exp(-log_sigma)
+    z = (level - mean) * torch.exp(-log_sd)
     # The branch that is not taken must stay finite, or its gradient (0 times infinity) is NaN.
     below = -torch.special.log_ndtr(torch.where(censored, z, 0.0))
-    seen = 0.5 * torch.where(censored, 0.0, z) ** 2 + log_sigma + HALF_LOG_2PI
+    seen = 0.5 * torch.where(censored, 0.0, z) ** 2 + log_sd + HALF_LOG_2PI
     return torch.where(censored, below, seen)
 
 
 def detection_probability(mean_db: np.ndarray, sd_db: np.ndarray,
                           limit_db: np.ndarray | float) -> np.ndarray:
-    """Return the probability that a level lies above the limit; -inf: always. Broadcasts."""
+    """Return the probability that a level lies above the limit; the arguments broadcast.
+
+    Args:
+        mean_db: expected [dB].
+        sd_db: standard deviation [dB].
+        limit_db: limit of detection [dB]; -inf: everything is detected.
+
+    Returns:
+        in 0..1, of the broadcast shape.
+    """
     return ndtr((mean_db - limit_db) / sd_db)

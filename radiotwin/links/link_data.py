@@ -217,6 +217,14 @@ class LinkData:
         """Return the same links over another map."""
         return replace(self, city=city, known_los=None)
 
+    def renumber_receivers(self, names: Sequence[str]) -> LinkData:
+        """Return the same links, counting receivers by `names`, which hold all of theirs."""
+        number = np.array([list(names).index(name) for name in self.receiver_names])
+        tracks = {(int(number[receiver]), flight): track
+                  for (receiver, flight), track in self.tracks.items()}
+        return replace(self, receiver=number[self.receiver], receiver_names=list(names),
+                       tracks=tracks)
+
     def _time_in_flight_s(self) -> np.ndarray:
         if np.isnan(self.time_s).all():
             return self.time_s

@@ -10,7 +10,7 @@ from radiotwin.antennas import Antenna
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path, require_writable
 from radiotwin.geodesy import to_local
-from radiotwin.measurements import read_cells
+from radiotwin.cells import read_cells
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
 from radiotwin.tables import Origin

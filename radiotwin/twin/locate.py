@@ -72,10 +72,8 @@ def locate_file(measurements: Measurements, twin: Twin, scene: Scene | None,
         others = " and others" if len(strangers) > MAX_NAMED else ""
         notes.append(f"nothing is known of receivers {', '.join(strangers[:MAX_NAMED])}{others}: "
                      "they are taken for faultless ones")
-    every = [*model.receivers, *strangers]
-    number = np.array([every.index(name) for name in links.receiver_names])
-    links = replace(links, receiver=number[links.receiver], receiver_names=every, tracks=None,
-                    device_m=np.nan_to_num(links.device_m),
+    links = links.renumber_receivers([*model.receivers, *strangers])
+    links = replace(links, device_m=np.nan_to_num(links.device_m), known_los=None,
                     # A few links do not tell how weak a level can be detected.
                     limit_db=links.limit_db if twin.limit_db is None else twin.limit_db)
     area_m = scene.config.extent.bounds if scene is not None else whole_area(model, links)

@@ -1,11 +1,11 @@
-"""Worlds whose truth is written down here, apart from the package: a law, a bent law, random positions."""
+"""Worlds whose truth is written down here, apart from the package: a law, a law with a break point, random positions."""
 
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 
-from radiotwin.links.geometry import LinkGeometry
+from radiotwin.links import LinkGeometry
 
 ANCHOR_M = np.array([[60.0, 320.0, 1.5], [320.0, 120.0, 1.5], [580.0, 520.0, 1.5]])
 LAW = {True: (-30.0, -2.5, 2.0**0.5), False: (-35.0, -3.04, 5.0**0.5)}
@@ -27,7 +27,7 @@ def paper_law(distance_m, los, elevation_rad):
 
 
 def bent_law(distance_m, los, elevation_rad):
-    """In LoS free space to a break point at 200 m and the sixth power beyond (nearly two-ray); in NLoS a loss that
+    """Return free space in LoS to a break point at 200 m and the sixth power beyond (nearly two-ray); in NLoS a loss that
     falls with elevation, as over roofs [dB]."""
     decades = np.log10(distance_m / 200.0)
     los_db = -86.0 - 20.0 * decades - 40.0 * np.maximum(decades, 0.0)

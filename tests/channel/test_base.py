@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from radiotwin.channel import MODELS, check_fit_data
+from radiotwin.channel import channel_models, check_fit_data
 from radiotwin.errors import BadInput
 
+MODELS = channel_models()
 EVERY = pytest.mark.parametrize("name", MODELS)
 
 

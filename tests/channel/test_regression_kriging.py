@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from radiotwin.channel import residual_field
-from radiotwin.links.geometry import LinkGeometry
 from radiotwin.channel.regression_kriging import RegressionKriging
+from radiotwin.links import LinkGeometry
 
 
 def shadowing(links):
@@ -24,7 +24,7 @@ def test_interpolates_a_smooth_field(world):
 
 
 def test_nine_in_ten_fall_within_their_interval(world):
-    """CorrelatedShadowing drawn from the exponential model, 6 dB and 80 m, on top of the law's own noise."""
+    """Shadowing drawn from the exponential model, 6 dB and 80 m, on top of the law's own noise."""
     data = world(2, 2400)
     rng = np.random.default_rng(3)
     level_db = data.level_db.copy()

@@ -10,29 +10,29 @@ from radiotwin.channel.residual_field import ResidualField
 def drawn(seed, n=500, offset=1.5):
     """Two kinds on one field of 60 m: the second reads `offset` more, and is mostly where the field is low."""
     rng = np.random.default_rng(seed)
-    place_m = np.column_stack([rng.uniform(0, 600, (n, 2)), np.zeros(n)])
-    apart_m = np.linalg.norm(place_m[:, None] - place_m[None], axis=2)
+    position_m = np.column_stack([rng.uniform(0, 600, (n, 2)), np.zeros(n)])
+    apart_m = np.linalg.norm(position_m[:, None] - position_m[None], axis=2)
     field = np.linalg.cholesky(np.exp(-apart_m / 60.0) + 1e-9 * np.eye(n)) @ rng.normal(size=n)
     kind = (rng.random(n) < np.where(field < 0, 0.8, 0.2)).astype(int)
-    return place_m, field, kind, field + offset * kind + 0.3 * rng.normal(size=n)
+    return position_m, field, kind, field + offset * kind + 0.3 * rng.normal(size=n)
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_kinds_that_meet_are_told_apart_though_they_went_to_other_places(seed):
-    place_m, field, kind, value = drawn(seed)
+def test_kinds_that_meet_are_distinguished_though_they_went_to_other_positions(seed):
+    position_m, field, kind, value = drawn(seed)
     learned, asked = np.arange(500) < 350, np.arange(500) >= 350
     mean, sigma = value[learned].mean(), value[learned].std()
     assert abs(value[kind == 1].mean() - value[kind == 0].mean()) < 0.9  # a plain comparison is deceived
 
     def error(kinds):
-        fitted = ResidualField().fit(np.zeros(350, int), place_m[learned], (value[learned] - mean) / sigma, 0,
+        fitted = ResidualField().fit(np.zeros(350, int), position_m[learned], (value[learned] - mean) / sigma, 0,
                                      None if kinds is None else kinds[learned])
-        expected, spread = fitted.predict(np.zeros(150, int), place_m[asked], None if kinds is None else kinds[asked])
-        z = ((value[asked] - mean) / sigma - expected) / spread
+        expected, sd = fitted.predict(np.zeros(150, int), position_m[asked], None if kinds is None else kinds[asked])
+        z = ((value[asked] - mean) / sigma - expected) / sd
         return np.sqrt(np.mean((mean + sigma * expected - value[asked]) ** 2)), z.std(), fitted
     plain, _, without = error(None)
-    told, calibration, fitted = error(kind)
-    assert told < 0.9 * plain and 0.8 < calibration < 1.25
+    by_kind, calibration, fitted = error(kind)
+    assert by_kind < 0.9 * plain and 0.8 < calibration < 1.25
     assert without.kind_share == 0 and fitted.kind_share > 0.1
     at_half_way = fitted.predict(np.zeros(1, int), np.full((1, 3), 300.0), np.array([-1]))[0]
     both = [fitted.predict(np.zeros(1, int), np.full((1, 3), 300.0), np.array([k]))[0] for k in (0, 1)]
@@ -52,12 +52,12 @@ def test_two_points_are_as_the_closed_form_says():
     assert np.array(field.predict(np.ones(1, int), np.zeros((1, 3)))).tolist() == [[0.0], [1.0]]
 
 
-def test_what_was_saved_predicts_the_same():
-    place_m, _, kind, value = drawn(3, 200)
-    field = ResidualField().fit(np.arange(200) % 3, place_m, value / value.std(), 0, kind)
+def test_a_saved_field_predicts_the_same():
+    position_m, _, kind, value = drawn(3, 200)
+    field = ResidualField().fit(np.arange(200) % 3, position_m, value / value.std(), 0, kind)
     again = ResidualField.from_state(*field.state())
-    series, places_m, kinds = np.arange(50) % 3, place_m[:50] + 7.0, kind[:50]
-    np.testing.assert_array_equal(field.predict(series, places_m, kinds), again.predict(series, places_m, kinds))
+    series, other_m, kinds = np.arange(50) % 3, position_m[:50] + 7.0, kind[:50]
+    np.testing.assert_array_equal(field.predict(series, other_m, kinds), again.predict(series, other_m, kinds))
 
 
 def test_many_series_stay_within_the_memory_that_is_said(monkeypatch):
@@ -65,15 +65,15 @@ def test_many_series_stay_within_the_memory_that_is_said(monkeypatch):
     monkeypatch.setattr(residual_field, "MAX_PAIRS", 200 * 70**2)
     monkeypatch.setattr(residual_field, "MAX_SERIES_TO_FIT", 20)
     rng = np.random.default_rng(5)
-    places_m, values = [], []
+    other_m, values = [], []
     for _ in range(200):
-        place_m = np.column_stack([rng.uniform(0, 600, (150, 2)), np.zeros(150)])
-        apart_m = np.linalg.norm(place_m[:, None] - place_m[None], axis=2)
+        position_m = np.column_stack([rng.uniform(0, 600, (150, 2)), np.zeros(150)])
+        apart_m = np.linalg.norm(position_m[:, None] - position_m[None], axis=2)
         values.append(np.linalg.cholesky(np.exp(-apart_m / 60.0) + 1e-6 * np.eye(150)) @ rng.normal(size=150))
-        places_m.append(place_m)
-    field = ResidualField().fit(np.repeat(np.arange(200), 150), np.concatenate(places_m), np.concatenate(values), 0)
+        other_m.append(position_m)
+    field = ResidualField().fit(np.repeat(np.arange(200), 150), np.concatenate(other_m), np.concatenate(values), 0)
     sizes = np.array([len(each.residual) for each in field.fields.values()])
     assert len(sizes) == 200 and (sizes**2).sum() <= residual_field.MAX_PAIRS and sizes.min() > 20
     assert field.length_m == pytest.approx(60.0, rel=0.25) and field.share > 0.9
-    mean, _ = field.predict(np.arange(200), np.array([place_m[0] for place_m in places_m]))
+    mean, _ = field.predict(np.arange(200), np.array([position_m[0] for position_m in other_m]))
     assert np.corrcoef(mean, [value[0] for value in values])[0, 1] > 0.7

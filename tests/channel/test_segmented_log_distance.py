@@ -17,7 +17,7 @@ def test_recovers_both_lines_under_heavy_censoring(world, laws):
         intercept_db, exponent, sigma_db = laws["parameters"][los]
         assert line.exponent == pytest.approx(exponent, abs=0.2)
         assert line.intercept_db == pytest.approx(intercept_db, abs=5.0)
-        assert line.sigma_db == pytest.approx(sigma_db, rel=0.09)
+        assert line.sd_db == pytest.approx(sigma_db, rel=0.09)
 
 
 def test_nine_in_ten_fall_within_their_interval(world):
@@ -38,8 +38,8 @@ def test_class_without_data_borrows_the_other_line(world, kept, poor):
     assert model.state()[1] == {"borrowed": poor}
     assert model.los.exponent == model.nlos.exponent
     assert model.los.intercept_db - model.nlos.intercept_db == pytest.approx(20.0, abs=0.1)
-    assert getattr(model, poor).sigma_db == 8.0
-    assert getattr(model, "los" if kept else "nlos").sigma_db < 3.0
+    assert getattr(model, poor).sd_db == 8.0
+    assert getattr(model, "los" if kept else "nlos").sd_db < 3.0
 
 
 def test_a_few_links_move_a_borrowed_line(world):

@@ -79,7 +79,7 @@ def test_table_is_the_mean_of_the_networks(fitted_nn):
             {k: torch.as_tensor(v) for k, v in model.weights.items()},
             torch.as_tensor(model._inputs(place, segment), dtype=torch.float32),
         )
-    sigma_db = np.array([model.law.nlos.sigma_db, model.law.los.sigma_db])[segment]
+    sigma_db = np.array([model.law.nlos.sd_db, model.law.los.sd_db])[segment]
     expected = np.clip(outputs.mean(0).numpy() * sigma_db, *model.residual_db[segment].T)
     assert np.abs(model.predict(data.links)[0] - model.law.predict(data.links)[0] - expected).max() < 0.02
 

@@ -1,29 +1,34 @@
 """Saved models predict the same; damaged files are refused in one message."""
 
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 from safetensors.numpy import save_file
 
-from radiotwin.channel import MODELS, load_channel, save_channel
+from radiotwin.channel import channel_models, load_channel, save_channel
+from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.errors import BadInput
+from radiotwin.scene.citymap import CityMap
 
+MODELS = channel_models()
 
 @pytest.fixture(scope="module")
 def models(fitted_nn):
+    """One of each kind; of that which follows paths, with a law and a diffuse power of its own."""
     network, data = fitted_nn
-    others = [
-        kind().fit(data.links, data.level_db, -120.0, seed=0)
-        for kind in MODELS.values()
-        if kind.name != network.name
-    ]
-    return {model.name: model for model in [network, *others]}
+    found = {kind.name: kind().fit(data.links, data.level_db, -120.0, seed=0)
+             for kind in MODELS.values() if not kind.follows_paths and kind.name != network.name}
+    return found | {network.name: network,
+                    ImagePaths.name: ImagePaths(found["segmented_log_distance"], (-93.0, 3.5))}
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_predictions_survive_bit_for_bit(name, models, world, tmp_path):
-    links = world(70, 2000).links
+    solid = trimesh.creation.box(bounds=[[200, 300, 0], [240, 360, 40]])
+    links = replace(world(70, 2000).links, city=CityMap(solid.vertices, solid.faces))
     path = tmp_path / "channel.safetensors"
     save_channel(models[name], path)
     loaded = load_channel(path)

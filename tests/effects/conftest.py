@@ -8,7 +8,7 @@ import pytest
 import radiotwin as rt
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
-from tests.closeloop.conftest import open_ground
+from tests.worlds import open_ground
 
 __all__ = ["open_ground"]
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from radiotwin.inference.censored_line import LogDistanceLine, fit_line, fit_sigma, shift_line
+from radiotwin.inference.censored_line import LogDistanceLine, fit_line, fit_sd_db, shift_line
 
 TRUE = np.array([-35.0, -3.04, 5.0**0.5])
 LIMIT_DB = -107.0
@@ -17,7 +17,7 @@ def draw(seed, n=600):
 
 
 def parameters(line):
-    return np.array([line.intercept_db, line.exponent, line.sigma_db])
+    return np.array([line.intercept_db, line.exponent, line.sd_db])
 
 
 def test_without_censoring_it_is_least_squares():
@@ -105,4 +105,4 @@ def test_sigma_of_censored_levels():
     mean_db = rng.uniform(-115.0, -95.0, 4000)
     level_db = mean_db + 3.0 * rng.standard_normal(4000)
     level_db[level_db < -105.0] = np.nan
-    assert fit_sigma(level_db, mean_db, -105.0) == pytest.approx(3.0, rel=0.06)
+    assert fit_sd_db(level_db, mean_db, -105.0) == pytest.approx(3.0, rel=0.06)

@@ -8,25 +8,21 @@ from scipy.optimize import minimize
 from scipy.stats import norm
 from scipy.stats import t as student
 
+from radiotwin.effects.noise_floor import floored
 from radiotwin.inference.censored_regression import (
-    Linearisation,
     CensoredRegression,
-    _derivatives,
+    FitResult,
     _slope_and_hessian,
     covariance,
-    expect,
-    nll,
-    nll_at,
-    residual_db,
-    solve,
+    fit,
 )
-from radiotwin.effects.noise_floor import floored
+from radiotwin.inference.student import derivatives
 
 
-def problem(level_db, columns, limit_db=-np.inf, dof=5.0, split=1, paths=None, receiver=None, spread=np.inf):
+def problem(level_db, columns, limit_db=-np.inf, dof=5.0, split=1, paths=None, receiver=None, prior_sd_db=np.inf):
     n, p = columns.shape
     return CensoredRegression(level_db, np.full(n, limit_db), np.zeros(n), columns[:, :split], paths, np.zeros(n),
-                   columns[:, split:], np.full(p, spread), np.zeros(n, int), receiver, dof)
+                              columns[:, split:], np.full(p, prior_sd_db), np.zeros(n, int), receiver, dof)
 
 
 def draw(seed, dof=5.0, n=4000, scale=3.0):
@@ -42,9 +38,9 @@ def test_coefficients_and_scale_are_found_also_where_many_levels_are_blank(seed,
     columns, truth, level_db = draw(seed)
     limit_db = np.quantile(level_db, blank_share) if blank_share else -np.inf
     given = problem(np.where(level_db < limit_db, np.nan, level_db), columns, limit_db)
-    found = solve(given)
-    deviation = np.sqrt(np.diag(covariance(given, found)))
-    assert (np.abs(found.coefficients - truth) < 4.5 * deviation).all() and deviation.max() < 0.2
+    found = fit(given)
+    sd_db = np.sqrt(np.diag(covariance(given, found)))
+    assert (np.abs(found.coefficients - truth) < 4.5 * sd_db).all() and sd_db.max() < 0.2
     assert found.scale_db[0] == pytest.approx(3.0, rel=0.08)
 
 
@@ -53,7 +49,7 @@ def test_the_solution_is_the_maximum_of_the_likelihood_written_with_scipy():
     limit_db = np.quantile(level_db, 0.3)
     blank = level_db < limit_db
     given = problem(np.where(blank, np.nan, level_db), columns, limit_db)
-    found = solve(given)
+    found = fit(given)
 
     def objective(theta):
         mean, scale = columns @ theta[:3], np.exp(theta[3])
@@ -62,13 +58,13 @@ def test_the_solution_is_the_maximum_of_the_likelihood_written_with_scipy():
 
     best = minimize(objective, np.r_[found.coefficients, np.log(found.scale_db)], method="BFGS")
     assert objective(np.r_[found.coefficients, np.log(found.scale_db)]) == pytest.approx(best.fun, abs=0.05)
-    assert nll(given, found).sum() == pytest.approx(best.fun, abs=0.05)
+    assert given.nll(found).sum() == pytest.approx(best.fun, abs=0.05)
 
 
-def test_outliers_do_not_bend_it():
+def test_outliers_do_not_bias_it():
     columns, truth, level_db = draw(1, dof=50.0)
     level_db[:200] += 60
-    found = solve(problem(level_db, columns, dof=3.0))
+    found = fit(problem(level_db, columns, dof=3.0))
     assert np.abs(found.coefficients - truth).max() < 0.4
     plain = np.linalg.lstsq(columns, level_db, rcond=None)[0]
     assert abs(plain[0] - truth[0]) > 2
@@ -76,58 +72,60 @@ def test_outliers_do_not_bend_it():
 
 def test_a_narrow_prior_holds_a_coefficient_back():
     columns, _, level_db = draw(2, n=50)
-    free, held = solve(problem(level_db, columns)), solve(problem(level_db, columns, spread=0.01))
+    free, held = fit(problem(level_db, columns)), fit(problem(level_db, columns, prior_sd_db=0.01))
     assert np.abs(held.coefficients).max() < 0.1 < np.abs(free.coefficients).max()
 
 
-def test_a_blank_without_a_limit_tells_nothing():
+def test_a_blank_without_a_limit_says_nothing():
     columns, _, level_db = draw(3)
     blank = np.arange(len(level_db)) % 3 == 0
-    with_blanks = solve(problem(np.where(blank, np.nan, level_db), columns))
-    without = solve(problem(level_db[~blank], columns[~blank]))
+    with_blanks = fit(problem(np.where(blank, np.nan, level_db), columns))
+    without = fit(problem(level_db[~blank], columns[~blank]))
     np.testing.assert_allclose(with_blanks.coefficients, without.coefficients, atol=0.02)
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_links_that_are_lost_whatever_their_level_do_not_bend_it(seed):
+def test_links_that_drop_out_whatever_their_level_do_not_bias_it(seed):
     columns, truth, level_db = draw(seed)
     limit_db = np.quantile(level_db, 0.2)
-    chance = np.where(np.arange(len(level_db)) % 2, 0.3, 0.0)
-    lost = np.random.default_rng(seed).random(len(level_db)) < chance
-    given = problem(np.where((level_db < limit_db) | lost, np.nan, level_db), columns, limit_db)
-    told = replace(given, dropout_probability=chance)
-    found, deviation = solve(told), np.sqrt(np.diag(covariance(told, solve(told))))
-    assert (np.abs(found.coefficients - truth) < 4.5 * deviation).all() and deviation.max() < 0.2
+    probability = np.where(np.arange(len(level_db)) % 2, 0.3, 0.0)
+    dropped = np.random.default_rng(seed).random(len(level_db)) < probability
+    given = problem(np.where((level_db < limit_db) | dropped, np.nan, level_db), columns, limit_db)
+    known = replace(given, dropout_probability=probability)
+    found = fit(known)
+    sd_db = np.sqrt(np.diag(covariance(known, found)))
+    assert (np.abs(found.coefficients - truth) < 4.5 * sd_db).all() and sd_db.max() < 0.2
     assert found.scale_db[0] == pytest.approx(3.0, rel=0.08)
-    assert abs(solve(given).coefficients[0] - truth[0]) > 1
-    # A strong link that is blank was lost; it is not thought to be weak.
-    strong = lost & (columns @ truth > limit_db + 10)
-    assert residual_db(told, found)[strong].min() > -0.5 and residual_db(given, found)[strong].max() < -9
+    assert abs(fit(given).coefficients[0] - truth[0]) > 1
+    # A strong link that is blank dropped out; it is not thought to be weak.
+    strong = dropped & (columns @ truth > limit_db + 10)
+    assert known.residual_db(found)[strong].min() > -0.5 and given.residual_db(found)[strong].max() < -9
 
 
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.6])
-def test_derivatives_are_those_of_the_likelihood_also_where_links_are_lost(share):
+def test_derivatives_are_those_of_the_likelihood_also_where_links_drop_out(share):
     """Slope and curvature against differences in the mean, and the term of the scale against those in its logarithm."""
     rng = np.random.default_rng(5)
     level_db = rng.uniform(-100, -60, 300)
     level_db[::2] = np.nan
     given = replace(problem(level_db, np.ones((300, 1)), -95.0), dropout_probability=np.full(300, share))
     mean, scale, step = rng.uniform(-110, -70, 300), 3.0, 1e-3
-    one = np.ones(300)
-    slope, curvature, spread = _derivatives(given, Linearisation(mean, scale * one, one[:, None], one, 0 * one, one))
-    around = [nll_at(given, mean + way * step, np.full(300, scale)) for way in (-1, 0, 1)]
+    slope, curvature, scale_slope = derivatives(level_db, given.limit_db, mean, np.full(300, scale), given.dof,
+                                                given.dropout_probability)
+    around = [given.nll_at(mean + way * step, np.full(300, scale)) for way in (-1, 0, 1)]
     np.testing.assert_allclose(slope, (around[0] - around[2]) / (2 * step), atol=1e-5)
     blank = np.isnan(level_db)
     exact = (around[0] - 2 * around[1] + around[2]) / step**2
     np.testing.assert_allclose(curvature[blank], np.maximum(exact[blank], 0), atol=1e-5)
     assert curvature.min() > 0 > exact[blank].min()  # far from the limit the likelihood is not concave
-    wider, narrower = (nll_at(given, mean, np.full(300, scale * np.exp(way * step))) for way in (1, -1))
-    np.testing.assert_allclose(spread, (narrower - wider) / (2 * step), atol=1e-5)
+    wider, narrower = (given.nll_at(mean, np.full(300, scale * np.exp(way * step))) for way in (1, -1))
+    np.testing.assert_allclose(scale_slope, (narrower - wider) / (2 * step), atol=1e-5)
 
 
-def test_the_likelihood_of_a_link_that_may_be_lost_is_that_of_either():
-    given = replace(problem(np.array([-80.0, np.nan, np.nan]), np.ones((3, 1)), -90.0), dropout_probability=np.array([0.1, 0.1, 0.0]))
-    found = nll_at(given, np.full(3, -84.0), np.full(3, 4.0))
+def test_the_likelihood_of_a_link_that_may_drop_out_is_that_of_either():
+    given = replace(problem(np.array([-80.0, np.nan, np.nan]), np.ones((3, 1)), -90.0),
+                    dropout_probability=np.array([0.1, 0.1, 0.0]))
+    found = given.nll_at(np.full(3, -84.0), np.full(3, 4.0))
     below = student.cdf(-6 / 4, 5)
     np.testing.assert_allclose(found, -np.log([0.9 * student.pdf(1, 5) / 4, 0.1 + 0.9 * below, below]))
 
@@ -149,9 +147,9 @@ def test_what_paths_add_and_receivers_compress_is_undone():
         return np.where(strong, -72 + 0.5 * (mean + 72), mean), np.where(strong, 0.5, 1.0)
 
     given = problem(level_db, columns, split=2, paths=paths, receiver=receiver, dof=30.0)
-    found = solve(given)
+    found = fit(given)
     np.testing.assert_allclose(found.coefficients, truth, atol=0.15)
-    assert np.sqrt(np.mean(residual_db(given, found) ** 2)) == pytest.approx(0.5, rel=0.1)
+    assert np.sqrt(np.mean(given.residual_db(found) ** 2)) == pytest.approx(0.5, rel=0.1)
 
 
 @pytest.mark.parametrize("random_effect_sd_db", [0.0, 6.0])
@@ -161,7 +159,7 @@ def test_what_is_read_near_a_floor_is_the_mean_of_what_may_arrive(random_effect_
     arriving_db = np.array([-120.0, -100.0, -92.0, -85.0, -60.0])
     given = replace(problem(np.zeros(5), arriving_db[:, None], receiver=lambda level: floored(level, -90.0)),
                     random_effect_sd_db=np.full(5, random_effect_sd_db))
-    expected = given.expect(np.ones(1), np.array([7.0]))
+    expected = given.linearise(np.ones(1), np.array([7.0]))
     drawn_db = floored(arriving_db + np.hypot(7.0, random_effect_sd_db) * rng.normal(size=(200_000, 5)), -90.0)[0]
     np.testing.assert_allclose(expected.mean_db, drawn_db.mean(axis=0), atol=0.15)
     assert (np.diff(expected.scale_db) > 0).all() and 3.5 <= expected.scale_db[0] < 4
@@ -176,9 +174,9 @@ def test_slope_and_growth_of_what_is_read_are_those_of_differences():
     beta, scale_db, step = np.array([-90.0, 7.0]), np.array([6.0]), 1e-4
 
     def log_likelihood(numbers):
-        expected = given.expect(numbers, scale_db)
-        return -nll_at(given, expected.mean_db, expected.scale_db).sum()
-    found = _slope_and_hessian(given, given.expect(beta, scale_db), np.zeros(2))[0]
+        expected = given.linearise(numbers, scale_db)
+        return -given.nll_at(expected.mean_db, expected.scale_db).sum()
+    found = _slope_and_hessian(given, given.linearise(beta, scale_db), np.zeros(2))[0]
     steps = step * np.eye(2)
     numeric = [(log_likelihood(beta + each) - log_likelihood(beta - each)) / (2 * step) for each in steps]
     np.testing.assert_allclose(found, numeric, rtol=1e-4)
@@ -192,17 +190,16 @@ def test_a_law_under_a_floor_is_found(seed):
     arriving_db = columns @ [-20.0, -32.0] + 6.0 * rng.standard_t(5, 4000)
     level_db = floored(arriving_db, -85.0)[0] + rng.normal(0, 1.0, 4000)
     given = problem(level_db, columns, receiver=lambda level: floored(level, -85.0))
-    flat = solve(replace(given, receiver=None))
-    found = solve(given)
+    floorless = replace(given, receiver=None)
+    flat = fit(floorless)
+    found = fit(given)
     assert found.coefficients[1] == pytest.approx(-32.0, abs=4.0) and flat.coefficients[1] > -22
-    error_db = level_db - expect(given, found).mean_db
-    assert np.sqrt(np.mean(error_db**2)) < np.sqrt(np.mean((level_db - expect(replace(given, receiver=None),
-                                                                              flat).mean_db) ** 2))
+    error_db = level_db - given.predict(found).mean_db
+    assert np.sqrt(np.mean(error_db**2)) < np.sqrt(np.mean((level_db - floorless.predict(flat).mean_db) ** 2))
 
 
 def test_with_many_degrees_of_freedom_the_errors_are_normal():
     given = problem(np.array([-80.0, np.nan]), np.ones((2, 1)), -90.0, dof=1e6)
-    fixed = type(solve(problem(np.full(20, -81.0) + np.arange(20) % 2, np.ones((20, 1)))))(
-        np.array([-84.0]), np.array([4.0]), 0.0)
+    fixed = FitResult(np.array([-84.0]), np.array([4.0]), 0.0)
     expected = [-norm.logpdf(-80, -84, 4), -norm.logcdf(-90, -84, 4)]
-    np.testing.assert_allclose(nll(given, fixed), expected, atol=1e-4)
+    np.testing.assert_allclose(given.nll(fixed), expected, atol=1e-4)

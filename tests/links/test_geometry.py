@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from radiotwin.links.geometry import LinkGeometry, link_geometry
 from radiotwin.errors import BadInput
+from radiotwin.links import LinkGeometry, link_geometry
 
 DEVICE_M = np.array([[0.0, 0.0, 1.5], [np.nan, np.nan, 1.5], [10.0, 20.0, 0.0]])
 

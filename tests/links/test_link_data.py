@@ -1,4 +1,4 @@
-"""What is left out of a file, and that it is told."""
+"""Links as they are read from measurements: what is left out and noted, directions, and the map between the ends."""
 
 from dataclasses import replace
 
@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.closeloop.folds import evidence_blocks, make_folds
-from radiotwin.links.link_data import prepare_links
 from radiotwin.errors import BadInput
+from radiotwin.links import evidence_blocks, prepare_links
 from radiotwin.scene.citymap import CityMap
 
 
-def test_what_cannot_be_used_is_left_out_and_told(open_ground):
+def test_what_cannot_be_used_is_left_out_and_noted(open_ground):
     measurements = open_ground.measured(open_ground.fly(0, limit_db=-500.0))
     table = measurements.table
     n = len(table)
@@ -25,9 +24,9 @@ def test_what_cannot_be_used_is_left_out_and_told(open_ground):
     table.loc[41:60, "gain_db"] = -77.0
     links = prepare_links(measurements, None)
     assert len(links) == n - 1 - 1 - 3 - 35 - 20 and links.receiver_names == ["r0", "r1"]
-    told = " ".join(links.notes)
+    notes = " ".join(links.notes)
     for part in ("more than 100 km", "twice", "broken has 3 only", "dead never detected", "stuck always reads -77"):
-        assert part in told, part
+        assert part in notes, part
 
 
 def test_a_receiver_that_heard_once_is_not_stuck_and_equal_rows_without_a_time_are_measurements(open_ground):
@@ -65,24 +64,6 @@ def test_directions_are_compass_bearings(open_ground):
     assert away.any() and (np.abs(links.body_azimuth_deg[away] - 180) < 5.01).all()
 
 
-def test_flights_are_held_out_where_they_are_alike_and_places_where_not(open_ground):
-    world = open_ground.fly(3)
-    links = prepare_links(open_ground.measured(world), None)
-    folds = make_folds(links, 0)
-    assert folds.by == "flight"
-    for flight in range(6):
-        assert len(np.unique(folds.index[links.flight == flight])) == 1
-    walks = [f"{device}-{receiver}" for device, receiver in zip(world.device, world.receiver)]
-    one = prepare_links(open_ground.measured(world, flight=walks), None)
-    folds = make_folds(one, 0)
-    assert folds.by == "block" and folds.count == 6
-    cell = np.floor(one.receiver_m[:, :2] / 60).astype(int)
-    for place in np.unique(cell, axis=0)[:40]:
-        assert len(np.unique(folds.index[(cell == place).all(axis=1)])) == 1
-    sizes = np.bincount(folds.index)
-    assert sizes.max() < 1.3 * sizes.min()
-
-
 def test_a_piece_of_evidence_is_of_one_device_receiver_and_flight(open_ground):
     links = prepare_links(open_ground.measured(open_ground.fly(4)), None)
     block = evidence_blocks(links)
@@ -97,14 +78,14 @@ def test_too_little_is_refused(open_ground):
         prepare_links(measurements.select(np.arange(len(measurements.table)) < 40), None)
 
 
-def test_what_stands_in_the_way_is_measured_along_the_link(open_ground):
+def test_buildings_in_the_way_are_measured_along_the_link(open_ground):
     """A wall 10 m thick and 30 m high, in the middle of links of 100 m that pass 20 m below its top and 10 m above."""
     city = trimesh.creation.box(extents=[10, 400, 30])
     city.apply_translation([0, 0, 15])
     links = prepare_links(open_ground.measured(open_ground.fly(0)), None).select(np.arange(2))
     links = replace(links, device_m=np.array([[-50.0, 0, 10], [-50, 0, 40]]), device=np.array([0, 1]),
-                      receiver_m=np.array([[50.0, 0, 10], [50, 0, 40]]), frequency_hz=2.4e9,
-                      city=CityMap(city.vertices, city.faces))
+                    receiver_m=np.array([[50.0, 0, 10], [50, 0, 40]]), frequency_hz=2.4e9,
+                    city=CityMap(city.vertices, city.faces))
     np.testing.assert_allclose(links.metres_inside, [10, 0], atol=0.01)
     wavelength_m = 299_792_458 / 2.4e9
     assert links.diffraction_parameter[0] == pytest.approx(20 * np.sqrt(2 / wavelength_m * 2 / 50), rel=0.01)

@@ -1,16 +1,16 @@
-"""The corrected twin is used with all that was found, and with the map that it was made with."""
+"""One twin predicts links and maps, with the levels fitted upon its channel and the map that it was fitted with."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.channel.log_distance import LogDistance
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.twin.corrected import corrected_model
 from radiotwin.compare import predict
+from radiotwin.effects.effect_model import EffectModel
 from radiotwin.errors import BadInput
+from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.survey import fly_survey, segmented_truth
 from radiotwin.twin import Twin, TwinDevice
 
@@ -18,33 +18,33 @@ LINE = LogDistanceLine(-40.0, -2.5, 2.0)
 
 
 def twin(channel, classes):
-    """As the loop saves it, of a law with a level and a slope for each class of line of sight."""
-    effects = {"base": "twin", "coefficients": [0.0, 0.0] * classes, "dof": 5.0, "scale_db": [2.0] * classes,
-               "receivers": [], "parts": [], "first_s": None, "device_spread_db": 0.0, "likelihood_power": 1.0}
-    devices = [TwinDevice("a", 10.0, 10.0, 1.5, "anchor", True, 0.0, None)]
-    return Twin(channel, devices, "gain_db", -110.0, {}, effects)
+    """Return a twin as close-loop makes it, of a law with a level and a slope for each class of line of sight."""
+    device = TwinDevice.anchor("a", 10.0, 10.0, 1.5)
+    fitted = EffectModel(channel, (), np.zeros(2 * classes), np.full(classes, 2.0), 5.0,
+                         np.array([[10.0, 10.0, 1.5]]), (), np.nan, 0.0)
+    return Twin(channel, [device], "gain_db", -110.0, {}, fitted)
 
 
 def test_a_map_is_neither_forgotten_nor_added(small_scene):
     with_map, without = (twin(SegmentedLogDistance(LINE, LINE), classes) for classes in (2, 1))
     with pytest.raises(BadInput, match="made with a 3D map .* give it with --scene"):
-        corrected_model(with_map, None)
+        with_map.require_map(None)
     with pytest.raises(BadInput, match="made without a 3D map"):
-        corrected_model(without, small_scene)
+        without.require_map(small_scene)
     with pytest.raises(BadInput, match="made without a 3D map"):
         without.radio_map(small_scene)
     for same, scene in ((with_map, small_scene), (without, None), (twin(LogDistance(LINE), 1), small_scene)):
-        assert len(corrected_model(same, scene).solution.coefficients) == len(same.effects["coefficients"])
+        same.require_map(scene)
     assert np.isfinite(with_map.radio_map(small_scene).gain_db).all()
 
 
-def test_what_was_found_is_in_predictions_of_links_as_in_the_map(small_scene):
+def test_fitted_levels_are_in_predictions_of_links_as_in_the_map(small_scene):
     flown = fly_survey(small_scene, segmented_truth(small_scene), flights=1, pattern="random-waypoint", seed=0,
                        noise_db=0.0)
     one = replace(twin(SegmentedLogDistance(LINE, LINE), 2), devices=[
-        TwinDevice(row.device, row.x_m, row.y_m, row.z_m, "anchor", True, 0.0, None)
+        TwinDevice.anchor(row.device, row.x_m, row.y_m, row.z_m)
         for row in flown.devices.itertuples() if row.role == "anchor"], limit_db=None)
-    shifted = replace(one, effects=one.effects | {"coefficients": [3.0, 0.0, -5.0, 0.0]})
+    shifted = replace(one, fitted=replace(one.fitted, level_coefficients=np.array([3.0, 0.0, -5.0, 0.0])))
     before_db, after_db = (predict(each, small_scene, flown) for each in (one, shifted))
     anchors = flown.is_anchor[flown.device_index]
     los = small_scene.city.line_of_sight(flown.device_m[flown.device_index], flown.receiver_m)

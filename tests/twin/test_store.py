@@ -1,0 +1,120 @@
+"""Twins as folders: what comes back is what was saved, also from version 0.1, and damage is one message."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from radiotwin.closeloop.corrected_twin import corrected_twin
+from radiotwin.closeloop.run import close_loop
+from radiotwin.errors import BadInput
+from radiotwin.links import prepare_links
+from radiotwin.measurements import read_measurements
+from radiotwin.twin import Twin, check_twin_target, fit_twin
+
+VERSION_1 = Path(__file__).parent / "version_1"  # made with radiotwin 0.1, see its README.md
+NO_MAP = SimpleNamespace(config=SimpleNamespace(radio=SimpleNamespace(frequency_hz=2.4e9)), city=None)
+
+
+@pytest.mark.parametrize("model", ["log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging"])
+def test_saved_and_loaded_it_predicts_the_same(small_scene, flown, tmp_path, model):
+    twin = fit_twin(flown, small_scene, model=model, seed=0)
+    twin.save(tmp_path / "twin")
+    again = Twin.load(tmp_path / "twin")
+    assert again.devices == twin.devices and again.provenance == twin.provenance
+    here, there = (t.radio_map(small_scene) for t in (twin, again))
+    np.testing.assert_array_equal(here.gain_db, there.gain_db)
+    np.testing.assert_array_equal(here.dataset["sigma_db"], there.dataset["sigma_db"])
+
+
+def assert_equal(one, other):
+    """Check that two predictions are the same to the bit."""
+    for name, value in vars(one).items():
+        np.testing.assert_array_equal(value, getattr(other, name), err_msg=name)
+
+
+def test_a_twin_with_effects_predicts_the_same_after_loading(open_ground, tmp_path):
+    world = open_ground.fly(20)
+    world.gain_db[world.receiver == 1] += 6.0
+    world.gain_db[world.device == 2] -= 7.0
+    measurements = open_ground.measured(world).select(world.slot % 3 == 0)
+    loop = close_loop(measurements, base="log-distance")
+    twin = corrected_twin(loop, None)
+    assert {each.effect.name for each in twin.effects} == {"device_gain_offset", "receiver_gain_offset"}
+    twin.save(tmp_path / "twin")
+    again = Twin.load(tmp_path / "twin")
+    assert again.description == twin.description and again.limit_db == twin.limit_db
+    assert again.fitted.receivers == twin.fitted.receivers == ("r0", "r1")
+    assert_equal(twin.predict(loop.links), again.predict(loop.links))
+    faultless = [each.links(world.receiver_m[:50], world.device[:50], NO_MAP) for each in (twin, again)]
+    assert_equal(twin.predict(faultless[0]), again.predict(faultless[1]))
+
+
+def test_a_corrected_twin_of_version_0_1_predicts_the_same():
+    """Offsets of devices, a step of one receiver, and interpolated shadowing, without a map."""
+    twin, before = Twin.load(VERSION_1 / "corrected"), np.load(VERSION_1 / "corrected.npz")
+    assert twin.is_corrected and twin.description == \
+        "log_distance with device_gain_offset, receiver_drift, correlated_shadowing"
+    found = twin.predict(twin.links(before["receiver_m"], before["device"], NO_MAP))
+    np.testing.assert_allclose(found.mean_db, before["mean_db"], atol=1e-6, rtol=0)
+    np.testing.assert_allclose(found.sd_db, before["sd_db"], atol=1e-6, rtol=0)
+    # As they are read by the receivers that it knows, before shadowing.
+    links = prepare_links(read_measurements(VERSION_1 / "links" / "measurements.csv"), None)
+    model, result = twin.fitted.on_links(links)
+    reading = model.regression().predict(result)
+    np.testing.assert_allclose(reading.mean_db, before["read_db"], atol=1e-6, rtol=0)
+    np.testing.assert_allclose(reading.scale_db, before["read_scale_db"], atol=1e-6, rtol=0)
+    assert np.ptp(before["read_db"] - found.mean_db) > 3  # the step is in one and not in the other
+
+
+def test_a_twin_of_version_0_1_that_follows_paths_predicts_the_same(small_scene):
+    twin, before = Twin.load(VERSION_1 / "raytrace"), np.load(VERSION_1 / "raytrace.npz")
+    assert twin.channel.name == "image_paths" and not twin.is_corrected
+    links = twin.links(before["receiver_m"], before["device"], small_scene)
+    found = twin.predict(links)
+    np.testing.assert_array_equal(links.los, before["los"])
+    np.testing.assert_allclose(found.mean_db, before["mean_db"], atol=1e-6, rtol=0)
+    np.testing.assert_allclose(found.sd_db, before["sd_db"], atol=1e-6, rtol=0)
+
+
+def test_a_twin_of_version_0_1_is_saved_as_one_of_this_version(tmp_path):
+    twin = Twin.load(VERSION_1 / "corrected")
+    twin.save(tmp_path / "twin")
+    assert json.loads((tmp_path / "twin" / "twin.json").read_text())["schema"] == "radiotwin.twin/2"
+    before = np.load(VERSION_1 / "corrected.npz")
+    links = twin.links(before["receiver_m"], before["device"], NO_MAP)
+    assert_equal(twin.predict(links), Twin.load(tmp_path / "twin").predict(links))
+
+
+def test_a_damaged_twin_is_bad_input(twin, tmp_path):
+    with pytest.raises(BadInput, match="not a twin's folder"):
+        Twin.load(tmp_path)
+    twin.save(tmp_path / "twin")
+    path = tmp_path / "twin" / "twin.json"
+    text = path.read_text()
+    for broken in (text[:100], text.replace('"devices"', '"gadgets"'), text.replace('"x_m": 80.0', '"x_m": "far"'),
+                   text.replace('"gain_db"', '"loudness"'), text.replace('"d1"', '"d0"'),
+                   text.replace('"anchor"', '"boss"')):
+        assert broken != text
+        path.write_text(broken)
+        with pytest.raises(BadInput, match="damaged"):
+            Twin.load(tmp_path / "twin")
+    path.write_text(json.dumps(json.loads(text) | {"schema": "radiotwin.twin/99"}))
+    with pytest.raises(BadInput, match="schema is"):
+        Twin.load(tmp_path / "twin")
+
+
+def test_a_twin_is_replaced_with_its_page_and_nothing_else_is_lost(twin, tmp_path):
+    twin.save(tmp_path / "twin")
+    (tmp_path / "twin" / "report.html").write_text("made of the twin before")
+    twin.save(tmp_path / "twin")
+    assert not (tmp_path / "twin" / "report.html").exists()
+    (tmp_path / "twin" / "notes.txt").write_text("mine")
+    with pytest.raises(BadInput, match="notes.txt"):
+        twin.save(tmp_path / "twin")
+    assert (tmp_path / "twin" / "notes.txt").read_text() == "mine"
+    (tmp_path / "file").write_text("")
+    with pytest.raises(BadInput, match="file"):
+        check_twin_target(tmp_path / "file")

@@ -1,0 +1,79 @@
+"""Worlds that tests of several packages share: open ground, by plain formulas of their own, and a traced city."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.measurements import Measurements
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.survey import fly_survey
+
+FLIGHTS, SLOTS, RECEIVERS, DEVICES = 6, 60, 2, 5
+RBM = Path(__file__).parents[1] / "scenes" / "rbm"
+IN_A_NARROW_STREET = "d4"
+
+
+def fly(seed, noise_db=2.0, limit_db=-110.0):
+    """Fly over open ground: arrays of links, to be changed, with gain = -35 - 26 log10(d) + noise."""
+    rng = np.random.default_rng(seed)
+    device_m = np.column_stack([rng.uniform(0, 500, (DEVICES, 2)), np.full(DEVICES, 1.5)])
+    rows = []
+    for flight in range(FLIGHTS):
+        for receiver in range(RECEIVERS):
+            position_m, heading = rng.uniform(100, 400, 2), rng.uniform(0, 2 * np.pi)
+            for slot in range(SLOTS):
+                heading += rng.normal(0, 0.25)
+                if np.abs(position_m - 250).max() > 240:
+                    heading = np.arctan2(*(250 - position_m))
+                position_m = position_m + 10 * np.array([np.sin(heading), np.cos(heading)])
+                rows += [(flight, receiver, device, 200.0 * flight + slot, slot, *position_m, 50.0 + 10 * receiver,
+                          np.degrees(heading) % 360) for device in range(DEVICES)]
+    flight, receiver, device, time_s, slot, x, y, z, heading_deg = np.array(rows).T
+    flight, receiver, device = (value.astype(int) for value in (flight, receiver, device))
+    receiver_m = np.column_stack([x, y, z])
+    offset_m = receiver_m - device_m[device]
+    distance_m = np.linalg.norm(offset_m, axis=1)
+    gain_db = -35 - 26 * np.log10(distance_m) + rng.normal(0, noise_db, len(rows))
+    return SimpleNamespace(
+        flight=flight, receiver=receiver, device=device, time_s=time_s, slot=slot, receiver_m=receiver_m,
+        device_m=device_m, heading_deg=heading_deg, offset_m=offset_m, distance_m=distance_m, gain_db=gain_db,
+        limit_db=limit_db)
+
+
+def measured(world, **columns):
+    """Return the measurements that a user would have of it."""
+    gain_db = np.where(world.gain_db < world.limit_db, np.nan, world.gain_db)
+    table = pd.DataFrame({
+        "time_s": world.time_s, "flight": [f"f{i}" for i in world.flight],
+        "receiver": [f"r{i}" for i in world.receiver],
+        **{f"receiver_{axis}_m": world.receiver_m[:, i] for i, axis in enumerate("xyz")},
+        "device": [f"d{i}" for i in world.device], "gain_db": gain_db, "heading_deg": world.heading_deg} | columns)
+    devices = pd.DataFrame({"device": [f"d{i}" for i in range(DEVICES)], "x_m": world.device_m[:, 0],
+                            "y_m": world.device_m[:, 1], "z_m": world.device_m[:, 2], "role": "anchor",
+                            "frequency_hz": 2.4e9})
+    return Measurements(table, devices)
+
+
+@pytest.fixture
+def open_ground():
+    """`fly(seed)` makes a world over open ground, `measured(world)` its measurements."""
+    return SimpleNamespace(fly=fly, measured=measured)
+
+
+@pytest.fixture(scope="session")
+def narrow_street():
+    """RBM, links of its anchors and of one unknown device in a narrow street, and its true position."""
+    scene = Scene.load(RBM)
+    flown = fly_survey(scene, RadioMap.read(RBM / "truth.nc"), flights=3, pattern="random-waypoint", seed=0,
+                       noise_db=1.0)
+    devices = flown.devices[(flown.devices["role"] == "anchor") | (flown.devices["device"] == IN_A_NARROW_STREET)]
+    every_third = np.unique(flown.table["time_s"], return_inverse=True)[1] % 3 == 0
+    links = flown.table[flown.table["device"].isin(devices["device"]) & every_third]
+    position_m = next(np.array([each.x_m, each.y_m]) for each in scene.config.devices
+                   if each.device == IN_A_NARROW_STREET)
+    return SimpleNamespace(scene=scene, name=IN_A_NARROW_STREET, position_m=position_m, measured=Measurements(
+        links.reset_index(drop=True), devices.reset_index(drop=True)))
