@@ -1,4 +1,4 @@
-"""Channel models held against each other: on flights that none has seen, and on the whole truth map."""
+"""Comparison of channel models on held-out flights and on the whole truth map."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -6,30 +6,32 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from radiotwin.inference.gaussian import mean_if_detected
 from radiotwin.errors import BadInput
+from radiotwin.inference.gaussian import mean_if_detected
 from radiotwin.measurements import Measurements
 from radiotwin.progress import progress
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin, fit_twin
 
+# Models that are compared unless others are named.
 DEFAULT_MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging")
-CLASSES = ("all", "LoS", "NLoS")
+CLASSES = ("all", "LoS", "NLoS")  # of links, as the tables name them
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """What the models make of one data set.
+    """Errors of several models on one data set.
 
     Attributes:
         scores: one row for each (model, against, positions, links): n, rmse_db, mae_db, bias_db.
-            `against` is `held-out flights` or `whole map`; `positions` is `estimated` (the twin as it is) or `true`
-            (the channel alone); `links` is all, LoS or NLoS by the true positions where they are known.
+            `against` is `held-out flights` or `whole map`; `positions` is `estimated` (the twin as
+            it is) or `true` (the channel alone); `links` is all, LoS or NLoS by the true positions
+            where they are known.
         locations: one row for each (model, unknown device): error_m, credible_radius_m, located.
         twins: the fitted twins by model.
-        predictions: held-out links with `measured_db`, `los` (1, 0, or NaN where the true position is not known) and
-            a column of predictions for each model.
+        predictions: held-out links with `measured_db`, `los` (1, 0, or NaN where the true position
+            is not known) and a column of predictions for each model.
     """
 
     scores: pd.DataFrame
@@ -38,7 +40,7 @@ class Comparison:
     predictions: pd.DataFrame
 
     def tables(self) -> list[tuple[str, dict[str, str], list[list]]]:
-        """The tables that are shown: (title, headings with their alignment, rows), scores first."""
+        """Return tables to show: (title, headings with their alignment, rows), scores first."""
         tables = []
         estimated = self.scores[self.scores["positions"] == "estimated"]
         for against, part in estimated.groupby("against", sort=False):
@@ -46,27 +48,31 @@ class Comparison:
             rows = []
             for model, of_model in part.groupby("model", sort=False):
                 of_class = of_model.set_index("links")
-                rows.append([model, *("/".join(_short(of_class.loc[links, f"{measure}_db"]) for links in CLASSES)
-                                      for measure in ("rmse", "mae", "bias"))])
+                rows.append([model, *(
+                    "/".join(_short(of_class.loc[links, f"{measure}_db"]) for links in CLASSES)
+                    for measure in ("rmse", "mae", "bias"))])
             links = part.groupby("links")["n"].max()
             counts = "/".join(str(links[name]) for name in CLASSES)
-            tables.append((f"Error on {against} [dB]: all/LoS/NLoS of {counts} links", columns, rows))
+            tables.append((f"Error on {against} [dB]: all/LoS/NLoS of {counts} links", columns,
+                           rows))
         summary = self.location_summary()
         if len(summary):
             tables.append(("Error of the unknown devices' positions [m]",
-                           {"model": "left", "devices": "right", "median": "right", "90 %": "right", "worst": "right"},
+                           {"model": "left"} | dict.fromkeys(
+                               ("devices", "median", "90 %", "worst"), "right"),
                            [[row.model, int(row.devices), row.median_m, row.p90_m, row.worst_m]
                             for row in summary.itertuples()]))
         return tables
 
     def location_summary(self) -> pd.DataFrame:
-        """Median, 90th percentile and worst error [m] of the unknown devices, for each model."""
+        """Return median, 90th percentile and worst position error [m] of each model."""
         def summary(errors: pd.Series) -> pd.Series:
             return pd.Series({"devices": len(errors), "median_m": errors.median(),
                               "p90_m": errors.quantile(0.9), "worst_m": errors.max()})
         if self.locations.empty or self.locations["error_m"].isna().all():
             return pd.DataFrame(columns=["model", "devices", "median_m", "p90_m", "worst_m"])
-        return self.locations.groupby("model", sort=False)["error_m"].apply(summary).unstack().reset_index()
+        errors_m = self.locations.groupby("model", sort=False)["error_m"]
+        return errors_m.apply(summary).unstack().reset_index()
 
 
 def _short(value: float) -> str:
@@ -74,7 +80,14 @@ def _short(value: float) -> str:
 
 
 def split_flights(measurements: Measurements, held_out: int) -> tuple[Measurements, Measurements]:
-    """The last `held_out` flights apart from those before.
+    """Split the last flights from those before.
+
+    Args:
+        measurements: of several flights.
+        held_out: number of the last flights.
+
+    Returns:
+        measurements to learn from, and measurements to judge on.
 
     Raises:
         BadInput: fewer flights than it takes to learn from one and hold out the others.
@@ -84,33 +97,42 @@ def split_flights(measurements: Measurements, held_out: int) -> tuple[Measuremen
         raise BadInput(f"held-out flights = {held_out}: at least 1 is needed to compare on")
     if len(flights) <= held_out:
         some = "1 flight" if len(flights) == 1 else f"{len(flights)} flights"
-        raise BadInput(f"{some} in the measurements ({', '.join(flights[:4])}), {held_out} to be held out: at least "
-                       f"{held_out + 1} are needed, so that models are judged on a flight that they were not fitted "
-                       "to; survey more flights, or hold out fewer")
+        raise BadInput(
+            f"{some} in the measurements ({', '.join(flights[:4])}), {held_out} to be held out: at "
+            f"least {held_out + 1} are needed, so that models are judged on a flight that they were "
+            "not fitted to; survey more flights, or hold out fewer")
     test = measurements.table["flight"].isin(flights[-held_out:]).to_numpy()
     return measurements.select(~test), measurements.select(test)
 
 
-def compare_models(train: Measurements, test: Measurements, scene: Scene, truth: RadioMap | None, *, seed: int,
-                   models: tuple[str, ...] = DEFAULT_MODELS, twins: dict[str, Twin] | None = None,
+def compare_models(train: Measurements, test: Measurements, scene: Scene,
+                   truth: RadioMap | None, *, seed: int,
+                   models: tuple[str, ...] = DEFAULT_MODELS,
+                   twins: dict[str, Twin] | None = None,
                    maps: dict[str, RadioMap] | None = None) -> Comparison:
     """Fit every model to the same links and judge all of them on the same others.
 
     Args:
-        train, test: links to learn from and to judge on.
-        scene: where both were measured; its devices' true positions are used to judge, never to learn.
-        truth: the whole map to judge on, too, where there is one.
+        train: links to learn from.
+        test: links to judge on.
+        scene: where both were measured; its devices' true positions are used to judge, never to
+            learn.
+        truth: the whole map to judge on, too; None: there is none.
         seed: of all fits.
-        models: of `fit_twin`.
+        models: names, as for `fit_twin`.
         twins: fitted already, judged beside the models, by the name that they get in the tables.
         maps: made already, judged on the truth map.
 
+    Returns:
+        errors of all of them
+
     Raises:
-        BadInput: nothing detected to judge on, a truth of another scene, or what `fit_twin` refuses.
+        BadInput: nothing detected to judge on, a truth of another scene, or what `fit_twin`
+            refuses.
     """
     _check(test, scene, truth, twins or {})
     for twin in (twins or {}).values():
-        twin.require_map(scene)  # complains before the others are fitted, which takes long
+        twin.require_map(scene)  # refuses before the others are fitted, which takes long
     fitted = {}
     with progress("comparing models", total=len(models)) as advance:
         for model in models:
@@ -119,39 +141,53 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene, truth:
     fitted |= twins or {}
     true_m = true_positions(scene, train)
     los = _los(scene, true_m, test)
-    predictions = test.table[["flight", "receiver", "device"]].assign(measured_db=test.level_db, los=los)
+    predictions = test.table[["flight", "receiver", "device"]].assign(measured_db=test.level_db,
+                                                                      los=los)
     scores, locations = [], []
     for model, twin in fitted.items():
         predictions[model] = predict(twin, scene, test)
-        scores += _scores(model, "held-out flights", "estimated", test.level_db, predictions[model].to_numpy(), los)
+        scores += _scores(model, "held-out flights", "estimated", test.level_db,
+                          predictions[model].to_numpy(), los)
         if truth is not None:
             scores += score_map(model, twin.radio_map(scene), truth)
         if all(device.device in true_m for device in twin.devices):
             ideal = _moved(twin, true_m)
-            scores += _scores(model, "held-out flights", "true", test.level_db, predict(ideal, scene, test), los)
+            scores += _scores(model, "held-out flights", "true", test.level_db,
+                              predict(ideal, scene, test), los)
             if truth is not None:
                 scores += score_map(model, ideal.radio_map(scene), truth, positions="true")
         locations += _location_rows(model, twin, true_m)
     for name, candidate in (maps or {}).items():
-        assert truth is not None  # only a truth judges a map
+        assert truth is not None  # a map can be judged on nothing else
         scores += score_map(name, candidate, truth)
     return Comparison(pd.DataFrame(scores), pd.DataFrame(locations), fitted, predictions)
 
 
-def _check(test: Measurements, scene: Scene, truth: RadioMap | None, twins: dict[str, Twin]) -> None:
+def _check(test: Measurements, scene: Scene, truth: RadioMap | None,
+           twins: dict[str, Twin]) -> None:
     if not np.isfinite(test.level_db).any():
-        raise BadInput(f"nothing was detected on the held-out flights ({', '.join(test.flights[:4])}), so no error can "
-                       "be computed; hold out other flights")
+        raise BadInput("nothing was detected on the held-out flights "
+                       f"({', '.join(test.flights[:4])}), so no error can be computed; hold out "
+                       "other flights")
     if truth is not None:
         scene.check_map(truth)
     for name, twin in twins.items():
         if twin.level != test.level_column:
-            raise BadInput(f"{name} predicts {twin.level}, the measurements hold {test.level_column}; "
-                           "they cannot be compared")
+            raise BadInput(f"{name} predicts {twin.level}, the measurements hold "
+                           f"{test.level_column}; they cannot be compared")
 
 
-def true_positions(scene: Scene, measurements: Measurements) -> dict[str, tuple[float, float, float]]:
-    """Device -> (x, y, z) [m]: anchors as the measurements declare them, others as the scene does where it does."""
+def true_positions(scene: Scene,
+                   measurements: Measurements) -> dict[str, tuple[float, float, float]]:
+    """Return the known positions of measured devices.
+
+    Args:
+        scene: which declares devices.
+        measurements: which declare anchors; for these they have precedence.
+
+    Returns:
+        device -> (x, y, z) [m], for devices of the measurements only.
+    """
     known = {d.device: (d.x_m, d.y_m, d.z_m) for d in scene.config.devices}
     known |= {row.device: (row.x_m, row.y_m, row.z_m) for row in measurements.devices.itertuples()
               if row.role == "anchor"}
@@ -159,18 +195,25 @@ def true_positions(scene: Scene, measurements: Measurements) -> dict[str, tuple[
 
 
 def predict(twin: Twin, scene: Scene, measurements: Measurements) -> np.ndarray:
-    """What a twin expects of measured links.
+    """Return the expected level of measured links, given that they are detected.
 
-    Only detected links can be held against a prediction, and near the limit only the strong ones were detected: the
-    mean of all would lie below the mean of those, most for the model with the widest scatter. So every model is
-    asked for the mean of what is detected (a truncated normal distribution).
+    Only detected links can be compared with a prediction, and near the limit only the strong ones
+    were detected: the mean of all would lie below the mean of those, most for the model with the
+    largest standard deviation. So every model predicts the mean of what is detected (a truncated
+    normal distribution).
+
+    Args:
+        twin: predicts.
+        scene: that the twin needs for its map.
+        measurements: n links.
 
     Returns:
         (n,) levels [dB]; NaN for devices that the twin does not know, or could not locate.
     """
     row_of = {device.device: row for row, device in enumerate(twin.devices)
               if np.isfinite([device.x_m, device.y_m]).all()}
-    row = np.array([row_of.get(name, -1) for name in measurements.devices["device"]])[measurements.device_index]
+    row_of_device = np.array([row_of.get(name, -1) for name in measurements.devices["device"]])
+    row = row_of_device[measurements.device_index]
     predicted_db = np.full(len(row), np.nan)
     if (row >= 0).any():
         links = twin.links(measurements.receiver_m[row >= 0], row[row >= 0], scene)
@@ -181,19 +224,25 @@ def predict(twin: Twin, scene: Scene, measurements: Measurements) -> np.ndarray:
 
 
 def _moved(twin: Twin, position_m: dict[str, tuple[float, float, float]]) -> Twin:
-    """The twin with its devices at other positions."""
-    devices = [replace(device, **dict[str, Any](zip(("x_m", "y_m", "z_m"), position_m[device.device])))
-               for device in twin.devices]
+    """Return the twin with its devices at other positions."""
+    devices = [
+        replace(device, **dict[str, Any](zip(("x_m", "y_m", "z_m"), position_m[device.device])))
+        for device in twin.devices]
     return replace(twin, devices=devices)
 
 
-def score_map(name: str, candidate: RadioMap, truth: RadioMap, positions: str = "estimated") -> list[dict]:
-    """Rows of scores for a radio map against the truth, on the devices and positions of both.
+def score_map(name: str, candidate: RadioMap, truth: RadioMap,
+              positions: str = "estimated") -> list[dict]:
+    """Score a radio map against the truth, on the devices and positions of both.
 
     Args:
-        name: in the rows.
-        candidate, truth: maps on one lattice.
+        name: of the map in the rows.
+        candidate: map to judge.
+        truth: map on the same lattice.
         positions: `estimated` or `true`, in the rows.
+
+    Returns:
+        rows of `Comparison.scores`
 
     Raises:
         BadInput: the maps have no device in common, or different lattices.
@@ -201,16 +250,22 @@ def score_map(name: str, candidate: RadioMap, truth: RadioMap, positions: str = 
     common = [device for device in truth.devices if device in candidate.devices]
     if not common or candidate.gain_db.shape[1:] != truth.gain_db.shape[1:] or \
             not np.allclose(candidate.lattice.positions_m, truth.lattice.positions_m):
-        raise BadInput(f"map {name} cannot be held against the truth: devices {candidate.devices} on a lattice of "
-                       f"{candidate.gain_db.shape[1:]} positions, the truth has {truth.devices} on "
-                       f"{truth.gain_db.shape[1:]}; make both for the same scene")
+        raise BadInput(
+            f"map {name} cannot be compared with the truth: devices {candidate.devices} on a "
+            f"lattice of {candidate.gain_db.shape[1:]} positions, the truth has {truth.devices} on "
+            f"{truth.gain_db.shape[1:]}; make both for the same scene")
     ours, theirs = ([m.devices.index(device) for device in common] for m in (candidate, truth))
     return _scores(name, "whole map", positions, truth.gain_db[theirs].astype(float).ravel(),
                    comparable_db(candidate, truth)[ours].ravel(), truth.los[theirs].ravel())
 
 
 def comparable_db(candidate: RadioMap, truth: RadioMap) -> np.ndarray:
-    """What a map says of the links that are detected: its mean given detection, where the truth is a map of values.
+    """Return a map's levels as they compare with the truth's detected links.
+
+    Args:
+        candidate: map; its mean given detection is taken where it has a standard deviation.
+        truth: map of single values, or with a standard deviation of its own: then the means are
+            compared as they are.
 
     Returns:
         (device, z, y, x) gain [dB]
@@ -223,24 +278,29 @@ def comparable_db(candidate: RadioMap, truth: RadioMap) -> np.ndarray:
 
 
 def _los(scene: Scene, true_m: dict, links: Measurements) -> np.ndarray:
-    """(n,) 1 with LoS, 0 without, NaN for links of devices whose true position nobody knows."""
-    device_m = np.array([true_m.get(name, (np.nan,) * 3) for name in links.devices["device"]])[links.device_index]
+    """Return (n,) 1 with LoS, 0 without, NaN where the true position is unknown."""
+    position_m = np.array([true_m.get(name, (np.nan,) * 3) for name in links.devices["device"]])
+    device_m = position_m[links.device_index]
     los = np.full(len(device_m), np.nan)
     known = np.isfinite(device_m).all(axis=1)
     los[known] = scene.city.line_of_sight(device_m[known], links.receiver_m[known])
     return los
 
 
-def _scores(model, against, positions, measured_db, predicted_db, los) -> list[dict]:
+def _scores(model: str, against: str, positions: str, measured_db: np.ndarray,
+            predicted_db: np.ndarray, los: np.ndarray) -> list[dict]:
+    """Return a row of errors for each class of links, from (n,) levels and lines of sight."""
     rows = []
     usable = np.isfinite(measured_db) & np.isfinite(predicted_db)
     for links, mask in zip(CLASSES, (usable, usable & (los == 1), usable & (los == 0))):
         error_db = predicted_db[mask] - measured_db[mask]
-        measures = {"rmse_db": np.sqrt(np.mean(error_db**2)), "mae_db": np.mean(np.abs(error_db)),
-                    "bias_db": np.mean(error_db)} if len(error_db) else \
-            {"rmse_db": np.nan, "mae_db": np.nan, "bias_db": np.nan}
+        rmse_db = mae_db = bias_db = np.nan
+        if len(error_db):
+            rmse_db, mae_db = np.sqrt(np.mean(error_db**2)), np.mean(np.abs(error_db))
+            bias_db = np.mean(error_db)
         rows.append({"model": model, "against": against, "positions": positions, "links": links,
-                     "n": int(mask.sum()), **{k: float(v) for k, v in measures.items()}})
+                     "n": int(mask.sum()), "rmse_db": float(rmse_db), "mae_db": float(mae_db),
+                     "bias_db": float(bias_db)})
     return rows
 
 
@@ -249,7 +309,8 @@ def _location_rows(model: str, twin: Twin, true_m: dict) -> list[dict]:
     for device in twin.devices:
         if device.role == "unknown":
             x_m, y_m, _ = true_m.get(device.device, (np.nan,) * 3)
-            rows.append({"model": model, "device": device.device, "x_m": device.x_m, "y_m": device.y_m,
-                         "error_m": float(np.hypot(device.x_m - x_m, device.y_m - y_m)),
-                         "credible_radius_m": device.credible_radius_m, "located": device.located})
+            rows.append({
+                "model": model, "device": device.device, "x_m": device.x_m, "y_m": device.y_m,
+                "error_m": float(np.hypot(device.x_m - x_m, device.y_m - y_m)),
+                "credible_radius_m": device.credible_radius_m, "located": device.located})
     return rows

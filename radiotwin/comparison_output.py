@@ -1,4 +1,4 @@
-"""Read the models that a comparison is asked for, and write its tables."""
+"""Read further models for a comparison, and write its tables."""
 
 import json
 import warnings
@@ -14,7 +14,7 @@ from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin
 
-SCHEMA = "radiotwin.comparison/1"
+SCHEMA = "radiotwin.comparison/1"  # of compare.json
 
 
 def judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],

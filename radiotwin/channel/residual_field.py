@@ -36,13 +36,13 @@ class _Field:
 
 
 class ResidualField:
-    """A Gaussian process of unit variance for each series, such as each device's receiver positions.
+    """A Gaussian process of unit variance for each series, such as the receivers of each device.
 
     Correlation a * exp(-r / length), the exponential model of shadowing (Gudmundson 1991,
-    Electronics Letters 27), b between measurements of one kind, such as those by one phone, wherever
-    they are, and a nugget 1 - a - b for noise and what changes between neighbouring points. The
-    parameters have the highest marginal likelihood on at most MAX_POINTS_TO_FIT points of each of at
-    most MAX_SERIES_TO_FIT series. Where points are too many, neighbours become their mean.
+    Electronics Letters 27), b between measurements of one kind, such as those by one phone,
+    wherever they are, and a nugget 1 - a - b for noise and what changes between neighbours. The
+    parameters have the highest marginal likelihood on at most MAX_POINTS_TO_FIT points of each of
+    at most MAX_SERIES_TO_FIT series. Where points are too many, neighbours become their mean.
 
     Attributes:
         share: a, the same for all series.

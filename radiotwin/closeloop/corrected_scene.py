@@ -1,5 +1,4 @@
-"""The declared scene with what the loop found put right: traced boxes stand in it, buildings that are gone do not, and
-anchors are where they were found."""
+"""The declared scene corrected by what the loop found: boxes, removed buildings, moved anchors."""
 
 import shutil
 import xml.etree.ElementTree as ElementTree
@@ -14,8 +13,8 @@ from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.position_errors import DevicePositionError
 from radiotwin.effects.removed_obstacle import RemovedObstacle, buildings
 from radiotwin.errors import BadInput
-from radiotwin.links import site_of
 from radiotwin.files import atomic_folder, require_writable
+from radiotwin.links import site_of
 from radiotwin.scene import Scene
 from radiotwin.scene.build import check_target
 from radiotwin.scene.citymap import CityMap
@@ -26,59 +25,71 @@ from radiotwin.scene.ply import read_ply, write_ply
 from radiotwin.scene.preview import draw_preview
 from radiotwin.scene.writer import CityShape, write_city
 
-BOX_MATERIAL = "concrete"  # what a building that nobody has seen is most likely made of
-CLEARANCE_M = 0.5  # between walls and what is known to stand outside them
-FARTHEST_M = 60.0  # that a device is moved out of a building
+BOX_MATERIAL = "concrete"  # the likeliest of a building of unknown material
+CLEARANCE_M = 0.5  # between walls and positions that are known to be outside [m]
+MAX_SHIFT_M = 60.0  # by which a device is moved out of a building [m]
 
 
 def check_corrected_target(folder: Path, scene: Scene | None, report_folder: Path) -> None:
-    """Raise BadInput, before the long work, where no corrected scene can be written to a folder."""
+    """Refuse, before the long work, a folder that no corrected scene can be written to.
+
+    Args:
+        folder: to write.
+        scene: declared scene; None: there is none.
+        report_folder: where the loop's report goes.
+
+    Raises:
+        BadInput: there is no scene, or the folder cannot be replaced.
+    """
     if scene is None:
-        raise BadInput("--write-scene corrects a declared scene, and none was given; give it with --scene, or leave "
-                       "--write-scene out")
-    for other, what in ((scene.folder, "the declared scene"), (report_folder, "the report (--out)")):
+        raise BadInput("--write-scene corrects a declared scene, and none was given; give it with "
+                       "--scene, or leave --write-scene out")
+    for other, what in ((scene.folder, "the declared scene"),
+                        (report_folder, "the report (--out)")):
         if other.resolve().is_relative_to(folder.resolve()):
-            raise BadInput(f"--write-scene {folder}: {what} is in {other}, which the corrected scene would replace; "
-                           "choose another folder")
+            raise BadInput(f"--write-scene {folder}: {what} is in {other}, which the corrected "
+                           "scene would replace; choose another folder")
     check_target(folder)
     require_writable(folder / "scene.toml")
 
 
 def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
-    """Write a copy of the scene with the traced boxes added, the buildings that are gone taken out, and the anchors
-    that stand elsewhere moved; everything else as it is.
+    """Write a copy of the scene with boxes added, buildings removed and anchors moved.
 
     Args:
-        loop: what was found.
-        scene: that it was found in.
+        loop: whose accepted effects are the corrections.
+        scene: declared scene that the loop was run with.
         folder: to write; a scene that is already in it is replaced.
 
     Returns:
-        what was changed, a sentence each; where that is nothing, nothing is written
+        corrections, a sentence each; where there are none, nothing is written.
 
     Raises:
-        BadInput: the folder cannot be written or holds something else, or what was found makes no scene.
+        BadInput: the folder cannot be written or holds something else, or the result is no scene.
     """
     effects = loop.after.whole.effects
     label, centres_m = buildings(scene.city)
     gone = [each.params.building for each in effects if isinstance(each.effect, RemovedObstacle)]
     keep = ~np.isin(label, gone)
-    config, moves = _moved(loop, scene, CityMap(scene.city.vertices, scene.city.faces[keep]) if keep.any() else None)
+    city = CityMap(scene.city.vertices, scene.city.faces[keep]) if keep.any() else None
+    config, moves = _moved(loop, scene, city)
     free_m = np.array([*((d.x_m, d.y_m, d.z_m) for d in config.devices),
                        *((x_m, y_m, uav.altitude_m) for uav in config.uavs
-                         for x_m, y_m in ((uav.start_x_m, uav.start_y_m), (uav.terminal_x_m, uav.terminal_y_m)))])
+                         for x_m, y_m in ((uav.start_x_m, uav.start_y_m),
+                                          (uav.terminal_x_m, uav.terminal_y_m)))])
     boxes = [_pulled_back(Box(*each.params.box), free_m.reshape(-1, 3)) for each in effects
              if isinstance(each.effect, MissingObstacle)]
-    changes = [f"a box of {box.length_m:.0f} x {box.width_m:.0f} m, {box.height_m:.0f} m high, stands at "
-               f"({box.x_m:.0f}, {box.y_m:.0f}) m" for box in boxes]
-    changes += ["the building at ({:.0f}, {:.0f}) m, {:.0f} m high, is taken out".format(*centres_m[building])
-                for building in gone]
+    changes = [f"a box of {box.length_m:.0f} x {box.width_m:.0f} m, {box.height_m:.0f} m high, "
+               f"stands at ({box.x_m:.0f}, {box.y_m:.0f}) m" for box in boxes]
+    changes += ["the building at ({:.0f}, {:.0f}) m, {:.0f} m high, is taken out".format(
+        *centres_m[building]) for building in gone]
     changes += moves
     if not changes:
         return []
     check_target(folder)
     earlier = config.provenance.get("corrected")
-    provenance = config.provenance | {"corrected": "; ".join(([earlier] if earlier else []) + changes)}
+    corrected = "; ".join(([earlier] if earlier else []) + changes)
+    provenance = config.provenance | {"corrected": corrected}
     with atomic_folder(folder) as temporary:
         _write_city(scene, temporary, keep, boxes)
         scene.copy_antennas(temporary)
@@ -88,7 +99,7 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
 
 
 def _moved(loop: Loop, scene: Scene, city: CityMap | None) -> tuple[SceneConfig, list[str]]:
-    """The configuration with anchors where they were found, as near as `city` leaves room, and what was moved."""
+    """Return the configuration with anchors moved to the nearest free position, and the changes."""
     links = loop.after.whole.links
     found_m: dict[str, np.ndarray] = {}
     for each in loop.after.whole.effects:
@@ -99,22 +110,23 @@ def _moved(loop: Loop, scene: Scene, city: CityMap | None) -> tuple[SceneConfig,
     devices, changes = [], []
     for device in scene.config.devices:
         if device.device in found_m:
-            x_m, y_m = _free_place(found_m[device.device], device.z_m, scene, city)
-            changes.append(f"{device.device} is moved from ({device.x_m:.0f}, {device.y_m:.0f}) to ({x_m:.0f}, "
-                           f"{y_m:.0f}) m")
+            x_m, y_m = _free_position(found_m[device.device], device.z_m, scene, city)
+            changes.append(f"{device.device} is moved from ({device.x_m:.0f}, {device.y_m:.0f}) to "
+                           f"({x_m:.0f}, {y_m:.0f}) m")
             device = device.model_copy(update={"x_m": x_m, "y_m": y_m})
         devices.append(device)
     return scene.config.model_copy(update={"devices": devices}), changes
 
 
-def _free_place(place_m: np.ndarray, z_m: float, scene: Scene, city: CityMap | None) -> tuple[float, float]:
-    """The place next to one (2,) that is within the extent and outside buildings [m]."""
+def _free_position(position_m: np.ndarray, z_m: float, scene: Scene,
+                   city: CityMap | None) -> tuple[float, float]:
+    """Return the position nearest to one (2,) [m], within the extent and outside buildings."""
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     low_m, high_m = (x_min, y_min), (x_max, y_max)
-    radius_m, angle = (axis.ravel() for axis in np.meshgrid(np.arange(0, FARTHEST_M), np.radians(np.arange(0, 360, 10)),
-                                                            indexing="ij"))
+    radius_m, angle = (axis.ravel() for axis in np.meshgrid(
+        np.arange(0, MAX_SHIFT_M), np.radians(np.arange(0, 360, 10)), indexing="ij"))
     around_m = radius_m[:, None] * np.column_stack([np.sin(angle), np.cos(angle)])
-    tried_m = np.round(np.clip(np.clip(place_m, low_m, high_m) + around_m, low_m, high_m), 2)
+    tried_m = np.round(np.clip(np.clip(position_m, low_m, high_m) + around_m, low_m, high_m), 2)
     free = np.ones(len(tried_m), dtype=bool)
     if city is not None:
         for aside_m in CLEARANCE_M * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]):
@@ -124,7 +136,7 @@ def _free_place(place_m: np.ndarray, z_m: float, scene: Scene, city: CityMap | N
 
 
 def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
-    """The box without points (n, 3) that are known to be free: of each, it gives way on the side that costs least."""
+    """Shrink a box until no point (n, 3) [m] is inside, for each on the side that costs least."""
     turn = np.radians(box.turn_deg)
     axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
     high = np.array([0.5 * box.length_m, 0.5 * box.width_m, box.height_m])
@@ -144,9 +156,10 @@ def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
 
 
 def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box]) -> None:
-    """Write `city.xml` and `meshes/`: the faces (f,) of the scene's map that are kept, its materials, and boxes."""
+    """Write `city.xml` and `meshes/`: kept faces (f,) of the scene's map, materials, and boxes."""
     root = ElementTree.parse(scene.xml_path).getroot()
-    taken = {element.get("id", "").lower().removeprefix("mesh-").removeprefix("mat-") for element in root}
+    taken = {element.get("id", "").lower().removeprefix("mesh-").removeprefix("mat-")
+             for element in root}
     write_city(folder, _box_shapes(scene, boxes, taken))
     added = ElementTree.parse(folder / "city.xml").getroot()
     at = 0
@@ -174,9 +187,9 @@ def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box]) 
 
 
 def _box_shapes(scene: Scene, boxes: list[Box], taken: set[str]) -> list[CityShape]:
-    """Boxes from the lowest point of the map up; names that are not yet `taken`."""
-    material = traceable(itu_material(BOX_MATERIAL, name=unique_name(f"found_{BOX_MATERIAL}", taken)),
-                         scene.config.radio.frequency_hz)
+    """Return shapes from the lowest point of the map up, with names that are not `taken`."""
+    name = unique_name(f"found_{BOX_MATERIAL}", taken)
+    material = traceable(itu_material(BOX_MATERIAL, name=name), scene.config.radio.frequency_hz)
     bottom_m = min(float(scene.city.vertices[:, 2].min()), 0.0)
     shapes = []
     for box in boxes:

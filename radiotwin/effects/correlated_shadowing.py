@@ -1,4 +1,4 @@
-"""`correlated_shadowing`, the last resort: what no named effect explains, interpolated over the ground.
+"""`correlated_shadowing`, the last resort: an interpolation of what no named effect explains.
 
 A Gaussian process over the position of the end that moves, one field for each of the ends that do
 not (the exponential model of shadowing, Gudmundson 1991, Electronics Letters 27), and beside it an

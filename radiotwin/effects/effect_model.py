@@ -1,4 +1,4 @@
-"""A channel with refitted levels and fitted effects, for any links: what `close-loop` made a twin."""
+"""A channel with refitted levels and fitted effects, for any links: the result of `close-loop`."""
 
 from __future__ import annotations
 
@@ -55,7 +55,8 @@ class EffectModel:
         """Return what was learnt from the training links of a model.
 
         Args:
-            model, result: fitted.
+            model: channel and effects on the training links.
+            result: fit of the model.
             causes_only: whether to leave out what only describes the residual (`Effect.is_cause`).
         """
         effects = tuple(each for each in model.fitted_effects(result)

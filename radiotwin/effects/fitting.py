@@ -147,7 +147,8 @@ def _refine_members(model: FoldModel, result: FitResult, last: AppliedEffect,
         latest = None
         links = model.links.select(rows)
         others = [replace(each, term=each.term.select(rows)) for each in model.effects[:-1]]
-        alone = replace(model.with_effects([]).regression(rows), law_columns=np.ones((len(rows), 1)),
+        alone = replace(model.with_effects([]).regression(rows),
+                        law_columns=np.ones((len(rows), 1)),
                         prior_sd_db=np.full(1, ANY_LEVEL_SD_DB))
 
         def objective(values: np.ndarray, member: np.ndarray = member, rows: np.ndarray = rows,

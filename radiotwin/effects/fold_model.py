@@ -58,7 +58,7 @@ class FoldModel:
         usable: (n,) bool, links to devices that have a position.
         channel: fitted to the training links.
         channel_db: (n,) its mean level [dB].
-        level_columns: (n, p0) what of the channel is fitted again, see `ChannelModel.level_columns`.
+        level_columns: (n, p0) what is fitted again of the channel: `ChannelModel.level_columns`.
         level_prior_sd_db: (p0,) prior standard deviations of it.
         group: (n,) index of the error scale.
         dof: degrees of freedom of the errors.

@@ -1,4 +1,4 @@
-"""Parameters of an effect: typed, with units and bounds, as they are searched for and as reported."""
+"""Parameters of an effect: typed, with units and bounds, for the search and for the report."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,7 +27,8 @@ def quantity(default: Any, *, unit: str, low: float, high: float, step: float,
     Args:
         default: where the search begins.
         unit: such as `dB`, `m` or `s`.
-        low, high: bounds.
+        low: least value.
+        high: greatest value.
         step: typical uncertainty; the size of the search's first steps.
         prior_sd: standard deviation of a normal prior around the default; None: flat.
         description: one line, for the report.
@@ -101,8 +102,8 @@ class Variation:
         steps: (r,) typical uncertainty of each.
         low, high: (r,) bounds.
         params: numbers (r,) -> parameters.
-        members: indices of numbers that belong together and act on links of their own, such as those
-            of one device; each group is refined by itself. None: all numbers act on the same links.
+        members: indices of numbers that belong together and act on links of their own, such as
+            those of one device; each group is refined by itself. None: all act on the same links.
     """
 
     values: np.ndarray

@@ -50,8 +50,9 @@ def register(effect: type[Effect]) -> type[Effect]:
         taken = {(each.name, each.variant): each for each in (*BUILT_IN, *_registered)}
         if (effect.name, effect.variant) in taken:
             other = taken[effect.name, effect.variant]
-            raise BadInput(f"the effect {effect.name!r} ({effect.variant!r}) of {effect.__module__} "
-                           f"is in {other.__module__} already; give it another name or variant")
+            raise BadInput(
+                f"the effect {effect.name!r} ({effect.variant!r}) of {effect.__module__} is in "
+                f"{other.__module__} already; give it another name or variant")
         _registered.append(effect)
     return effect
 

@@ -24,8 +24,8 @@ class ResidualView:
 
     Attributes:
         links: n links.
-        residual_db: (n,) measured minus predicted [dB]; of blanks, how far below the prediction they
-            lie at least.
+        residual_db: (n,) measured minus predicted [dB]; of blanks, how far below the prediction
+            they lie at least.
         scale_db: (n,) scale of the errors [dB].
         mean_db: (n,) predicted level [dB].
         level_at: the channel's levels of other links, such as with devices elsewhere.

@@ -1,4 +1,4 @@
-"""What goes into localisation beside the data, and what comes out."""
+"""Settings of a localisation, and its result."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ from radiotwin.localize.likelihood import CHUNK_LINKS
 
 @dataclass(frozen=True)
 class LocalizeSettings:
-    """How the search is done.
+    """Extent of the search.
 
-    scan_step_m: cell of the first scan over the map [m]; scan_links: links that it may look at, beyond which its
-    cells grow; swarms: of each device; particles: of each swarm; iterations: of every swarm; allow_indoor:
-    whether a device may be inside a building; chunk_links: links in memory at once (about 100 bytes each).
+    Attributes:
+        scan_step_m: width of a cell of the first scan over the map [m].
+        scan_links: links that the scan may evaluate, beyond which its cells grow.
+        swarms: number for each device.
+        particles: of each swarm.
+        iterations: of every swarm.
+        allow_indoor: whether a device may be inside a building.
+        chunk_links: links in memory at once (about 100 bytes each).
     """
 
     scan_step_m: float = 5.0
@@ -49,21 +54,29 @@ class TwinDevice:
     second_mode: tuple[float, float, float] | None
 
     @classmethod
-    def anchor(cls, device: str, x_m: float, y_m: float, z_m: float) -> "TwinDevice":
+    def anchor(cls, device: str, x_m: float, y_m: float, z_m: float) -> TwinDevice:
         """Return a device of declared position [m]."""
         return cls(device, float(x_m), float(y_m), float(z_m), "anchor", True, 0.0, None)
 
 
 @dataclass(frozen=True)
 class DeviceEstimate:
-    """Where a device is.
+    """Estimated position of a device.
 
-    x_m, y_m: mean over the heaviest mode of the posterior; z_m: as given. credible_radius_m: radius about it that holds
-    90 % of the posterior, second modes included. second_mode: (x_m, y_m, weight) of another mode at least 20 m
-    away with at least 5 % of the posterior, or None. n_detected of n_links measurements were detected.
-    design_effect: how many links count as one (1 = independent). located: False where the data do not say where
-    the device is: it was never detected, or 90 % of the posterior cover half the map or more. Position and radius
-    are then the best that the links which were *not* detected on_progress, or NaN and infinity without any.
+    Attributes:
+        device: its index.
+        x_m, y_m: mean over the heaviest mode of the posterior [m].
+        z_m: height, as given [m].
+        credible_radius_m: radius about the position that holds 90 % of the posterior, second modes
+            included [m].
+        second_mode: (x_m, y_m, weight) of another mode at least 20 m away with at least 5 % of the
+            posterior; None: there is none.
+        n_detected: measurements that were detected.
+        n_links: all measurements.
+        design_effect: number of links that count as one; 1: independent.
+        located: False where the data do not determine the position: the device was never detected,
+            or 90 % of the posterior cover half the map or more. Position and radius are then the
+            best estimate from the links that were not detected, or NaN and infinity without any.
     """
 
     device: int

@@ -1,4 +1,4 @@
-"""Means and deviations of very many links: looked up in a table where the channel allows it, predicted where not."""
+"""Predictions of very many links: looked up in a table where the channel allows it."""
 
 from __future__ import annotations
 
@@ -6,60 +6,77 @@ from typing import Protocol
 
 import numpy as np
 
-from radiotwin.links.geometry import LinkGeometry
+from radiotwin.links import LinkGeometry
 
-MAX_LEVELS = 256
-NODES = 1024
-NEAR_M = 5.0  # softens the logarithmic axis below this horizontal distance
-PROBES = 40  # positions, each to as many receivers
-MEAN_TOLERANCE_DB = 0.05
-SIGMA_TOLERANCE = 0.02
-MIN_SIGMA_DB = 0.1
-PREDICT_CHUNK = 200_000
+MAX_LEVELS = 256  # differences in height that a table distinguishes
+NODES = 1024  # of each row of a table, over the horizontal distance
+NEAR_M = 5.0  # softens the logarithmic axis below this horizontal distance [m]
+PROBES = 40  # positions at which a table is checked, each to as many receivers
+MEAN_TOLERANCE_DB = 0.05  # of a table's mean: an order below the sd of any channel
+SD_TOLERANCE = 0.02  # of its standard deviation, relative
+MIN_SD_DB = 0.1  # of a channel: the likelihood divides by it
+PREDICT_CHUNK = 200_000  # links that are predicted at a time: bounds memory
 
 
 class Channel(Protocol):
     """Any channel: a fitted `radiotwin.channel.ChannelModel`, or a fixed one."""
 
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        """Mean [dB] and standard deviation [dB] of n links, (n,) each."""
+        """Return mean [dB] and standard deviation [dB] of n links, (n,) each."""
         ...
 
 
 class LinkTable:
-    """Channel of links from devices at one height, as a function of horizontal distance and line of sight.
+    """Predictions for devices at one height by horizontal distance, height difference and LoS.
 
-    For each difference in height between receiver and device (to `MAX_LEVELS` of them) and each of NLoS, LoS
-    there is a row over the horizontal distance rho, with NODES nodes evenly spaced in log(rho^2 + NEAR_M^2), in
-    which a log-distance law is close to straight; values between nodes are interpolated linearly.
+    For each difference in height between receiver and device (up to `MAX_LEVELS`) and each of NLoS,
+    LoS there is a row over the horizontal distance rho, with NODES nodes evenly spaced in
+    log(rho^2 + NEAR_M^2), in which a log-distance law is close to straight; values between nodes
+    are interpolated linearly.
     """
 
     by_device = False
 
-    def __init__(self, channel: Channel, receiver_m: np.ndarray, z_m: float, reach_m: float):
-        """receiver_m: (r, 3) [m]; z_m: the devices' height [m]; reach_m: the largest horizontal distance [m]."""
+    def __init__(self, channel: Channel, receiver_m: np.ndarray, z_m: float,
+                 reach_m: float) -> None:
+        """Tabulate a channel.
+
+        Args:
+            channel: to tabulate.
+            receiver_m: (r, 3) positions of all receivers [m].
+            z_m: height of the devices [m].
+            reach_m: largest horizontal distance [m].
+        """
         rise, step = receiver_m[:, 2] - z_m, 0.01
         while len(levels := np.unique(np.round(rise / step))) > MAX_LEVELS:
             step *= 2.0
         self._x, self._y = receiver_m[:, 0].astype(np.float32), receiver_m[:, 1].astype(np.float32)
-        self._first_node = (np.searchsorted(levels, np.round(rise / step)) * 2 * NODES).astype(np.int32)
+        level_index = np.searchsorted(levels, np.round(rise / step))
+        self._first_node = (level_index * 2 * NODES).astype(np.int32)
         low, high = np.log(NEAR_M**2), np.log(reach_m**2 + NEAR_M**2)
         axis = np.linspace(low, high, NODES)
         self._low, self._per_node = np.float32(low), np.float32((NODES - 1) / (high - low))
         rho = np.sqrt(np.maximum(np.exp(axis) - NEAR_M**2, 0.0))
-        level, los, rho = (a.ravel() for a in np.meshgrid(levels * step, [False, True], rho, indexing="ij"))
+        level, los, rho = (axis.ravel() for axis in np.meshgrid(levels * step, [False, True], rho,
+                                                                indexing="ij"))
         ends = np.column_stack([rho, np.zeros_like(rho), level + z_m])
         device_m = np.broadcast_to([0.0, 0.0, z_m], ends.shape)
         links = LinkGeometry(device_m, ends, los, np.zeros(len(ends), np.int64))
-        mean, sigma = predict_in_chunks(channel, links)
-        self._mean, self._sigma = mean.astype(np.float32), sigma.astype(np.float32)
+        mean_db, sd_db = predict_in_chunks(channel, links)
+        self._mean_db, self._sd_db = mean_db.astype(np.float32), sd_db.astype(np.float32)
 
-    def look_up(
-        self, xy_m: np.ndarray, rows: np.ndarray, los: np.ndarray, device: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and standard deviation [dB], (p, c) float32, between p device positions and c receivers.
+    def look_up(self, xy_m: np.ndarray, rows: np.ndarray, los: np.ndarray,
+                device: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the prediction of links between p device positions and c receivers.
 
-        xy_m: (p, 2) [m]; rows: (c,) of receiver_m; los: (p, c) bool; device: not looked at.
+        Args:
+            xy_m: (p, 2) positions of the device [m].
+            rows: (c,) receivers, as rows of `receiver_m`.
+            los: (p, c) bool, line of sight.
+            device: index of the device; not used, a table holds for all devices.
+
+        Returns:
+            (p, c) float32 mean [dB], and (p, c) float32 standard deviation [dB].
         """
         xy_m = xy_m.astype(np.float32)
         at = (xy_m[:, :1] - self._x[rows]) ** 2
@@ -73,26 +90,31 @@ class LinkTable:
         node += self._first_node[rows]
         node += los * np.int32(NODES)
         after = node + 1
-        mean, sigma = self._mean.take(node), self._sigma.take(node)
-        mean += at * (self._mean.take(after) - mean)
-        sigma += at * (self._sigma.take(after) - sigma)
-        return mean, sigma
+        mean_db, sd_db = self._mean_db.take(node), self._sd_db.take(node)
+        mean_db += at * (self._mean_db.take(after) - mean_db)
+        sd_db += at * (self._sd_db.take(after) - sd_db)
+        return mean_db, sd_db
 
 
 class DirectChannel:
-    """The same for a channel that depends on more, such as the place, the azimuth, or which device it is."""
+    """Predictions of a channel that depends on more, such as position, azimuth, or the device.
 
-    def __init__(self, channel: Channel, receiver_m: np.ndarray, z_m: float, by_device: bool):
+    Attributes:
+        by_device: whether predictions differ between devices at one position.
+    """
+
+    def __init__(self, channel: Channel, receiver_m: np.ndarray, z_m: float,
+                 by_device: bool) -> None:
         self._channel, self._receiver_m, self._z_m = channel, receiver_m, z_m
         self.by_device = by_device
 
-    def look_up(
-        self, xy_m: np.ndarray, rows: np.ndarray, los: np.ndarray, device: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """As `LinkTable.look_up`; device: the index that `predict` is told."""
+    def look_up(self, xy_m: np.ndarray, rows: np.ndarray, los: np.ndarray,
+                device: int) -> tuple[np.ndarray, np.ndarray]:
+        """Predict as `LinkTable.look_up` does; `device` is passed on to the channel."""
         links = link_grid(xy_m, self._z_m, self._receiver_m[rows], los, device)
-        mean, sigma = predict_in_chunks(self._channel, links)
-        return mean.reshape(los.shape).astype(np.float32), sigma.reshape(los.shape).astype(np.float32)
+        mean_db, sd_db = predict_in_chunks(self._channel, links)
+        return (mean_db.reshape(los.shape).astype(np.float32),
+                sd_db.reshape(los.shape).astype(np.float32))
 
 
 def tabulate(
@@ -103,10 +125,19 @@ def tabulate(
     devices: np.ndarray,
     rng: np.random.Generator,
 ) -> LinkTable | DirectChannel:
-    """A table if it repeats the channel's own predictions at random links of this very problem, else not.
+    """Return a table if it repeats the channel's predictions at random links of this problem.
 
-    bounds: (x_min, x_max, y_min, y_max) of the devices [m]; devices: (k,) the indices of those at height z_m.
-    The predictions must agree to MEAN_TOLERANCE_DB, an order below the deviation of any channel, in all of them.
+    Args:
+        channel: to tabulate.
+        receiver_m: (r, 3) positions of all receivers [m].
+        z_m: height of the devices [m].
+        bounds: x_min, x_max, y_min, y_max of the devices [m].
+        devices: (k,) indices of the devices at that height.
+        rng: random state.
+
+    Returns:
+        a table where all predictions agree to MEAN_TOLERANCE_DB and SD_TOLERANCE, the channel
+        itself where not.
     """
     x_min, x_max, y_min, y_max = bounds
     corners = np.array([[x, y] for x in (x_min, x_max) for y in (y_min, y_max)])
@@ -117,29 +148,41 @@ def tabulate(
         rows = rng.integers(len(receiver_m), size=PROBES)
         los = rng.random((PROBES, PROBES)) < 0.5
         links = link_grid(xy_m, z_m, receiver_m[rows], los, device)
-        mean, sigma = (each.reshape(los.shape) for each in predict_in_chunks(channel, links))
-        table_mean, table_sigma = table.look_up(xy_m, rows, los, device)
-        exact &= bool((np.abs(table_mean - mean) < MEAN_TOLERANCE_DB).all())
-        exact &= bool((np.abs(table_sigma - sigma) <= SIGMA_TOLERANCE * sigma).all())
-        as_first = predict_in_chunks(channel, link_grid(xy_m, z_m, receiver_m[rows], los, devices[0]))
-        by_device |= not all(np.allclose(a.ravel(), b) for a, b in zip((mean, sigma), as_first, strict=True))
+        mean_db, sd_db = (each.reshape(los.shape) for each in predict_in_chunks(channel, links))
+        table_mean_db, table_sd_db = table.look_up(xy_m, rows, los, device)
+        exact &= bool((np.abs(table_mean_db - mean_db) < MEAN_TOLERANCE_DB).all())
+        exact &= bool((np.abs(table_sd_db - sd_db) <= SD_TOLERANCE * sd_db).all())
+        as_first = predict_in_chunks(
+            channel, link_grid(xy_m, z_m, receiver_m[rows], los, devices[0]))
+        by_device |= not all(np.allclose(own.ravel(), first)
+                             for own, first in zip((mean_db, sd_db), as_first, strict=True))
     return table if exact else DirectChannel(channel, receiver_m, z_m, by_device)
 
 
-def link_grid(xy_m: np.ndarray, z_m: float, receiver_m: np.ndarray, los: np.ndarray, device: int) -> LinkGeometry:
-    """LinkGeometry from every one of p device positions (p, 2) to every one of c receivers (c, 3), p slowest."""
+def link_grid(xy_m: np.ndarray, z_m: float, receiver_m: np.ndarray, los: np.ndarray,
+              device: int) -> LinkGeometry:
+    """Return links from every position of a device to every receiver, positions slowest.
+
+    Args:
+        xy_m: (p, 2) positions of the device [m].
+        z_m: its height [m].
+        receiver_m: (c, 3) positions of the receivers [m].
+        los: (p, c) bool, line of sight.
+        device: index of the device.
+
+    Returns:
+        p * c links
+    """
     p, c = los.shape
     device_m = np.repeat(np.column_stack([xy_m, np.full(p, z_m)]), c, axis=0)
     return LinkGeometry(device_m, np.tile(receiver_m, (p, 1)), los.ravel(), np.full(p * c, device))
 
 
 def predict_in_chunks(channel: Channel, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-    """`channel.predict` with bounded memory; sigma at least MIN_SIGMA_DB, since the likelihood divides by it."""
+    """Return `channel.predict` with bounded memory, and at least MIN_SD_DB as deviation."""
     if not len(links):
         return np.zeros(0), np.zeros(0)
-    parts = [
-        channel.predict(links.select(slice(start, start + PREDICT_CHUNK)))
-        for start in range(0, len(links), PREDICT_CHUNK)
-    ]
-    mean, sigma = (np.concatenate(each) for each in zip(*parts, strict=True))
-    return mean, np.maximum(sigma, MIN_SIGMA_DB)
+    parts = [channel.predict(links.select(slice(start, start + PREDICT_CHUNK)))
+             for start in range(0, len(links), PREDICT_CHUNK)]
+    mean_db, sd_db = (np.concatenate(each) for each in zip(*parts, strict=True))
+    return mean_db, np.maximum(sd_db, MIN_SD_DB)

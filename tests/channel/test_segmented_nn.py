@@ -21,7 +21,7 @@ def rmse(model, data, mask):
 def test_held_out_error_is_within_8_percent_of_the_noise(world, laws, seed):
     """Rationale: on the published law nothing is left to learn, so whatever lies above the noise is overfitting.
 
-    Linearisation behaviour: 900 links of 3 anchors (as many as five flights give), 20,000 held-out links to three other
+    Expected behaviour: 900 links of 3 anchors (as many as five flights give), 20,000 held-out links to three other
     devices, so that the figure itself is uncertain by 1 % only; in every seed, LoS and NLoS.
     """
     others_m = np.array([[20.0, 200, 1.5], [460.0, 200, 1.5], [320.0, 760, 1.5]])

@@ -22,26 +22,26 @@ BOX = [130.0, 45.0, 24.0, 14.0, 70.0, 30.0]  # on a street of the small scene
 
 
 def loop_of(scene, *found):
-    """What `write_corrected_scene` looks at of a loop that found these: (effect, params)."""
+    """Return what `write_corrected_scene` reads of a loop that found these: (effect, its parameters by name)."""
     links = SimpleNamespace(device_names=[d.device for d in scene.config.devices], device_m=scene.device_m)
-    parts = [SimpleNamespace(effect=effect(), params=params) for effect, params in found]
-    return SimpleNamespace(after=SimpleNamespace(whole=SimpleNamespace(parts=parts, links=links)))
+    effects = [SimpleNamespace(effect=effect(), params=effect.Params(**params)) for effect, params in found]
+    return SimpleNamespace(after=SimpleNamespace(whole=SimpleNamespace(effects=effects, links=links)))
 
 
 def ends(x_m, y_m, turn_deg, reach_m, z_m):
-    """Two points on both sides of a place, along a direction."""
+    """Return two points on both sides of a position, along a direction."""
     turn = np.radians(turn_deg)
     step = reach_m * np.array([np.cos(turn), np.sin(turn)])
     return (np.array([[x_m + sign * step[0], y_m + sign * step[1], z_m]]) for sign in (-1, 1))
 
 
 def tallest(scene):
-    """Index, x, y [m] and height [m] of the highest building."""
+    """Return index, x, y [m] and height [m] of the highest building."""
     centres_m = buildings(scene.city)[1]
     return int(centres_m[:, 2].argmax()), *centres_m[centres_m[:, 2].argmax()]
 
 
-def test_a_traced_box_stands_in_the_way_as_long_wide_and_turned_as_it_was_found(small_scene, tmp_path):
+def test_a_traced_box_is_in_the_way_as_long_wide_and_turned_as_it_was_found(small_scene, tmp_path):
     loop = loop_of(small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0}))
     changes = write_corrected_scene(loop, small_scene, tmp_path / "new")
     assert changes == ["a box of 24 x 14 m, 70 m high, stands at (130, 45) m"]
@@ -79,16 +79,16 @@ def test_one_building_of_a_mesh_that_holds_several(small_scene, tmp_path):
     write_city(tmp_path / "one", [CityShape("all", mesh, itu_material("concrete"))])
     scene = Scene.load(tmp_path / "one")
     building, x_m, y_m, height_m = tallest(scene)
-    write_corrected_scene(loop_of(scene, (RemovedObstacle, {"building": building})), scene, tmp_path / "new")
+    write_corrected_scene(loop_of(scene, (RemovedObstacle, {"building": building, "centre_m": (x_m, y_m, height_m)})), scene, tmp_path / "new")
     new = buildings(Scene.load(tmp_path / "new").city)[1]
     old = np.delete(buildings(scene.city)[1], building, axis=0)
     assert np.sort(new, axis=0) == pytest.approx(np.sort(old, axis=0))
 
 
-def test_an_anchor_stands_where_it_was_found(small_scene, tmp_path):
+def test_an_anchor_is_where_it_was_found(small_scene, tmp_path):
     loop = loop_of(small_scene, (DevicePositionError, {"device": 0, "move_m": [0.0, 20.0]}),
                    (DevicePositionError, {"device": 0, "move_m": [5.0, 0.0]}),
-                   (ReceiverDrift, {"receiver": 0}))
+                   (ReceiverDrift, {"receivers": {0: ("step", 150.0)}}))
     assert write_corrected_scene(loop, small_scene, tmp_path / "new") == ["d0 is moved from (80, 40) to (85, 60) m"]
     new = Scene.load(tmp_path / "new")
     assert new.device_m[0] == pytest.approx(small_scene.device_m[0] + (5, 20, 0))
@@ -96,7 +96,7 @@ def test_an_anchor_stands_where_it_was_found(small_scene, tmp_path):
     assert new.xml_path.read_bytes() == small_scene.xml_path.read_bytes()
 
 
-def test_what_cannot_be_gives_way_to_what_is_known(small_scene, tmp_path):
+def test_positions_that_cannot_be_are_moved_to_the_nearest_that_can(small_scene, tmp_path):
     """An anchor found within a building or off the map, and a box over a device: each as near as it can be."""
     building, x_m, y_m, _ = tallest(small_scene)
     box = [*small_scene.device_m[1, :2] + (8.0, 0.0), 30.0, 20.0, 40.0, 0.0]
@@ -123,7 +123,7 @@ def test_what_was_corrected_can_be_corrected_again(small_scene, tmp_path):
 
 
 def test_where_nothing_is_to_be_corrected_nothing_is_written(small_scene, tmp_path):
-    loop = loop_of(small_scene, (ReceiverDrift, {"receiver": 0}))
+    loop = loop_of(small_scene, (ReceiverDrift, {"receivers": {0: ("step", 150.0)}}))
     assert write_corrected_scene(loop, small_scene, tmp_path / "new") == []
     assert not (tmp_path / "new").exists()
 
@@ -148,12 +148,12 @@ def test_folders_that_cannot_be_written_are_refused_before_the_work(small_scene,
 def test_sionna_rt_traces_it(small_scene, tmp_path):
     """Rationale: the map that Sionna RT loads is `city.xml`, not ours.
 
-    Linearisation: a link dropout_probability more than 6 dB where the box is put in its way, and gains more than 6 dB where the building
-    that blocked it is taken out.
+    Expected behaviour: a link loses more than 6 dB where the box is put in its way, and gains more than 6 dB where the
+    building that blocked it is taken out.
     """
     building, x_m, y_m, height_m = tallest(small_scene)
     loop = loop_of(small_scene, (MissingObstacle, {"box": BOX, "scattered_db": 0.0}),
-                   (RemovedObstacle, {"building": building}))
+                   (RemovedObstacle, {"building": building, "centre_m": (x_m, y_m, height_m)}))
     write_corrected_scene(loop, small_scene, tmp_path / "new")
     new = Scene.load(tmp_path / "new")
     links = [*zip(*ends(*BOX[:2], 30.0, 40.0, 60.0)), *zip(*ends(x_m, y_m, 0.0, 60.0, 0.5 * height_m))]

@@ -1,11 +1,11 @@
-"""The loop with a 3D map: buildings that the map has too many or too few of, in worlds made of two plain laws."""
+"""The loop with a 3D map that has a building too many or too few, in worlds made of two plain laws."""
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.twin.corrected import corrected_twin
-from radiotwin.closeloop.report import make_report
+from radiotwin.closeloop.corrected_twin import corrected_twin
+from radiotwin.closeloop.result_file import make_report
 from radiotwin.closeloop.run import close_loop
 from radiotwin.measurements import Measurements
 from radiotwin.twin import Twin
@@ -14,7 +14,7 @@ LAWS = {True: (-30.0, -2.5, 1.4), False: (-35.0, -3.04, 2.2)}  # with line of si
 
 
 def hits(corner_m, size_m, a_m, b_m):
-    """Whether segments pass through an upright box on the ground: points along them, one by one."""
+    """Return whether segments pass through an upright box on the ground: points along them, one by one."""
     share = np.linspace(0, 1, 400)[:, None, None]
     points_m = a_m + share * (b_m - a_m)
     low, high = np.array([*corner_m, 0.0]), np.array([*corner_m, 0.0]) + size_m
@@ -28,13 +28,13 @@ def survey(scene, seed, blocked):
     rows = []
     for flight in range(4):
         for receiver in range(2):
-            place_m = rng.uniform((x_min + 20, y_min + 20), (x_max - 20, y_max - 20))
+            position_m = rng.uniform((x_min + 20, y_min + 20), (x_max - 20, y_max - 20))
             heading = rng.uniform(0, 2 * np.pi)
             for slot in range(70):
                 heading += rng.normal(0, 0.3)
-                place_m = place_m + 8 * np.array([np.cos(heading), np.sin(heading)])
-                place_m = np.clip(place_m, (x_min, y_min), (x_max, y_max))
-                rows.append((flight, receiver, 100 * flight + slot, *place_m, 55.0 + 10 * receiver))
+                position_m = position_m + 8 * np.array([np.cos(heading), np.sin(heading)])
+                position_m = np.clip(position_m, (x_min, y_min), (x_max, y_max))
+                rows.append((flight, receiver, 100 * flight + slot, *position_m, 55.0 + 10 * receiver))
     flight, receiver, time_s, x, y, z = np.repeat(np.array(rows), len(scene.device_m), axis=0).T
     device = np.tile(np.arange(len(scene.device_m)), len(rows))
     receiver_m, device_m = np.column_stack([x, y, z]), scene.device_m[device]
@@ -55,11 +55,11 @@ def survey(scene, seed, blocked):
 
 
 def run(measurements, scene):
-    return make_report(close_loop(measurements, scene, "twin", 0, lambda text: None))
+    return make_report(close_loop(measurements, scene, "twin"))
 
 
 def error_db(radio_map, scene, blocked):
-    """RMSE of a map against the two laws."""
+    """Return the RMSE of a map against the two laws."""
     receiver_m = np.tile(scene.lattice.positions_m, (len(scene.device_m), 1))
     device_m = np.repeat(scene.device_m, len(scene.lattice.positions_m), axis=0)
     hidden, distance_m = blocked(device_m, receiver_m), np.linalg.norm(receiver_m - device_m, axis=1)
@@ -69,16 +69,16 @@ def error_db(radio_map, scene, blocked):
     return float(np.sqrt(np.nanmean(error**2)))
 
 
-def test_a_map_that_is_right_is_left_alone(small_scene):
+def test_a_correct_map_is_left_alone(small_scene):
     report = run(survey(small_scene, 0, lambda a, b: ~small_scene.city.line_of_sight(a, b)), small_scene)
     assert report["verdict"] == "none", [effect["name"] for effect in report["effects"]]
 
 
-def test_a_building_that_no_map_shows_is_found_and_goes_into_the_twin(small_scene, tmp_path):
-    middle_m = free_place(small_scene)
+def test_a_building_that_the_map_lacks_is_found_and_goes_into_the_twin(small_scene, tmp_path):
+    middle_m = free_position(small_scene)
     box = (middle_m - 9.0, np.array([18.0, 18.0, 60.0]))
     measurements = survey(small_scene, 1, lambda a, b: ~small_scene.city.line_of_sight(a, b) | hits(*box, a, b))
-    loop = close_loop(measurements, small_scene, "twin", 0, lambda text: None)
+    loop = close_loop(measurements, small_scene, "twin")
     report = make_report(loop)
     assert report["effects"][0]["name"] == "missing_obstacle"
     parameters = report["effects"][0]["parameters"]
@@ -122,14 +122,14 @@ def samples(scene):
     return np.tile(scene.device_m, (400, 1)), np.repeat(receiver_m, len(scene.device_m), axis=0)
 
 
-def free_place(scene):
-    """The middle of the largest gap between buildings and devices: where a tower has room."""
+def free_position(scene):
+    """Return the middle of the largest gap between buildings and devices, where a tower has room."""
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     x_m, y_m = (axis.ravel() for axis in np.meshgrid(np.arange(x_min + 40, x_max - 40, 4),
                                                      np.arange(y_min + 40, y_max - 40, 4)))
     built_x, built_y = (axis.ravel() for axis in np.meshgrid(np.arange(x_min, x_max, 3), np.arange(y_min, y_max, 3)))
     built = scene.city.height_at(built_x, built_y) > 2
     taken_m = np.vstack([np.column_stack([built_x, built_y])[built], scene.device_m[:, :2]])
-    gap_m = np.array([np.hypot(*(taken_m - place).T).min() for place in np.column_stack([x_m, y_m])])
+    gap_m = np.array([np.hypot(*(taken_m - each).T).min() for each in np.column_stack([x_m, y_m])])
     best = int(gap_m.argmax())
     return np.array([x_m[best], y_m[best]])

@@ -6,6 +6,9 @@ import trimesh
 
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.presets import preset_boxes
+from tests.worlds import narrow_street, open_ground
+
+__all__ = ["narrow_street", "open_ground"]
 
 LIMIT_DB = -120.0
 

@@ -1,7 +1,7 @@
 """Localisation as a whole against the statistical truth, over many devices and draws.
 
 Rationale: levels are drawn by the published law through an exact sight line, so that the only things between the data
-and the devices are the search and the posterior. Linearisation behaviour: errors within the bounds that the project
+and the devices are the search and the posterior. Expected behaviour: errors within the bounds that the project
 promises with a learned channel, here with margin because the channel is known or fitted in closed form; radii that
 cover as often as they say; no correction for correlation where there is none.
 """
@@ -9,7 +9,8 @@ cover as often as they say; no correction for correlation where there is none.
 import numpy as np
 import pytest
 
-from radiotwin.channel import MODELS, link_geometry
+from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
+from radiotwin.links import link_geometry
 from radiotwin.localize import localize
 
 BOUNDS = (0.0, 600.0, 0.0, 800.0)
@@ -30,7 +31,7 @@ def five_flights(city, flown, measured):
         track = flown(rng)
         anchors = measured(ANCHORS, track, rng)
         anchor_m = np.column_stack([ANCHORS, np.full(3, 1.5)])
-        channel = MODELS["segmented_log_distance"]()
+        channel = SegmentedLogDistance()
         channel.fit(link_geometry(anchor_m, anchors[0], anchors[1], city), anchors[2], -120.0, seed)
         found = localize(
             *measured(UNKNOWN, track, rng), channel,
@@ -57,7 +58,7 @@ def test_independent_noise_is_not_taken_for_correlation(five_flights):
 
 
 def test_credible_radius_covers(city, measured, on_free_ground, published_law):
-    """60 devices heard from 60 places: 90 % within the radius, 80 to 98 % being what chance allows (binomial)."""
+    """60 devices heard from 60 positions: 90 % within the radius, 80 to 98 % being what chance allows (binomial)."""
     rng = np.random.default_rng(5)
     xy_m = on_free_ground(60, rng)
     receivers = np.column_stack(
@@ -73,7 +74,7 @@ def test_credible_radius_covers(city, measured, on_free_ground, published_law):
 
 
 def test_correlated_model_error_widens_the_radius(free_space):
-    """CorrelatedShadowing that the channel does not know, 3 dB and alike within 60 m, in free space: radii under the
+    """Shadowing that the channel does not know, 3 dB and alike within 60 m, in free space: radii under the
     assumption of independence cover 7 of 40, corrected ones 30; they must cover 24. (The correction is of first
     order, and here the error moves the estimate by as much as the receivers' height.)"""
     rng = np.random.default_rng(2)

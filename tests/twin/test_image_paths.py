@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from radiotwin.closeloop import relocation
 from radiotwin.compare import predict
 from radiotwin.errors import BadInput
+from radiotwin.localize import Relocation
 from radiotwin.measurements import Measurements
 from radiotwin.radiomap import RadioMap
 from radiotwin.survey import fly_survey, segmented_truth
@@ -14,14 +14,14 @@ from radiotwin.twin import Twin, fit_twin
 
 @pytest.fixture(scope="module")
 def twin(narrow_street, tmp_path_factory):
-    """As it comes back from its folder."""
+    """The twin, loaded from its folder."""
     folder = tmp_path_factory.mktemp("raytraced") / "twin"
     fit_twin(narrow_street.measured, narrow_street.scene, model="raytrace", seed=0).save(folder)
     return Twin.load(folder)
 
 
-def judged(twin, scene, devices, seed):
-    """RMSE on flights of another seed, of all links and of those in the shadow [dB]."""
+def rmse_db(twin, scene, devices, seed):
+    """Return the RMSE on flights of another seed, of all links and of those in the shadow [dB]."""
     flown = fly_survey(scene, RadioMap.read(scene.folder / "truth.nc"), flights=1, pattern="random-waypoint", seed=seed,
                        noise_db=0.0)
     flown = flown.select(flown.table["device"].isin(devices).to_numpy())
@@ -34,29 +34,29 @@ def test_it_predicts_other_flights_far_better_than_a_law(narrow_street, twin):
     scene, measured = narrow_street.scene, narrow_street.measured
     law = fit_twin(measured, scene, model="segmented_nn", seed=0)
     devices = list(measured.devices["device"])
-    for by_paths, by_law in zip(*(judged(each, scene, devices, 5) for each in (twin, law))):
+    for by_paths, by_law in zip(*(rmse_db(each, scene, devices, 5) for each in (twin, law))):
         assert by_paths < 3.5 and by_paths < 0.6 * by_law
     device = next(each for each in twin.devices if each.role == "unknown")
-    assert np.hypot(*((device.x_m, device.y_m) - narrow_street.place_m)) < 4.0
+    assert np.hypot(*((device.x_m, device.y_m) - narrow_street.position_m)) < 4.0
     assert device.located and device.credible_radius_m < 15
 
 
 def test_an_earlier_twin_saves_most_of_the_search(narrow_street, twin, monkeypatch):
-    places = set()
-    follow = relocation.Relocation._follow
+    positions = set()
+    follow = Relocation.follow
 
-    def counted(self, city, place_m, *others):
-        places.add(place_m)
-        return follow(self, city, place_m, *others)
+    def counted(self, city, position_m, *others):
+        positions.add(position_m)
+        return follow(self, city, position_m, *others)
 
-    monkeypatch.setattr(relocation.Relocation, "_follow", counted)
+    monkeypatch.setattr(Relocation, "follow", counted)
     again = fit_twin(narrow_street.measured, narrow_street.scene, model="raytrace", seed=0, start=twin)
     for before, after in zip(twin.devices, again.devices):
         assert np.hypot(before.x_m - after.x_m, before.y_m - after.y_m) <= 1.5
-    assert 0 < len(places) < 16  # at least that many cells are looked at where nothing is known
+    assert 0 < len(positions) < 16  # at least that many cells are tried where nothing is known
 
 
-def test_a_map_that_the_levels_know_nothing_of_is_told(narrow_street):
+def test_a_map_that_does_not_explain_the_levels_is_warned_of(narrow_street):
     """In a statistical truth only line of sight is the map's."""
     scene = narrow_street.scene
     flown = fly_survey(scene, segmented_truth(scene), flights=1, pattern="random-waypoint", seed=0, noise_db=0.0)
@@ -71,7 +71,7 @@ def test_paths_do_not_go_indoors(narrow_street):
         fit_twin(narrow_street.measured, narrow_street.scene, model="raytrace", seed=0, allow_indoor=True)
 
 
-def test_what_was_not_heard_is_not_made_up(narrow_street):
+def test_what_was_not_heard_is_not_invented(narrow_street):
     """Anchors with line of sight alone, stronger than paths bring, and a device that was heard three times."""
     scene, measured, name = narrow_street.scene, narrow_street.measured, narrow_street.name
     table = measured.table.assign(gain_db=measured.table["gain_db"] + 6.0)
@@ -79,9 +79,10 @@ def test_what_was_not_heard_is_not_made_up(narrow_street):
     los = scene.city.line_of_sight(measured.device_m[measured.device_index], measured.receiver_m)
     table.loc[np.flatnonzero(mine)[3:], "gain_db"] = np.nan
     some = Measurements(table[mine | los].reset_index(drop=True), measured.devices)
-    with pytest.warns(UserWarning, match=r"only 0 links without line of sight .* others, [56]\.\d dB") as told:
+    with pytest.warns(UserWarning, match=r"only 0 links without line of sight .* others, [56]\.\d dB") as warned:
         twin = fit_twin(some, scene, model="raytrace", seed=0)
-    assert not any("worse than a law" in str(each.message) for each in told)
-    assert twin.effects["coefficients"][0] == twin.effects["coefficients"][1] == pytest.approx(6.0, abs=0.6)
+    assert not any("worse than a law" in str(each.message) for each in warned)
+    los_db, nlos_db = twin.fitted.level_coefficients
+    assert los_db == nlos_db == pytest.approx(6.0, abs=0.6)
     device = next(each for each in twin.devices if each.device == name)
     assert not device.located or device.credible_radius_m > 15

@@ -1,15 +1,24 @@
-"""Everything that a file says of a device tells where it is: few links of many receivers, and silence."""
+"""Devices in a file: few links of many receivers and blanks count, and bad input is one message."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 
-from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.channel.log_distance import LogDistance
-from radiotwin.closeloop import locate_file as module
-from radiotwin.twin.corrected import corrected_model
+from radiotwin.closeloop.corrected_twin import corrected_twin
+from radiotwin.closeloop.run import close_loop
+from radiotwin.effects.effect_model import EffectModel
+from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.measurements import Measurements
 from radiotwin.twin import Twin, TwinDevice
+from radiotwin.twin import locate as module
 
+COMMAND = Path(sys.executable).with_name("radiotwin")
 LIMIT_DB, GATEWAYS, PACKETS = -115.0, 30, 3
 
 
@@ -25,18 +34,58 @@ def test_a_device_is_found_by_three_packets_of_each_gateway_and_by_the_silence_o
         "receiver_x_m": gateway_m[gateway, 0], "receiver_y_m": gateway_m[gateway, 1], "receiver_z_m": 1.5,
         "device": "x", "gain_db": gain_db})
     devices = pd.DataFrame({"device": ["x"], "x_m": np.nan, "y_m": np.nan, "z_m": 1.5, "role": "unknown"})
-    anchor = TwinDevice("a", 100.0, 100.0, 1.5, "anchor", True, 0.0, None)
-    twin = Twin(LogDistance(LogDistanceLine(-40.0, -2.5, 2.0)), [anchor], "gain_db", LIMIT_DB, {}, {
-        "base": "log-distance", "coefficients": [0.0, 0.0], "dof": 30.0, "scale_db": [2.0], "receivers": ["g0"],
-        "parts": [], "first_s": None, "device_spread_db": 0.0, "likelihood_power": 1.0})
+    channel = LogDistance(LogDistanceLine(-40.0, -2.5, 2.0))
+    fitted = EffectModel(channel, (), np.zeros(2), np.array([2.0]), 30.0, np.array([[100.0, 100.0, 1.5]]), ("g0",),
+                         np.nan, 0.0)
+    twin = Twin(channel, [TwinDevice.anchor("a", 100.0, 100.0, 1.5)], "gain_db", LIMIT_DB, {}, fitted)
     used, plain = [], module.locate
 
     def locate(model, links, *others):
         used.append(links)
         return plain(model, links, *others)
     monkeypatch.setattr(module, "locate", locate)
-    places, _ = module.locate_file(Measurements(table, devices), twin, corrected_model(twin, None), None, lambda: None)
+    found, _ = module.locate_file(Measurements(table, devices), twin, None, lambda: None)
     silent = np.isnan(gain_db)
     assert 20 < silent.sum() < 70 and np.isnan(used[0].level_db).sum() == silent.sum()
-    assert used[0].limit_db == LIMIT_DB and places["links"].tolist() == [GATEWAYS * PACKETS]
-    assert np.hypot(places["x_m"][0] - there_m[0], places["y_m"][0] - there_m[1]) < 100
+    assert used[0].limit_db == LIMIT_DB and found["links"].tolist() == [GATEWAYS * PACKETS]
+    assert np.hypot(found["x_m"][0] - there_m[0], found["y_m"][0] - there_m[1]) < 100
+
+
+def run(*words):
+    return subprocess.run([str(word) for word in (COMMAND, *words)], capture_output=True, text=True, timeout=300)
+
+
+def test_the_command_finds_an_unknown_device_and_says_how_far_off_it_is(tmp_path, open_ground):
+    world = open_ground.fly(12)
+    world.gain_db[world.receiver == 0] -= 6.0
+    data = open_ground.measured(world)
+    hidden = data.devices.copy()
+    hidden.loc[4, ["x_m", "y_m"]] = np.nan
+    hidden.loc[4, "role"] = "unknown"
+    Measurements(data.table, hidden).write(tmp_path / "flight" / "measurements.csv")
+    data.devices.to_csv(tmp_path / "truth.csv", index=False)
+    done = run("close-loop", tmp_path / "flight" / "measurements.csv", "-o", tmp_path / "loop")
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "loop" / "closeloop.json").read_text())
+    assert report["effects"][0]["name"] == "receiver_gain_offset"
+    done = run("locate", tmp_path / "flight" / "measurements.csv", "--twin", tmp_path / "loop" / "twin",
+                   "--truth", tmp_path / "truth.csv", "-o", tmp_path / "located.csv")
+    assert done.returncode == 0, done.stderr
+    located = pd.read_csv(tmp_path / "located.csv").iloc[0]
+    assert located["device"] == "d4" and located["links"] == 720
+    assert np.hypot(located["x_m"] - world.device_m[4, 0], located["y_m"] - world.device_m[4, 1]) < 15.0
+    assert "wrote" in done.stdout and "How far off" in done.stdout
+
+
+@pytest.mark.parametrize("role, twin, message", [
+    ("anchor", "loop/twin", "role unknown"), ("unknown", "nowhere", "not a twin")])
+def test_bad_input_is_one_message(tmp_path, open_ground, role, twin, message):
+    data = open_ground.measured(open_ground.fly(13))
+    data.write(tmp_path / "flight" / "measurements.csv")
+    if role == "anchor":
+        loop = close_loop(data, base="log-distance")
+        corrected_twin(loop, None).save(tmp_path / "loop" / "twin")
+    done = run("locate", tmp_path / "flight" / "measurements.csv", "--twin", tmp_path / twin,
+                   "-o", tmp_path / "located.csv")
+    assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
+    assert not (tmp_path / "located.csv").exists()
