@@ -14,11 +14,10 @@ import numpy as np
 import pandas as pd
 
 import radiotwin
-from radiotwin.cli.world import read_truth
 from radiotwin.compare import compare_models, split_flights
 from radiotwin.files import atomic_path
 from radiotwin.scene import Scene
-from radiotwin.survey import fly_survey
+from radiotwin.survey import fly_survey, read_truth
 
 FLIGHTS = 5
 

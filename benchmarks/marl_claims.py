@@ -21,10 +21,10 @@ from marl.fedqmix import settings_of
 from marl.options import add_options
 from marl.settings import LearnerSettings, RunSettings
 from marl.threads import keep_memory, limit_threads
-from radiotwin.cli.world import read_truth
 from radiotwin.files import atomic_path
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
+from radiotwin.survey import read_truth
 
 
 def cpu_s() -> float:

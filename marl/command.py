@@ -4,7 +4,7 @@ import signal
 import sys
 from collections.abc import Callable
 
-from radiotwin.cli.console import complain, show_warnings_plainly
+from radiotwin.console import complain, show_warnings_plainly
 from radiotwin.errors import BadInput, RunFailed
 
 

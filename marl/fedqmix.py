@@ -7,8 +7,8 @@ from pathlib import Path
 from marl.command import exit_status
 from marl.options import add_options, checked
 from marl.settings import PRESETS, RUNS, LearnerSettings, RunSettings, check_together
-from radiotwin.cli.console import say
-from radiotwin.cli.output import output
+from radiotwin.command import output
+from radiotwin.console import say
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -18,13 +18,13 @@ from marl.randomness import stream
 from marl.settings import LEARNERS, LearnerSettings, RunSettings
 from marl.strategies import evaluate, make_strategy
 from marl.threads import keep_memory, limit_threads, torch_device
-from radiotwin.cli.console import print_rows
-from radiotwin.cli.world import read_truth
+from radiotwin.console import print_rows
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 from radiotwin.progress import progress
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
+from radiotwin.survey import read_truth
 
 TRAINED_IN = {"nn": "NN twin", "log-distance": "log-distance twin", "kriging": "kriging twin",
               "raytrace": "ray-traced twin", "truth": "the truth"}

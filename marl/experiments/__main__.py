@@ -7,7 +7,7 @@ from pathlib import Path
 from marl.command import exit_status
 from marl.experiments.records import Run, begun, finished
 from marl.experiments.studies import STUDIES, with_settings
-from radiotwin.cli.console import say
+from radiotwin.console import say
 from radiotwin.errors import BadInput
 
 OUT, FIGURES = Path("docs/results/experiments"), Path("docs/results/figures")

@@ -11,9 +11,9 @@ from marl.flights import Flights
 from marl.mission import Mission, make_mission
 from marl.settings import LearnerSettings, RunSettings
 from marl.threads import torch_device
-from radiotwin.cli.world import read_truth
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
+from radiotwin.survey import read_truth
 
 SCENES = Path("scenes")
 

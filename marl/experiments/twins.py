@@ -15,7 +15,6 @@ from marl.reality import Reality, known_by, location_errors_m
 from marl.settings import LearnerSettings, RunSettings
 from marl.strategies import evaluate, make_strategy
 from marl.waypoints import PATTERN
-from radiotwin.cli.world import read_truth
 from radiotwin.closeloop.corrected import corrected_twin
 from radiotwin.closeloop.run import close_loop
 from radiotwin.compare import score_map
@@ -23,7 +22,7 @@ from radiotwin.measurements import Measurements
 from radiotwin.progress import progress
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
-from radiotwin.survey import fly_survey
+from radiotwin.survey import fly_survey, read_truth
 from radiotwin.twin import Twin, fit_twin
 
 MODELS = {"nn": "segmented_nn", "segmented": "segmented_log_distance", "log-distance": "log_distance",

@@ -16,7 +16,7 @@ from typing import TextIO
 from marl.experiments.earlier import earlier_result
 from marl.experiments.records import Run, begin, begun, finished, write_record
 from marl.threads import keep_memory, limit_threads
-from radiotwin.cli.console import complain, say, show_warnings_plainly
+from radiotwin.console import complain, say, show_warnings_plainly
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.files import atomic_path
 

@@ -11,8 +11,8 @@ import typer
 
 from radiotwin import __version__
 from radiotwin.cli import importing, loop, model, report, scenes, tools, world
-from radiotwin.cli.console import complain
-from radiotwin.cli.output import add_output_options
+from radiotwin.command import add_output_options
+from radiotwin.console import complain
 from radiotwin.errors import BadInput, RunFailed
 
 app = typer.Typer(

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from radiotwin.cli.console import print_rows, say, show_warnings_plainly
+from radiotwin.console import print_rows, say, show_warnings_plainly
 from radiotwin.errors import BadInput
 
 

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from radiotwin.cli.console import print_rows, say, show_warnings_plainly
 from radiotwin.cli.model import MeasurementFile
+from radiotwin.console import print_rows, say, show_warnings_plainly
 
 
 def add_commands(app: typer.Typer) -> None:

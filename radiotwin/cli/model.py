@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from radiotwin.cli.console import print_rows, result, say, show_warnings_plainly
+from radiotwin.console import print_rows, result, say, show_warnings_plainly
 from radiotwin.errors import BadInput
 
 if TYPE_CHECKING:
@@ -134,12 +134,12 @@ def compare(
 ) -> None:
     """Hold all channel models against flights they have not seen, and against the truth map where there is one."""
     from radiotwin.channel import MODELS
-    from radiotwin.cli.world import read_truth
     from radiotwin.compare import compare_models, split_flights
     from radiotwin.comparison_output import judge_also, write_comparison
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
     from radiotwin.scene import Scene
+    from radiotwin.survey import read_truth
     from radiotwin.twin import RAYTRACE
 
     show_warnings_plainly()

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from radiotwin.cli.console import say, show_warnings_plainly
+from radiotwin.console import say, show_warnings_plainly
 
 
 def add_commands(app: typer.Typer) -> None:

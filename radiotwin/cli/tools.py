@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from radiotwin.cli.console import console, result, say, show_warnings_plainly
+from radiotwin.console import console, result, say, show_warnings_plainly
 
 
 def add_commands(app: typer.Typer) -> None:

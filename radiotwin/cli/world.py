@@ -5,9 +5,8 @@ from typing import Annotated
 
 import typer
 
-from radiotwin.cli.console import say, show_warnings_plainly
 from radiotwin.cli.scenes import SceneFolder
-from radiotwin.errors import BadInput
+from radiotwin.console import say, show_warnings_plainly
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -84,7 +83,7 @@ def survey(
 ) -> None:
     """Fly the scene's UAVs through a truth map and write what they measure."""
     from radiotwin.scene import Scene
-    from radiotwin.survey import fly_survey
+    from radiotwin.survey import fly_survey, read_truth
 
     scene = Scene.load(folder)
     if noise_db is None:
@@ -95,19 +94,3 @@ def survey(
     missed = int(measurements.table["gain_db"].isna().sum())
     say(f"wrote {out}: {len(measurements.flights)} flights, {len(measurements.table)} links to "
         f"{len(measurements.devices)} devices ({int(measurements.is_anchor.sum())} anchors), {missed} not detected")
-
-
-def read_truth(scene, truth: str):
-    """The radio map that `--truth` names."""
-    from radiotwin.radiomap import RadioMap
-    from radiotwin.survey import segmented_truth
-
-    if truth == "segmented":
-        return segmented_truth(scene)
-    if truth == "traced":
-        path = scene.folder / "truth.nc"
-        if not path.is_file():
-            raise BadInput(f"{path} does not exist; run `radiotwin trace {scene.folder}` first, or use "
-                           "--truth segmented")
-        return RadioMap.read(path)
-    return RadioMap.read(truth)

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from radiotwin.cli import console, main
+from radiotwin import console
+from radiotwin.cli import main
 
 COMMAND = Path(sys.executable).with_name("radiotwin")
 COLUMNS = 100

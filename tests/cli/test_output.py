@@ -12,8 +12,8 @@ import typer
 from typer.testing import CliRunner
 
 from radiotwin.cli import app
-from radiotwin.cli.console import print_rows, say
-from radiotwin.cli.output import TABLES, add_output_options
+from radiotwin.command import TABLES, add_output_options
+from radiotwin.console import print_rows, say
 
 COMMAND = Path(sys.executable).with_name("radiotwin")
 AT_RANDOM = ("build-scene", "trace", "survey", "fit", "compare", "close-loop", "demo")

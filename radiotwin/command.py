@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import typer
 
 from radiotwin import progress
-from radiotwin.cli.console import collected, console
+from radiotwin.console import collected, console
 
 TABLES = ("build-scene", "import", "fit", "compare", "close-loop", "locate", "demo", "doctor")
 """Commands that print tables."""
