@@ -1,35 +1,78 @@
-"""`--quiet` on every command, and `--json` on those that print tables: one JSON document instead of text."""
+"""What the commands of both packages share: `--quiet`, `--json`, and the exit statuses."""
 
 import functools
 import inspect
 import json
 import math
+import os
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any
+from typing import Annotated, Any, NoReturn
 
 import typer
 
 from radiotwin import progress
-from radiotwin.console import collected, console
+from radiotwin.console import collected, complain, console
+from radiotwin.errors import BadInput, RunFailed
 
 TABLES = ("build-scene", "import", "fit", "compare", "close-loop", "locate", "demo", "doctor")
-"""Commands that print tables."""
-QUIET = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but warnings and errors.")]
-JSON = Annotated[bool, typer.Option("--json", help="Print tables and messages as one JSON document.")]
+"""Commands of `radiotwin` that print tables."""
+QUIET = Annotated[bool, typer.Option(
+    "--quiet", "-q", help="Print nothing but warnings and errors.")]
+JSON = Annotated[bool, typer.Option(
+    "--json", help="Print tables and messages as one JSON document.")]
 
 
 def add_output_options(app: typer.Typer) -> None:
-    """Give the commands of an app their options; the commands themselves know nothing of them."""
+    """Add `--quiet`, and `--json` where there are tables, to every command of an app."""
     for command in app.registered_commands:
         if command.callback is not None:
-            command.callback = _with_options(command.callback, command.name in TABLES)
+            command.callback = with_output_options(command.callback, command.name in TABLES)
+
+
+def with_output_options(command: Callable[..., Any], prints_tables: bool) -> Callable[..., Any]:
+    """Return a command with the options `--quiet` and, where it prints tables, `--json`."""
+    @functools.wraps(command)
+    def run(*args: Any, quiet: bool = False, as_json: bool = False, **options: Any) -> None:
+        with output(quiet, as_json):
+            command(*args, **options)
+
+    return with_options(
+        run, inspect.signature(command),
+        {"quiet": (QUIET, False)} | ({"as_json": (JSON, False)} if prints_tables else {}))
+
+
+def with_options(command: Callable[..., Any], signature: inspect.Signature,
+                 added: dict[str, tuple[Any, Any]]) -> Callable[..., Any]:
+    """Declare the options of a command; Typer reads them from its signature and annotations.
+
+    Args:
+        command: function to be called; it takes all options as keywords.
+        signature: its parameters so far.
+        added: name -> annotation and default of the options to add.
+
+    Returns:
+        `command`, changed.
+    """
+    parameters = [*signature.parameters.values()] + [
+        inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+        for name, (kind, default) in added.items()]
+    setattr(command, "__signature__", signature.replace(parameters=parameters))  # noqa: B010  mypy
+    command.__annotations__ = {each.name: each.annotation for each in parameters
+                               if each.annotation is not inspect.Parameter.empty}
+    return command
 
 
 @contextmanager
 def output(quiet: bool, as_json: bool) -> Iterator[None]:
-    """Text as ever; nothing of it; or, once it is done, all that would have been text as JSON on standard output."""
+    """Print text as usual, or nothing, or all of it as one JSON document at the end.
+
+    Args:
+        quiet: print no text and show no progress.
+        as_json: print no text; on success, write `console.collected` to standard output.
+    """
     before = console.quiet, progress.silent
     console.quiet, progress.silent = quiet or as_json, quiet or progress.silent
     collected.clear()
@@ -37,7 +80,7 @@ def output(quiet: bool, as_json: bool) -> Iterator[None]:
     try:
         yield
         done = True
-    except typer.Exit:  # a finding, such as a scene that cannot be traced, and no failure
+    except typer.Exit:  # a finding, such as a scene that cannot be traced, is not a failure
         done = True
         raise
     finally:
@@ -47,24 +90,50 @@ def output(quiet: bool, as_json: bool) -> Iterator[None]:
             sys.stdout.write("\n")
 
 
-def _with_options(command: Callable[..., Any], prints_tables: bool) -> Callable[..., Any]:
-    @functools.wraps(command)
-    def run(*args: Any, quiet: bool = False, as_json: bool = False, **options: Any) -> None:
-        with output(quiet, as_json):
-            command(*args, **options)
+class _Interrupted(BaseException):
+    """Ctrl-C. Typer would swallow a KeyboardInterrupt without a message."""
 
-    # Typer reads a command's options from its signature and its annotations.
-    added = {"quiet": QUIET} | ({"as_json": JSON} if prints_tables else {})
-    signature = inspect.signature(command)
-    parameters = [inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
-                  for name, kind in added.items()]
-    setattr(run, "__signature__", signature.replace(parameters=[*signature.parameters.values(), *parameters]))
-    run.__annotations__ = {**command.__annotations__, **added}
-    return run
+
+def _interrupt(*_: Any) -> NoReturn:
+    raise _Interrupted
+
+
+def _terminate(*_: Any) -> NoReturn:
+    sys.exit(143)  # an exception, so that open files are cleaned up
+
+
+def exit_status(work: Callable[[], Any], kept: str) -> int:
+    """Do the work of a command; print one message for an error that the user can mend.
+
+    Args:
+        work: a Typer app, which may also end the process itself, or any function.
+        kept: part of the message after Ctrl-C: what is kept and how to go on.
+
+    Returns:
+        0 done, 1 failed while running, 2 bad input, 130 interrupted; SIGTERM ends the process
+        with 143.
+    """
+    signal.signal(signal.SIGINT, _interrupt)
+    signal.signal(signal.SIGTERM, _terminate)
+    try:
+        work()
+        return 0
+    except BadInput as error:
+        complain(str(error))
+        return 2
+    except RunFailed as error:
+        complain(str(error))
+        return 1
+    except _Interrupted:
+        complain(f"interrupted; {kept}")
+        return 130
+    except BrokenPipeError:  # the reader of a pipe has gone, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
 
 
 def _plain(value: Any) -> Any:
-    """For JSON: NaN and infinity as null, numpy's numbers as Python's."""
+    """Return a value as JSON has it: NaN and infinity as null, numpy's numbers as Python's."""
     if isinstance(value, dict):
         return {str(name): _plain(each) for name, each in value.items()}
     if isinstance(value, list | tuple):

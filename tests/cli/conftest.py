@@ -23,7 +23,8 @@ COLUMNS = 100
 @contextlib.contextmanager
 def as_in_a_process_of_its_own(words: list[str], cwd: Path) -> Iterator[None]:
     """What the command changes of the whole process is put back."""
-    argv, folder, interrupt, show = sys.argv, Path.cwd(), signal.getsignal(signal.SIGINT), warnings.showwarning
+    argv, folder, show = sys.argv, Path.cwd(), warnings.showwarning
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     width = console.console.width
     try:
         sys.argv, console.console.width = ["radiotwin", *words], COLUMNS
@@ -34,7 +35,8 @@ def as_in_a_process_of_its_own(words: list[str], cwd: Path) -> Iterator[None]:
     finally:
         os.chdir(folder)
         sys.argv, console.console.width, warnings.showwarning = argv, width, show
-        signal.signal(signal.SIGINT, interrupt)
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")
