@@ -6,9 +6,11 @@ import torch
 from marl.disturbances import Disturbance, DisturbedEnvironment
 from marl.environment import Environment
 from marl.features import observation_size
-from marl.flights import AgentPolicy, HeuristicPolicy, fly
+from marl.flights import fly
+from marl.heuristics import HeuristicPolicy
 from marl.mission import HOVER, NO_OP
-from marl.networks import Agent
+from marl.qmix import Agent
+from marl.training import AgentPolicy
 
 
 def flown(mission, disturbance, flights=200):
