@@ -3,6 +3,6 @@
 After Chen et al., "Model-aided Federated Reinforcement Learning for Multi-UAV Trajectory Planning
 in IoT Networks", GLOBECOM Workshops 2023; called "the paper" throughout the package.
 
-Read first `mission` (what is given), `environment` (the rules) and `features` (what agents see);
+Read first `mission` (the inputs), `environment` (the rules) and `features` (observations);
 then a learner: `qmix`, `iql`, `fedqmix.federation`, `planner` or `heuristics`; then `algorithm1`.
 """

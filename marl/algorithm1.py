@@ -76,11 +76,11 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
     Raises:
         BadInput: a damaged checkpoint, or input that `fit_twin` or `make_mission` refuses.
     """
-    # Shadowing of the truth stands for the receivers' noise.
+    # The shadowing of a truth includes the receivers' noise.
     noise_db = 0.0 if "sigma_db" in truth.dataset else run.noise_db
     reality = Reality(scene, truth, run.assignment, noise_db, run.seed)
-    told = run.twin == "truth" or run.privileged
-    known = Known.truth(scene) if told else Known.anchors(scene)
+    true_positions = run.twin == "truth" or run.privileged
+    known = Known.truth(scene) if true_positions else Known.anchors(scene)
     learner = make_learner(run, learner_settings, reality.mission(known), run.real_episodes,
                            device)
     checkpoint = folder / "checkpoint.pt" if folder else None
@@ -94,7 +94,7 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
             if run.twin != "truth":
                 restore_folder(state["twin"], folder / "twin")
                 twin = Twin.load(folder / "twin")
-                known = known if told else Known.of(twin.devices)
+                known = known if true_positions else Known.of(twin.devices)
             on_progress(run.episodes * len(rows), _summary(rows[-1], run))
             # The run may have been stopped between the checkpoint and the log.
             on_round(rows, blocks)
@@ -106,7 +106,7 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
             else:
                 reality.fly(_measuring(run, reality, twin, known, learner, rng), known)
                 twin = learn_twin(reality, run.twin, run.seed, twin)
-                known = known if told else Known.of(twin.devices)
+                known = known if true_positions else Known.of(twin.devices)
                 lasting = reality.measurements() if run.twin_shadowing == "fitted" else None
                 mission = reality.twin_mission(twin, known, lasting)
             learned_s = time.perf_counter() - started

@@ -124,8 +124,8 @@ class CorrelatedField:
     def draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
         """Return (count, rows, columns) float32 independent fields."""
         pairs = -(-count // 2)
-        noise = rng.standard_normal((pairs, *self._amplitude.shape, 2), dtype=np.float32)
-        noise = noise.view(np.complex64)[..., 0]
+        parts = rng.standard_normal((pairs, *self._amplitude.shape, 2), dtype=np.float32)
+        noise = parts.view(np.complex64)[..., 0]
         fields = fft2(noise * self._amplitude)[:, :self._shape[0], :self._shape[1]]
         return np.concatenate([fields.real, fields.imag])[:count]  # the parts are independent
 

@@ -19,7 +19,7 @@ from marl.settings import LearnerSettings, RunSettings
 
 @dataclass(frozen=True)
 class Setup:
-    """What a learner is made from.
+    """Arguments of a learner.
 
     Attributes:
         run: settings of the run.
@@ -70,13 +70,13 @@ class Learner(ABC):
 
     @abstractmethod
     def policy(self, rng: np.random.Generator) -> Policy:
-        """Return what was learned or planned, without exploration."""
+        """Return the learned or planned policy, without exploration."""
 
     def state(self, last: bool) -> dict:
         """Return a checkpoint: nested dicts and lists of numbers, texts, arrays and tensors.
 
         Args:
-            last: nothing will be prepared any more; then only what `policy` needs is kept.
+            last: `prepare` will not be called again, so only the policy is needed.
         """
         return {}
 

@@ -1,8 +1,8 @@
-"""The mission as arrays: what the UAVs fly over, what they collect, and what they know."""
+"""The mission as arrays: the map, the data to collect, and the knowledge of the UAVs."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -83,22 +83,6 @@ class Mission(NamedTuple):
         return int(self.battery.max())
 
 
-class Positioned(Protocol):
-    """A device with a name and horizontal position, such as `radiotwin.twin.TwinDevice`."""
-
-    @property
-    def device(self) -> str:
-        """Its name."""
-
-    @property
-    def x_m(self) -> float:
-        """East [m]; NaN where unknown."""
-
-    @property
-    def y_m(self) -> float:
-        """North [m]; NaN where unknown."""
-
-
 @dataclass(frozen=True)
 class Known:
     """Positions of the devices as the UAVs know them.
@@ -110,8 +94,8 @@ class Known:
     position_m: dict[str, tuple[float, float]]
 
     @classmethod
-    def of(cls, devices: Iterable[Positioned]) -> "Known":
-        """Return the positions of some devices, such as `Twin.devices`, where they are known."""
+    def of(cls, devices: Iterable[Any]) -> "Known":
+        """Return the positions of `Twin.devices`, or of a scene's, where they are known."""
         return cls({d.device: (d.x_m, d.y_m) for d in devices
                     if np.isfinite([d.x_m, d.y_m]).all()})
 

@@ -75,7 +75,7 @@ class ReplanPolicy:
                        self._hovered[flight, u]) for u in range(self._mission.uavs)]
         cell, battery = (array[flight].astype(np.int64) for array in (frame.cell, frame.battery))
         if self._linked:
-            # Nobody takes from a device that none of them hears, so it has what it had.
+            # The data of a device that no UAV hears does not change.
             found = self._improved(cell, battery, self._seen[flight, 0], tours, -1)
             self._take(flight, range(len(tours)), found)
             return
@@ -138,10 +138,10 @@ def _follow(mission: Mission, frame: Frame, tour: np.ndarray, count: np.ndarray,
     mask = np.empty(ACTION_COUNT, np.bool_)
     for e in range(flights):
         for u in range(uavs):
+            row, column = np.int64(frame.cell[e, u, 0]), np.int64(frame.cell[e, u, 1])
             action[e, u], reached[e, u], hovered[e, u] = next_action(
-                mission, u, np.int64(frame.cell[e, u, 0]), np.int64(frame.cell[e, u, 1]),
-                np.int64(frame.battery[e, u]), tour[e, u], count[e, u], reached[e, u],
-                hovered[e, u], mask)
+                mission, u, row, column, np.int64(frame.battery[e, u]),  # type: ignore[arg-type]
+                tour[e, u], count[e, u], reached[e, u], hovered[e, u], mask)
     return action
 
 

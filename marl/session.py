@@ -93,8 +93,8 @@ class Session:
                     if before.get(group, {}).get(name) == value:
                         continue
                     if group == "world":
-                        raise BadInput(f"the {name} is not what it was when the run in {self.out} "
-                                       "was started; put it back, or give another --out")
+                        raise BadInput(f"the {name} has changed since the run in {self.out} was "
+                                       "started; put it back, or give another --out")
                     raise BadInput(
                         f"--{name.replace('_', '-')} {value}: the run in {self.out} was started "
                         f"with {before.get(group, {}).get(name)}; resume it with the options that "

@@ -97,7 +97,7 @@ class RunSettings(BaseModel):
         "fitted", description="how long the twin's error lasts in a simulated flight: fitted to "
         "its residuals, or one slot; preset paper: slot")
     algorithm: Annotated[str, Choices(lambda: list(LEARNERS)), AfterValidator(_registered)] = Field(
-        "fedqmix", description="what decides where the UAVs fly")
+        "fedqmix", description="learner, planner or heuristic that flies")
     preset: Literal["fast", "paper"] = Field("fast", description="settings of learning")
     real_episodes: int = Field(
         10, ge=1, le=10_000, description="rounds, each with one real flight to learn the twin "
@@ -137,7 +137,7 @@ def check_together(run: RunSettings, learner: LearnerSettings) -> None:
     """Refuse settings that are allowed one by one, but not together.
 
     Raises:
-        BadInput: a replay memory that is too small, or a guide for what does not learn.
+        BadInput: a replay memory that is too small, or a guide for something that does not learn.
     """
     if learner.batch > learner.replay or learner.parallel > learner.replay:
         raise BadInput(

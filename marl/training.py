@@ -17,7 +17,7 @@ GUIDED_SHARE = 0.25  # of the training flights, with the planner's help
 
 
 class Networks(Protocol):
-    """What is trained, such as `marl.qmix.QNetworks`."""
+    """Interface of trained networks, such as `marl.qmix.QNetworks`."""
 
     agent: torch.nn.Module
     device: str

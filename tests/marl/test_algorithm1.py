@@ -55,7 +55,7 @@ def test_a_real_flight_measures_every_device_in_every_slot_until_it_lands(small_
     assert measured.devices.loc[measured.devices["role"] == "unknown", ["x_m", "y_m"]].isna().all().all()
 
 
-def test_what_is_measured_is_what_the_mission_received(small_scene, reality):
+def test_measurements_are_the_gains_that_the_mission_drew(small_scene, reality):
     table = reality.measurements().table
     truth = segmented_truth(small_scene)
     index = truth.lattice.index_of(table[["receiver_x_m", "receiver_y_m", "receiver_z_m"]].to_numpy())
@@ -76,7 +76,7 @@ def test_below_sensitivity_is_blank(small_scene):
     assert np.isnan(level_db).any() and np.nanmin(level_db) >= -80.0
 
 
-def test_the_twin_tells_positions_of_unknown_devices_from_measurements_only(small_scene, reality):
+def test_positions_of_unknown_devices_come_from_measurements_only(small_scene, reality):
     known = Known.of(learn_twin(reality, "nn", 0, None).devices)
     errors_m = location_errors_m(small_scene, known)
     assert len(errors_m) == sum(d.role == "unknown" for d in small_scene.config.devices)
@@ -146,7 +146,7 @@ def test_training_happens_in_the_twins_map_and_judging_in_the_truths(small_scene
     np.testing.assert_array_equal(judged[-1].snr_db, real.snr_db)
 
 
-def test_errors_of_positions_are_the_twins_also_where_agents_know_better(small_scene):
+def test_location_errors_are_the_twins_even_if_agents_see_true_positions(small_scene):
     rows = execute(small_scene, run_settings(algorithm="greedy", privileged=True)).rows
     assert rows[-1]["location_error_median_m"] > 0
 

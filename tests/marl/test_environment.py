@@ -75,7 +75,7 @@ def test_a_flight_follows_the_rules_slot_by_slot(missions, slow, data, seed):
 
 @given(st.data(), st.sampled_from(["random", "greedy"]), st.integers(0, 2**32 - 1))
 @FEW
-def test_data_is_conserved_and_nobody_strands(missions, data, name, seed):
+def test_data_is_conserved_and_every_uav_gets_home(missions, data, name, seed):
     mission = data.draw(missions)
     environment = Environment(mission, 4, np.random.default_rng(seed))
     flights = fly(environment, HeuristicPolicy(name, np.random.default_rng(seed)))
@@ -108,7 +108,7 @@ def test_the_first_position_counts_and_the_last_does_not(tiny):
 
 
 @pytest.mark.parametrize("max_rate, expected", [(False, [0, 1]), (True, [0, -1])])
-def test_who_loses_its_best_device_gets_another_or_idles(max_rate, expected):
+def test_a_uav_that_loses_its_best_device_gets_another_or_idles(max_rate, expected):
     strength, out = np.array([[30.0, 12.0], [25.0, 11.0]]), np.zeros(2, dtype=np.int16)
     assign(strength, max_rate, out)
     assert out.tolist() == expected
@@ -170,7 +170,7 @@ def test_very_short_and_very_long_correlations_have_fields_too(length_m):
     assert (fields[:, 1:] * fields[:, :-1]).mean() == pytest.approx(np.exp(-20 / length_m) * fields.var(), abs=0.05)
 
 
-def test_what_stays_stays_for_a_flight_and_the_rest_for_a_slot(tiny):
+def test_a_share_of_the_shadowing_lasts_for_a_flight_and_the_rest_for_a_slot(tiny):
     mission = tiny(0, uavs=2, devices=2, snr_db=20.0, sigma_db=np.array([3.0, 0.0]).reshape(1, 2, 1, 1),
                    battery=(8, 8), data_units=[1e9, 1e9])
     hover = PlanPolicy(np.full((8, 2), HOVER))
@@ -187,7 +187,7 @@ def test_what_stays_stays_for_a_flight_and_the_rest_for_a_slot(tiny):
         assert abs(np.corrcoef(off_db[:-1, 0, 0], off_db[1:, 0, 0])[0, 1]) < 0.06  # another flight, another world
 
 
-def test_a_flight_that_begins_anew_meets_a_new_world_and_the_others_keep_theirs(tiny):
+def test_a_new_flight_draws_new_shadowing_and_the_others_keep_theirs(tiny):
     mission = tiny(0, uavs=1, devices=1, snr_db=20.0, sigma_db=3.0, battery=(8,))._replace(shadowing_share=1.0)
     environment = Environment(mission, 4, np.random.default_rng(0))
     before = environment.reset().snr_db.copy()
@@ -195,7 +195,7 @@ def test_a_flight_that_begins_anew_meets_a_new_world_and_the_others_keep_theirs(
     assert ((before != after).ravel() == [True, False, False, True]).all()
 
 
-def test_the_same_seed_meets_the_same_worlds(tiny):
+def test_the_same_seed_draws_the_same_shadowing(tiny):
     mission = tiny(0, sigma_db=4.0)._replace(shadowing_share=0.7)
     one, same, other = (fly(Environment(mission, 5, np.random.default_rng(seed)),
                             HeuristicPolicy("greedy", np.random.default_rng(9))).frames.snr_db for seed in (1, 1, 2))

@@ -1,4 +1,4 @@
-"""The figures show what was flown."""
+"""Figures of a run."""
 
 import numpy as np
 import pytest

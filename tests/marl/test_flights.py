@@ -9,7 +9,7 @@ from marl.heuristics import HeuristicPolicy
 
 
 class Watching:
-    """Keeps what another policy saw and did."""
+    """Keeps the frames and actions of another policy."""
 
     def __init__(self, policy):
         self.policy, self.frames, self.actions = policy, [], []
@@ -23,7 +23,7 @@ class Watching:
         return self.actions[-1]
 
 
-def test_a_record_is_what_was_seen_and_done(city_mission):
+def test_a_record_holds_every_frame_and_action(city_mission):
     rng = np.random.default_rng(0)
     watching = Watching(HeuristicPolicy("random", rng))
     flights = fly(Environment(city_mission, 5, rng), watching)

@@ -32,7 +32,7 @@ def test_greedy_turns_to_another_device_when_one_is_empty(tiny):
     assert greedy_actions(mission, environment.frame, np.random.default_rng(0)).tolist() == [[NORTH]]
 
 
-def test_greedy_ignores_devices_that_nobody_has_located(tiny):
+def test_greedy_ignores_devices_without_a_known_position(tiny):
     mission = tiny(0, uavs=1, devices=2, battery=(30,), known_m=[[np.nan, np.nan], [40.0, 80.0]], snr_db=20.0)
     environment = Environment(mission, 1, np.random.default_rng(0))
     assert greedy_actions(mission, environment.reset(), np.random.default_rng(0)).tolist() == [[NORTH]]
@@ -75,14 +75,14 @@ def test_every_action_is_feasible_and_all_uavs_land_with_an_empty_battery(small_
     assert (city_mission.steps_home[uavs, frame.cell[0, :, 0], frame.cell[0, :, 1]] == 0).all()
 
 
-def test_they_get_about_more_than_random_steps(small_scene, city_mission):
+def test_waypoint_flights_cover_more_cells_than_random_steps(small_scene, city_mission):
     about, steps = (np.mean([seen(city_mission, make(np.random.default_rng(seed))) for seed in range(20)])
                     for make in (lambda rng: PlanPolicy(waypoint_actions(small_scene, city_mission, rng)),
                                  lambda rng: HeuristicPolicy("random", rng)))
     assert about > 1.2 * steps
 
 
-def test_the_same_random_numbers_fly_the_same(small_scene, city_mission):
+def test_the_same_seed_gives_the_same_waypoint_flights(small_scene, city_mission):
     one, same, other = (waypoint_actions(small_scene, city_mission, np.random.default_rng(seed)) for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, same)
     assert (one != other).any()

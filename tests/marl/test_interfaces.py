@@ -94,7 +94,7 @@ def test_one_flight_is_the_first_of_the_batched(city_mission):
     assert [one for one, _ in rewards] != [two for _, two in rewards], "another seed draws another shadowing"
 
 
-def test_what_is_not_feasible_is_replaced_and_nobody_strands(city_mission):
+def test_infeasible_actions_are_replaced_and_every_uav_gets_home(city_mission):
     mask = np.array([[[True, False, True, False, False, False], [False, False, True, True, False, False],
                       [False] * 5 + [True]]])
     assert safe_actions(np.array([[2, 0, 1]]), mask).tolist() == [[2, 2, NO_OP]]

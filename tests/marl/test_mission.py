@@ -26,7 +26,7 @@ def test_the_snr_is_power_plus_gain_minus_noise_at_the_uavs_altitude(small_scene
                                        at_altitude["sigma_db"].sel(device=device.device).values)
 
 
-def test_what_is_not_detected_is_never_heard(small_scene):
+def test_a_link_without_gain_has_no_snr(small_scene):
     truth = segmented_truth(small_scene)
     dataset = truth.dataset.copy(deep=True)
     dataset["gain_db"].values[2, :, 3, 4] = np.nan
@@ -60,7 +60,7 @@ def test_batteries_are_counted_in_whole_hovers(small_scene):
     assert mission.battery.tolist() == [81, 81] and mission.longest == 81
 
 
-def test_known_positions_are_relative_to_the_lattice_and_nan_where_nobody_knows(small_scene):
+def test_known_positions_are_relative_to_the_lattice_and_nan_where_unknown(small_scene):
     mission = make_mission(small_scene, segmented_truth(small_scene), Known.anchors(small_scene))
     for device, known_m in zip(small_scene.config.devices, mission.known_m):
         if device.role == "anchor":

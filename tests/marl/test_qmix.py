@@ -32,7 +32,7 @@ def weights(module):
     return {name: tensor.detach().numpy() for name, tensor in module.named_parameters()}
 
 
-def test_the_agent_is_the_network_it_says_it_is(slow):
+def test_the_agent_matches_its_equations_in_double_precision(slow):
     agent = Agent(11, 3, 8, seeded())
     rng = np.random.default_rng(0)
     seen, last = rng.normal(size=(6, 2, 3, 11)).astype(np.float32), rng.integers(0, 6, (6, 2, 3))
@@ -54,7 +54,7 @@ def test_the_agent_walks_slot_by_slot_as_over_the_whole_flight():
     torch.testing.assert_close(torch.cat(steps), whole)
 
 
-def test_the_mixer_is_the_network_it_says_it_is(slow):
+def test_the_mixer_matches_its_equations_in_double_precision(slow):
     mixer = Mixer(9, 3, 5, seeded(1))
     chosen, state = torch.randn(4, 2, 3), torch.randn(4, 2, 9)
     total = mixer(chosen, state).detach().numpy()
@@ -212,7 +212,7 @@ def test_flights_of_an_earlier_twin_are_seen_with_the_positions_known_now(tiny):
 
 
 class Seen:
-    """Stands for flights of which the collected share is known beforehand."""
+    """Flights with a given collected share."""
 
     def __init__(self, share):
         self._share = share
@@ -248,14 +248,14 @@ def test_the_policy_that_does_best_in_the_map_flies(tiny, monkeypatch, shares, w
     assert torch.equal(best(learner), looked[which])
 
 
-@pytest.mark.parametrize("second_look, stays", [(0.5, True), (0.3, False)])
-def test_an_earlier_best_flies_on_if_it_is_still_best_in_the_new_map(tiny, monkeypatch, second_look, stays):
-    learner, looked = prepared(tiny, monkeypatch, [0.3, 0.6, 0.5, second_look, 0.4, 0.45, 0.44], rounds=2)
+@pytest.mark.parametrize("second_ratio, stays", [(0.5, True), (0.3, False)])
+def test_an_earlier_best_flies_on_if_it_is_still_best_in_the_new_map(tiny, monkeypatch, second_ratio, stays):
+    learner, looked = prepared(tiny, monkeypatch, [0.3, 0.6, 0.5, second_ratio, 0.4, 0.45, 0.44], rounds=2)
     assert torch.equal(looked[3], looked[1])  # looked at again, in the new map
     assert torch.equal(best(learner), looked[1] if stays else looked[5])
 
 
-def test_without_looks_the_last_policy_flies(tiny, monkeypatch):
+def test_without_selection_flights_the_last_policy_flies(tiny, monkeypatch):
     learner, looked = prepared(tiny, monkeypatch, [], LEARNER.model_copy(update={"selection_flights": 0}))
     assert not looked and learner.selection_flights == 0
     mean = learner._trainer.weights()

@@ -139,7 +139,7 @@ def test_exploration_is_as_frequent_as_epsilon_says_and_safe(city_mission, agent
     assert (home == 0).all()
 
 
-def test_a_guided_flight_follows_the_plan_as_long_as_it_is_told(city_mission, agent):
+def test_a_guided_flight_follows_the_plan_for_its_number_of_slots(city_mission, agent):
     rng = np.random.default_rng(0)
     plan = fly(Environment(city_mission, 1, rng), HeuristicPolicy("greedy", rng)).action[0]
     slots = np.array([0, 7, len(plan)])
@@ -229,7 +229,7 @@ def test_samples_are_different_flights_with_equal_chances_cut_to_the_longest(tin
     assert np.abs(counts / 2000 - 0.1).max() < 4 * np.sqrt(0.1 * 0.9 / 2000)
 
 
-def test_what_was_flown_comes_back_whole(tiny):
+def test_stored_flights_come_back_whole(tiny):
     mission = tiny(1)
     replay, flights = Replay(3, mission), flown(mission, 3, 0)
     replay.add(flights)
@@ -241,7 +241,7 @@ def test_what_was_flown_comes_back_whole(tiny):
             np.testing.assert_array_equal(kept[row, :slots], original[source, :slots])
 
 
-def test_the_state_restores_it(tiny):
+def test_the_state_restores_the_memory(tiny):
     mission = tiny(0)
     replay, other = Replay(5, mission), Replay(5, mission)
     for seed in range(4):

@@ -1,0 +1,90 @@
+"""The registry of learners, and the example of the documentation: a learner of somebody else's."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from marl.algorithm1 import run_algorithm
+from marl.learner import Learner, make_learner
+from marl.options import settings_of
+from marl.registry import LEARNERS, learner_class
+from marl.session import Session
+from marl.settings import LearnerSettings, RunSettings, check_together
+from radiotwin.errors import BadInput
+from radiotwin.survey import segmented_truth
+
+DOCS = Path(__file__).parents[2] / "docs" / "marl.md"
+
+
+@pytest.fixture
+def best_of_many():
+    """Run the example, and forget the learner afterwards."""
+    section = DOCS.read_text(encoding="utf-8").split("### Add a learner")[1]
+    code = section.split("```python\n")[1].split("```")[0]
+    exec(compile(code, str(DOCS), "exec"), {"__name__": "example"})
+    yield
+    LEARNERS.pop("best-of-many")
+
+
+def test_every_registered_learner_is_one():
+    for name in LEARNERS:
+        assert issubclass(learner_class(name), Learner)
+    assert [name for name in LEARNERS if learner_class(name).learns] == ["fedqmix", "qmix", "iql"]
+    assert [name for name in LEARNERS if not learner_class(name).uses_map] == ["greedy", "random"]
+    with pytest.raises(BadInput, match="allowed are fedqmix, qmix"):
+        learner_class("magic")
+
+
+def test_a_new_learner_runs_like_the_others(small_scene, tmp_path, best_of_many, capsys):
+    given = {"scene": str(small_scene.folder), "truth": "segmented", "twin": "log-distance",
+             "algorithm": "best-of-many", "real_episodes": "2", "episodes": "30", "flights": "4",
+             "planner_iterations": "50"}
+    run, settings = settings_of(given)
+    Session(run, settings, tmp_path / "out", resume=False).execute()
+    with (tmp_path / "out" / "comparison.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    # It learns, so that it is compared over maps; in the truth each of its episodes is a real one.
+    assert [(row["method"], row["trained_in"], row["real_episodes"]) for row in rows[:3]] == [
+        ("best-of-many", "log-distance twin", "2"), ("best-of-many", "NN twin", "2"),
+        ("best-of-many", "the truth", "60")]
+    assert float(rows[2]["truth_ratio"]) > float(rows[-1]["truth_ratio"])  # than random flights
+    assert json.loads((tmp_path / "out" / "config.json").read_text())["run"]["algorithm"] == "best-of-many"
+    assert "best-of-many" in capsys.readouterr().out
+
+
+def test_a_new_learner_resumes(small_scene, tmp_path, best_of_many):
+    run = RunSettings(algorithm="best-of-many", twin="log-distance", truth="segmented", real_episodes=2, episodes=20,
+                      flights=4)
+
+    def execute(folder, resume, on_round):
+        return run_algorithm(run, LearnerSettings(), small_scene, segmented_truth(small_scene), folder, resume,
+                             on_round, lambda *_: None)
+
+    def stop(rows, blocks):
+        raise KeyboardInterrupt
+
+    unbroken = execute(None, False, lambda *_: None)
+    with pytest.raises(KeyboardInterrupt):
+        execute(tmp_path, False, stop)
+    resumed = execute(tmp_path, True, lambda *_: None)
+    np.testing.assert_array_equal(resumed.flights.action, unbroken.flights.action)
+
+
+def test_only_what_learns_can_be_guided(best_of_many):
+    check_together(RunSettings(algorithm="best-of-many", guide="planner"), LearnerSettings())
+    with pytest.raises(BadInput, match="fedqmix, qmix, iql, best-of-many only"):
+        check_together(RunSettings(algorithm="random", guide="planner"), LearnerSettings())
+
+
+def test_an_unknown_learner_is_refused_as_every_other_choice():
+    with pytest.raises(BadInput, match=r"--algorithm best-of-many: Input should be 'fedqmix', .* or 'random'; allowed: "
+                                       r"fedqmix\|qmix\|iql\|greedy\|planner\|random"):
+        settings_of({"algorithm": "best-of-many"})
+
+
+def test_a_learner_sees_no_map_before_it_is_prepared(city_mission):
+    learner = make_learner(RunSettings(algorithm="random"), LearnerSettings(), city_mission, 1)
+    assert np.isneginf(learner.setup.mission.snr_db).all() and np.isfinite(city_mission.snr_db).all()
