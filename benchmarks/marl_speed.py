@@ -18,11 +18,11 @@ from torch import nn
 
 from marl.environment import ACTION_COUNT, Environment
 from marl.features import global_state, observe
-from marl.fedqmix.federation import Replicas
 from marl.flights import fly
 from marl.heuristics import HeuristicPolicy, random_actions
 from marl.mission import Known, make_mission
 from marl.qmix import QNetworks
+from marl.replicas import Replicas
 from marl.settings import PRESETS
 from marl.threads import keep_memory, limit_threads
 from marl.training import Replay, Trainer

@@ -21,8 +21,9 @@ from marl.learner import Learner, Setup
 from marl.mission import Mission
 from marl.planner import PlanPolicy, plan
 from marl.randomness import stream
+from marl.replicas import Replicas
 from marl.settings import LearnerSettings
-from marl.training import AgentPolicy, Trainer
+from marl.training import AgentPolicy
 from radiotwin.channel.adam import Adam
 
 MAX_GRADIENT_NORM = 10.0
@@ -274,29 +275,16 @@ class QMIX(Learner):
 
     networks: type[QNetworks] = QNetworks
 
-    def __init__(self, setup: Setup) -> None:
+    def __init__(self, setup: Setup, replicas: int = 1) -> None:
         super().__init__(setup)
-        run, settings, mission = setup.run, setup.settings, setup.mission
+        run, settings, mission, self.replicas = setup.run, setup.settings, setup.mission, replicas
         self._current = self.networks(settings, mission, run.seed, setup.device).agent
         self._best = copy.deepcopy(self._current)
         self._episodes = 0
         self._actions: np.ndarray | None = None  # of the guide's plan
-        self._start()
-
-    def _start(self) -> None:
-        self._trainer = Trainer(*self._trainer_arguments(0))
-
-    def _trainer_arguments(self, number: int) -> tuple:
-        setup = self.setup
-        return (self.networks, setup.settings, setup.mission, setup.rounds * setup.run.episodes,
-                setup.run.seed, number, setup.device)
-
-    def _enter(self, mission: Mission, actions: np.ndarray | None) -> None:
-        self._trainer.enter(mission, actions)
-
-    def _train(self, episodes: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
-        """Train for some episodes; return what is logged, and the new weights."""
-        return self._trainer.train(episodes), self._trainer.weights()
+        horizon = setup.rounds * run.episodes
+        self._trainers = Replicas([(self.networks, settings, mission, horizon, run.seed, number,
+                                    setup.device) for number in range(replicas)])
 
     @override
     def prepare(self, mission: Mission,
@@ -304,7 +292,7 @@ class QMIX(Learner):
         run, settings = self.setup.run, self.setup.settings
         if run.guide == "planner":
             self._actions = self._better_plan(mission)
-        self._enter(mission, self._actions)
+        self._trainers.call("enter", mission, self._actions)
         records, left = [], run.episodes
         highest = self._ratio(mission, self._best) if self._episodes else -np.inf
         while left:
@@ -319,6 +307,11 @@ class QMIX(Learner):
             records.append({"episodes": self._episodes, "twin_ratio": ratio} | trained)
             on_progress(block)
         return records
+
+    def _train(self, episodes: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+        """Train for some episodes; return the record to be logged, and the new weights."""
+        [record], [weights] = self._trainers.call("train", episodes), self._trainers.call("weights")
+        return record, weights
 
     def _ratio(self, mission: Mission, agent: Agent) -> float:
         """Return the share that a policy collects, always in the same shadowing.
@@ -357,10 +350,7 @@ class QMIX(Learner):
         # The replicas' memories are most of a checkpoint.
         return {"episodes": self._episodes, "best": self._best.state_dict(),
                 "actions": self._actions, "selection_flights": self.selection_flights,
-                "replicas": None if last else self._replica_states()}
-
-    def _replica_states(self) -> list[dict]:
-        return [self._trainer.state()]
+                "replicas": None if last else self._trainers.call("state")}
 
     @override
     def load_state(self, state: dict) -> None:
@@ -368,10 +358,11 @@ class QMIX(Learner):
         self.selection_flights = state["selection_flights"]
         self._best.load_state_dict(state["best"])
         if state["replicas"] is not None:
-            self._load_replicas(state["replicas"])
+            self._trainers.call("load_state", each=state["replicas"])
 
-    def _load_replicas(self, states: list[dict]) -> None:
-        self._trainer.load_state(states[0])
+    @override
+    def close(self) -> None:
+        self._trainers.close()
 
 
 @torch.no_grad()

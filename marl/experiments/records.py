@@ -23,8 +23,8 @@ EARLIER: dict[str, dict[str, Any]] = {
     "learner": {"excursion_slots": 1.0}}
 """What was done before there was a setting for it, where that is not its default."""
 LEARNERS = ("fedqmix", "qmix", "iql")
-DELETED = ("mix", "fly_again", "restart_epsilon", "restart_slots")
-"""Settings of learning that old records have."""
+DELETED = {"mix": (True, False), "fly_again": (False,), "restart_epsilon": (0.0,), "restart_slots": (25_000,)}
+"""Settings of learning that old records have, with the values that say nothing."""
 MEASURING = ("first_flight", "measure", "twin_shadowing")
 
 
@@ -128,7 +128,8 @@ def filled(settings: dict) -> dict:
         settings = settings | {"learner": {}}
     if run.get("twin") == "truth":  # nothing is measured
         settings = settings | {"run": {name: value for name, value in run.items() if name not in MEASURING}}
-    return settings | {name: {key: value for key, value in (group | settings[name]).items() if key not in DELETED}
+    return settings | {name: {key: value for key, value in (group | settings[name]).items()
+                              if value not in DELETED.get(key, ())}
                        for name, group in groups.items() if name in settings}
 
 

@@ -1,24 +1,10 @@
-"""FedQMIX: one QMIX replica for each UAV, averaged from time to time (the paper, Sec. III-C).
-
-From top to bottom: federated averaging, the learner, and replicas that train side by side.
-"""
-
-import multiprocessing
-import pickle
-import traceback
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from multiprocessing.connection import Connection
-from typing import Any
+"""FedQMIX: one QMIX replica for each UAV, averaged from time to time (the paper, Sec. III-C)."""
 
 import numpy as np
 from typing_extensions import override
 
-from marl.mission import Mission
+from marl.learner import Setup
 from marl.qmix import QMIX
-from marl.threads import keep_memory, limit_threads, usable_cores
-from marl.training import Trainer
-from radiotwin.errors import RunFailed
 
 Weights = dict[str, np.ndarray]
 
@@ -43,139 +29,13 @@ class FedQMIX(QMIX):
     gets a copy.
     """
 
-    @override
-    def _start(self) -> None:
-        self.replicas = self.setup.mission.uavs
-        self._pool = Replicas([self._trainer_arguments(n) for n in range(self.replicas)])
-
-    @override
-    def _enter(self, mission: Mission, actions: np.ndarray | None) -> None:
-        self._pool.call("enter", mission, actions)
+    def __init__(self, setup: Setup) -> None:
+        super().__init__(setup, replicas=setup.mission.uavs)
 
     @override
     def _train(self, episodes: int) -> tuple[dict[str, float], Weights]:
-        records = self._pool.call("train", episodes)
-        mean = average(self._pool.call("weights"))
-        if self.replicas > 1:
-            self._pool.call("set_weights", mean)
+        records = self._trainers.call("train", episodes)
+        mean = average(self._trainers.call("weights"))
+        self._trainers.call("set_weights", mean)
         return {name: float(np.mean([record[name] for record in records]))
                 for name in records[0]}, mean
-
-    @override
-    def _replica_states(self) -> list[dict]:
-        return self._pool.call("state")
-
-    @override
-    def _load_replicas(self, states: list[dict]) -> None:
-        self._pool.call("load_state", each=states)
-
-    @override
-    def close(self) -> None:
-        self._pool.close()
-
-
-class Replicas:
-    """Trainers that train side by side, each in a process of its own.
-
-    Processes, because three of them use two cores a quarter better than three threads do. With a
-    single replica or core they train one after the other in this process, to the same result.
-
-    Args:
-        arguments: of each `Trainer`.
-    """
-
-    def __init__(self, arguments: Sequence[tuple]) -> None:
-        here = len(arguments) == 1 or usable_cores() == 1
-        self._replicas = [(_Local if here else _Remote)(*each) for each in arguments]
-        # The threads only wait for the processes.
-        self._pool = ThreadPoolExecutor(1 if here else len(arguments))
-
-    def call(self, method: str, *arguments: Any, each: list | None = None) -> list:
-        """Call a method of all trainers at once.
-
-        Args:
-            method: name of a method of `Trainer`.
-            arguments: the same for all.
-            each: one more argument for every replica, after the others.
-
-        Returns:
-            The result of every replica.
-
-        Raises:
-            RunFailed: a process has ended.
-        """
-        own = [()] * len(self._replicas) if each is None else [(one,) for one in each]
-        calls = [self._pool.submit(replica.call, method, *arguments, *mine)
-                 for replica, mine in zip(self._replicas, own)]
-        return [call.result() for call in calls]
-
-    def close(self) -> None:
-        """End the processes."""
-        for replica in self._replicas:
-            replica.close()
-        self._pool.shutdown()
-
-
-class _Local:
-    def __init__(self, *arguments: Any) -> None:
-        self._trainer = Trainer(*arguments)
-
-    def call(self, method: str, *arguments: Any) -> Any:
-        return getattr(self._trainer, method)(*arguments)
-
-    def close(self) -> None:
-        pass
-
-
-class _Remote:
-    def __init__(self, *arguments: Any) -> None:
-        # A forked process would inherit the locks of threads that it does not have.
-        context = multiprocessing.get_context("spawn")
-        self._pipe, other = context.Pipe()
-        self._process = context.Process(target=_serve, args=(other, arguments), daemon=True)
-        self._process.start()
-        other.close()
-
-    def call(self, method: str, *arguments: Any) -> Any:
-        try:
-            _send(self._pipe, (method, arguments))
-            done, result = _receive(self._pipe)
-        except (EOFError, OSError):
-            raise RunFailed("a process that trains a replica has ended, perhaps for lack of "
-                            "memory; start the same command with --resume to go on from the last "
-                            "checkpoint") from None
-        if not done:
-            raise RuntimeError(f"in a replica's process:\n{result}")
-        return result
-
-    def close(self) -> None:
-        self._pipe.close()
-        self._process.join(timeout=10)
-        self._process.kill()
-
-
-def _serve(pipe: Connection, arguments: tuple) -> None:
-    """Answer calls until the other end of the pipe closes."""
-    limit_threads(1)
-    keep_memory()
-    trainer = Trainer(*arguments)
-    while True:
-        try:
-            method, call = _receive(pipe)
-        except (EOFError, KeyboardInterrupt):
-            return
-        try:
-            _send(pipe, (True, getattr(trainer, method)(*call)))
-        except KeyboardInterrupt:
-            return
-        except Exception:
-            _send(pipe, (False, traceback.format_exc()))
-
-
-def _send(pipe: Connection, message: tuple) -> None:
-    """Send plain bytes: `pipe.send` would hand over tensors as shared memory, one file each."""
-    pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
-
-
-def _receive(pipe: Connection) -> tuple:
-    return pickle.loads(pipe.recv_bytes())

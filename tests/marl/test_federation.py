@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-import marl.fedqmix.federation
-from marl.fedqmix.federation import Replicas, average
+import marl.replicas
+from marl.fedqmix.federation import average
 from marl.mission import Known, make_mission
 from marl.qmix import QNetworks
+from marl.replicas import Replicas
 from marl.settings import PRESETS
 from marl.training import Trainer
 from radiotwin.errors import RunFailed
@@ -74,7 +75,7 @@ def test_federating_all_averages_moments_and_target_networks(mission):
 
 
 def test_processes_learn_the_same_as_this_one(mission, monkeypatch):
-    monkeypatch.setattr(marl.fedqmix.federation, "usable_cores", lambda: 2)
+    monkeypatch.setattr(marl.replicas, "usable_cores", lambda: 2)
     here = [Trainer(*each) for each in arguments(mission)]
     replicas = Replicas(arguments(mission))
     try:
@@ -98,7 +99,7 @@ def test_processes_learn_the_same_as_this_one(mission, monkeypatch):
 
 
 def test_on_one_core_replicas_learn_in_this_process(mission, monkeypatch):
-    monkeypatch.setattr(marl.fedqmix.federation, "usable_cores", lambda: 1)
+    monkeypatch.setattr(marl.replicas, "usable_cores", lambda: 1)
     here = [Trainer(*each) for each in arguments(mission)]
     replicas = Replicas(arguments(mission))
     try:

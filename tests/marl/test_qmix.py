@@ -258,7 +258,7 @@ def test_an_earlier_best_flies_on_if_it_is_still_best_in_the_new_map(tiny, monke
 def test_without_selection_flights_the_last_policy_flies(tiny, monkeypatch):
     learner, looked = prepared(tiny, monkeypatch, [], LEARNER.model_copy(update={"selection_flights": 0}))
     assert not looked and learner.selection_flights == 0
-    mean = learner._trainer.weights()
+    [mean] = learner._trainers.call("weights")
     agent = torch.cat([torch.from_numpy(mean[f"agent.{name}"]).ravel() for name, _ in
                        learner._best.named_parameters()])
     assert torch.equal(best(learner), agent)
