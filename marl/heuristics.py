@@ -55,21 +55,6 @@ class Greedy(Random):
     name = "greedy"
 
 
-def random_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> np.ndarray:
-    """Return (E, U) feasible actions, all with the same probability."""
-    return _random(mission, frame, rng)
-
-
-def greedy_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> np.ndarray:
-    """Return (E, U) greedy actions with distinct targets.
-
-    Each UAV, one after the other, claims the nearest device with data that nobody claimed, flies
-    towards it along the larger axis and hovers on top. Where that is not feasible: the other axis,
-    then any feasible action.
-    """
-    return _greedy(mission, frame, rng)
-
-
 def waypoint_actions(scene: Scene, mission: Mission, rng: np.random.Generator) -> np.ndarray:
     """Return flights of all UAVs that measure: straight from one random cell to the next.
 
@@ -94,7 +79,8 @@ def waypoint_actions(scene: Scene, mission: Mission, rng: np.random.Generator) -
 
 
 @njit(cache=True, nogil=True)
-def _random(mission: Mission, frame: Frame, rng: np.random.Generator) -> np.ndarray:
+def random_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> np.ndarray:
+    """Return (E, U) feasible actions, all with the same probability."""
     flights, uavs = frame.battery.shape
     action = np.empty((flights, uavs), dtype=np.int64)
     mask = np.empty(ACTION_COUNT, dtype=np.bool_)
@@ -118,7 +104,13 @@ def _any_of(mask: np.ndarray, rng: np.random.Generator) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _greedy(mission: Mission, frame: Frame, rng: np.random.Generator) -> np.ndarray:
+def greedy_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> np.ndarray:
+    """Return (E, U) greedy actions with distinct targets.
+
+    Each UAV, one after the other, claims the nearest device with data that nobody claimed, flies
+    towards it along the larger axis and hovers on top. Where that is not feasible: the other axis,
+    then any feasible action.
+    """
     flights, uavs = frame.battery.shape
     devices = len(mission.data_units)
     action = np.empty((flights, uavs), dtype=np.int64)

@@ -103,17 +103,16 @@ def _serve(pipe: Connection, arguments: tuple) -> None:
     limit_threads(1)
     keep_memory()
     trainer = Trainer(*arguments)
-    while True:
-        try:
+    try:
+        while True:
             method, call = _receive(pipe)
-        except (EOFError, KeyboardInterrupt):
-            return
-        try:
-            _send(pipe, (True, getattr(trainer, method)(*call)))
-        except KeyboardInterrupt:
-            return
-        except Exception:
-            _send(pipe, (False, traceback.format_exc()))
+            try:
+                answer = True, getattr(trainer, method)(*call)
+            except Exception:
+                answer = False, traceback.format_exc()
+            _send(pipe, answer)
+    except (EOFError, OSError, KeyboardInterrupt):  # closed, or interrupted
+        return
 
 
 def _send(pipe: Connection, message: tuple) -> None:
