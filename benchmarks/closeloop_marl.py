@@ -16,11 +16,12 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from marl.algorithm1 import Reality
+from marl.flights import evaluate
+from marl.learner import make_learner
 from marl.mission import Known
 from marl.randomness import stream
-from marl.reality import Reality, known_by
 from marl.settings import PRESETS, RunSettings
-from marl.strategies import evaluate, make_strategy
 from marl.threads import keep_memory, limit_threads
 from radiotwin.closeloop.corrected import corrected_twin
 from radiotwin.closeloop.report import make_report
@@ -116,9 +117,9 @@ def train(scene: Scene, truth, twin: Twin | None, seed: int, algorithm: str, epi
     """Train in the map of a twin (or in the truth) and fly in the truth."""
     run = RunSettings(algorithm=algorithm, episodes=episodes, real_episodes=1, seed=seed)
     reality = Reality(scene, truth, run.assignment, 0.0, seed)
-    known = Known.truth(scene) if twin is None else known_by(twin)
+    known = Known.truth(scene) if twin is None else Known.of(twin.devices)
     mission = reality.mission(known) if twin is None else reality.twin_mission(twin, known)
-    strategy = make_strategy(run, PRESETS["fast"], mission, 1, "cpu")
+    strategy = make_learner(run, PRESETS["fast"], mission, 1)
     try:
         with progress("training", total=episodes) as advance:
             strategy.prepare(mission, advance)

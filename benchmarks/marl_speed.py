@@ -18,15 +18,14 @@ from torch import nn
 
 from marl.environment import ACTION_COUNT, Environment
 from marl.features import global_state, observe
-from marl.flights import HeuristicPolicy, fly
-from marl.heuristics import random_actions
-from marl.learner import Learner
+from marl.flights import fly
+from marl.heuristics import HeuristicPolicy, random_actions
 from marl.mission import Known, make_mission
-from marl.replay import Replay
+from marl.qmix import QNetworks
 from marl.replicas import Replicas
 from marl.settings import PRESETS
 from marl.threads import keep_memory, limit_threads
-from marl.trainer import Trainer
+from marl.training import Replay, Trainer
 from radiotwin.channel.adam import Adam
 from radiotwin.scene import Scene
 from radiotwin.survey import segmented_truth
@@ -88,10 +87,11 @@ def updates(mission) -> tuple[float, float, float]:
     replay = Replay(BATCH, mission)
     replay.add(fly(Environment(mission, BATCH, rng), HeuristicPolicy("greedy", rng)))
     flights = replay.sample(BATCH, rng)
-    ours = Learner(PRESETS["paper"], mission, 0)
-    reference = Learner(PRESETS["paper"], mission, 0)
+    ours = QNetworks(PRESETS["paper"], mission, 0)
+    reference = QNetworks(PRESETS["paper"], mission, 0)
     size, uavs, hidden = observe(mission, Environment(mission, 1, rng).reset())[0].shape[-1], mission.uavs, 64
-    reference.agent, reference.target_agent = SlotBySlot(size, uavs, hidden), SlotBySlot(size, uavs, hidden)
+    reference.agent = reference.modules["agent"] = SlotBySlot(size, uavs, hidden)
+    reference.targets["agent"] = SlotBySlot(size, uavs, hidden)
     reference.optimiser = Adam(reference.parameters())
     taken = [cpu_seconds(lambda: learner.update(flights, mission, 5e-4), 15) for learner in (ours, reference)]
     return *taken, float(flights.length.mean())
@@ -100,7 +100,8 @@ def updates(mission) -> tuple[float, float, float]:
 def replicas_wall_s(mission, episodes: int) -> dict[str, float]:
     """Wall seconds for three replicas of the preset `paper` to train: one after the other, as threads, as processes."""
     settings, walls = PRESETS["paper"], {}
-    trainers = [Trainer(settings, mission, 10_000, 0, stream) for stream in range(3)]
+    arguments = [(QNetworks, settings, mission, 10_000, 0, number) for number in range(3)]
+    trainers = [Trainer(*each) for each in arguments]
     for trainer in trainers:
         trainer.train(40)
     for name, workers in (("one after the other", 1), ("three threads", 3)):
@@ -108,7 +109,7 @@ def replicas_wall_s(mission, episodes: int) -> dict[str, float]:
             started = time.perf_counter()
             list(pool.map(lambda trainer: trainer.train(episodes), trainers))
             walls[name] = time.perf_counter() - started
-    with closing(Replicas(3, settings, mission, 10_000, 0)) as replicas:
+    with closing(Replicas(arguments)) as replicas:
         replicas.call("train", 40)
         started = time.perf_counter()
         replicas.call("train", episodes)

@@ -6,10 +6,9 @@
 import numpy as np
 
 import radiotwin as rt
-from marl.environment import Environment
-from marl.flights import HeuristicPolicy, fly
-from marl.mission import make_mission
-from marl.reality import known_by
+from marl.flights import evaluate
+from marl.heuristics import HeuristicPolicy
+from marl.mission import Known, make_mission
 
 rt.build_preset("small", "plan/scene")
 scene = rt.Scene.load("plan/scene")
@@ -21,13 +20,13 @@ twin = rt.fit_twin(measurements, scene, model="segmented_log_distance", seed=0)
 # The mission in the twin, with the devices where the twin believes they are, and the same in the truth.
 
 # %%
-known = known_by(twin)
+known = Known.of(twin.devices)
 in_twin = make_mission(scene, twin.radio_map(scene), known)
 in_truth = make_mission(scene, truth, known)
 for name in ("greedy", "random"):
     for where, mission in (("twin", in_twin), ("truth", in_truth)):
         rng = np.random.default_rng(0)
-        ratio = fly(Environment(mission, 32, rng), HeuristicPolicy(name, rng)).ratio(mission)
+        ratio = evaluate(mission, HeuristicPolicy(name, rng), 32, rng).ratio(mission)
         print(f"{name} flights collect {ratio.mean():.0%} of all data in the {where}")
 
 # %% [markdown]

@@ -1,5 +1,8 @@
-"""Multi-UAV data harvesting: a mission in a radio map, and what plans it (QMIX, IQL, federated QMIX, a planner).
+"""Multi-UAV data harvesting: a mission in a radio map, and learners that plan its flights.
 
-After Chen et al., "Model-aided Federated Reinforcement Learning for Multi-UAV Trajectory Planning in IoT Networks",
-GLOBECOM Workshops 2023; called "the paper" throughout the package.
+After Chen et al., "Model-aided Federated Reinforcement Learning for Multi-UAV Trajectory Planning
+in IoT Networks", GLOBECOM Workshops 2023; called "the paper" throughout the package.
+
+Read first `mission` (the inputs), `environment` (the rules) and `features` (observations);
+then a learner: `qmix`, `iql`, `fedqmix.federation`, `planner` or `heuristics`; then `algorithm1`.
 """

@@ -1,7 +1,8 @@
-"""A run's state on disk: whole or not at all, and read without executing anything in it."""
+"""Checkpoints: written whole or not at all, and read without executing anything in them."""
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -10,17 +11,22 @@ import torch
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, atomic_path
 
-FORMAT = 3  # 1 had the optimiser's state as torch.optim writes it, 2 not when a trainer entered its map
+FORMAT = 3  # 1 had the optimiser's state as torch.optim writes it
 
 
 def save_checkpoint(state: dict, path: Path) -> None:
-    """Write nested dicts and lists of numbers, texts, arrays, tensors and tables."""
+    """Write a checkpoint.
+
+    Args:
+        state: nested dicts and lists of numbers, texts, arrays, tensors and tables.
+        path: of the file.
+    """
     with atomic_path(path) as temporary:
         torch.save({"format": FORMAT, "state": _packed(state)}, temporary)
 
 
 def load_checkpoint(path: Path) -> dict:
-    """Read what `save_checkpoint` wrote.
+    """Read a checkpoint of `save_checkpoint`.
 
     Raises:
         BadInput: it is damaged, or of another version.
@@ -30,16 +36,19 @@ def load_checkpoint(path: Path) -> dict:
     except (OSError, MemoryError):
         raise
     except Exception as error:  # zipfile, pickle and torch each have their own
-        raise BadInput(f"{path} is damaged ({type(error).__name__}); remove the run's folder and start again") from None
+        raise BadInput(f"{path} is damaged ({type(error).__name__}); remove the run's folder and "
+                       "start again") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise BadInput(f"{path} was written by another version of radiotwin, in a form that this one does not read; "
-                       "finish the run with that version, or remove its folder and start again")
+        raise BadInput(
+            f"{path} was written by another version of radiotwin, in a form that this one does not "
+            "read; finish the run with that version, or remove its folder and start again")
     return _unpacked(content["state"])
 
 
 def folder_content(folder: Path) -> dict[str, np.ndarray]:
-    """The files of a flat folder, for a checkpoint."""
-    return {path.name: np.frombuffer(path.read_bytes(), np.uint8) for path in sorted(folder.iterdir())}
+    """Return the files of a flat folder, for a checkpoint."""
+    return {path.name: np.frombuffer(path.read_bytes(), np.uint8)
+            for path in sorted(folder.iterdir())}
 
 
 def restore_folder(content: dict[str, np.ndarray], folder: Path) -> None:
@@ -49,10 +58,10 @@ def restore_folder(content: dict[str, np.ndarray], folder: Path) -> None:
             (temporary / name).write_bytes(data.tobytes())
 
 
-def _packed(value):
+def _packed(value: Any) -> Any:
     if isinstance(value, pd.DataFrame):
-        return {"__table__": {name: list(column) if column.dtype.kind not in "fiub" else _packed(column.to_numpy())
-                              for name, column in value.items()}}
+        return {"__table__": {name: _packed(column.to_numpy()) if column.dtype.kind in "fiub"
+                              else list(column) for name, column in value.items()}}
     if isinstance(value, np.ndarray):
         return {"__array__": torch.from_numpy(np.array(value))}
     if isinstance(value, dict):
@@ -65,7 +74,7 @@ def _packed(value):
     return value
 
 
-def _unpacked(value):
+def _unpacked(value: Any) -> Any:
     if isinstance(value, dict):
         if "__table__" in value:
             return pd.DataFrame(_unpacked(value["__table__"]))

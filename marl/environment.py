@@ -1,22 +1,22 @@
 """Many flights at once: the mission's rules, compiled.
 
-One slot: collect from the assigned device at the current position, then move, then draw new SNRs and assign devices
-anew. So the first position counts and the last one does not.
+One slot: collect from the assigned device at the current position, then move, then draw new SNRs
+and assign devices anew. So the first position counts and the last one does not.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from scipy.fft import fft2, next_fast_len
 
 from marl.mission import COSTS, MOVES, NO_OP, Mission
-from marl.shadowing import CorrelatedField
 
 ACTION_COUNT = len(COSTS)
 
 
 class Frame(NamedTuple):
-    """What there is to know of E flights at the beginning of a slot; U UAVs, K devices.
+    """The state of E flights at the beginning of a slot; U UAVs, K devices.
 
     Attributes:
         cell: (E, U, 2) int16 row and column.
@@ -33,26 +33,27 @@ class Frame(NamedTuple):
     assigned: np.ndarray
 
     def copy(self) -> "Frame":
+        """Return a copy in new memory."""
         return Frame(*(array.copy() for array in self))
 
 
 def empty_frame(shape: tuple[int, ...], mission: Mission) -> Frame:
-    """Arrays for `shape` frames, zero."""
+    """Return frames of zeros, with leading dimensions `shape`."""
     uavs, devices = mission.uavs, mission.devices
     return Frame(np.zeros((*shape, uavs, 2), np.int16), np.zeros((*shape, uavs), np.int16),
-                 np.zeros((*shape, uavs, devices), np.float32), np.zeros((*shape, devices), np.float32),
-                 np.zeros((*shape, uavs), np.int16))
+                 np.zeros((*shape, uavs, devices), np.float32),
+                 np.zeros((*shape, devices), np.float32), np.zeros((*shape, uavs), np.int16))
 
 
 class Environment:
-    """E flights side by side; each ends when all its batteries are empty, and then stands still.
+    """E flights side by side; each ends when all its batteries are empty, and then stays as it is.
 
     Attributes:
-        mission: its rules.
-        frame: the present; `step` overwrites it.
+        mission: the rules.
+        frame: the present state; `step` overwrites it.
     """
 
-    def __init__(self, mission: Mission, flights: int, rng: np.random.Generator):
+    def __init__(self, mission: Mission, flights: int, rng: np.random.Generator) -> None:
         self.mission = mission
         self.frame = empty_frame((flights,), mission)
         self._rng = rng
@@ -60,11 +61,11 @@ class Environment:
         self._field = None
         if mission.shadowing_share > 0:
             self._field = CorrelatedField(shape[1:], mission.step_m, mission.shadowing_m)
-        # (E, K, ny, nx) what stays of each flight's shadowing, in sigmas
+        # (E, K, ny, nx) part of each flight's shadowing that stays, in standard deviations
         self._lasting = np.zeros((flights if self._field else 0, *shape), dtype=np.float32)
 
     def reset(self, which: np.ndarray | None = None) -> Frame:
-        """All UAVs at their starts with full batteries, all data at their devices.
+        """Put all UAVs at their starts with full batteries, and all data at their devices.
 
         Args:
             which: (E,) bool, flights that begin anew while the others go on; None for all.
@@ -75,8 +76,9 @@ class Environment:
         frame.battery[which] = mission.battery
         frame.data_units[which] = mission.data_units
         if self._field is not None:
-            new = self._field.draw(int(which.sum()) * mission.devices, self._rng) * mission.shadowing_share**0.5
-            self._lasting[which] = new.reshape(-1, *self._lasting.shape[1:])
+            fields = self._field.draw(int(which.sum()) * mission.devices, self._rng)
+            fields = fields * mission.shadowing_share**0.5
+            self._lasting[which] = fields.reshape(-1, *self._lasting.shape[1:])
         _sense(mission, frame, which, self._lasting, self._rng)
         return frame
 
@@ -87,9 +89,10 @@ class Environment:
             action: (E, U) int; each must be feasible (`feasible`), which is not checked.
 
         Returns:
-            (E, U) float32 data units that each UAV collected
+            (E, U) float32 data units that each UAV collected.
         """
-        return _step(self.mission, self.frame, np.asarray(action, dtype=np.int64), self._lasting, self._rng)
+        return _step(self.mission, self.frame, np.asarray(action, dtype=np.int64), self._lasting,
+                     self._rng)
 
     @property
     def done(self) -> np.ndarray:
@@ -97,14 +100,49 @@ class Environment:
         return (self.frame.battery == 0).all(axis=1)
 
 
-@njit(cache=True, nogil=True)
-def feasible(mission: Mission, uav: int, row: int, column: int, battery: int, out: np.ndarray) -> None:
-    """The safety controller (paper, Sec. II-A): exactly the actions after which the UAV is on the map and can still
-    fly home; nothing but no-op with an empty battery.
+class CorrelatedField:
+    """Gaussian random fields over a grid, of unit variance and correlation exp(-distance / length).
+
+    Drawn by circulant embedding (Dietrich and Newsam 1997, SIAM J. Sci. Comput. 18); the
+    correlation is that of Gudmundson 1991, Electronics Letters 27.
 
     Args:
-        mission, uav: whose terminal is home.
-        row, column, battery: where it is and what it has left [hovers].
+        shape: (rows, columns).
+        step_m: of the grid [m].
+        length_m: of the correlation [m].
+    """
+
+    def __init__(self, shape: tuple[int, int], step_m: float, length_m: float) -> None:
+        self._shape = shape
+        # A torus on which opposite sides of the map are three lengths apart, hence uncorrelated.
+        around = [next_fast_len(side + min(side, int(np.ceil(3.0 * length_m / step_m))))
+                  for side in shape]
+        rows, columns = (np.minimum(np.arange(n), n - np.arange(n)) * step_m for n in around)
+        spectrum = fft2(np.exp(-np.hypot(rows[:, None], columns) / length_m)).real.clip(0)
+        self._amplitude = np.sqrt(spectrum / spectrum.mean() / spectrum.size).astype(np.float32)
+
+    def draw(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Return (count, rows, columns) float32 independent fields."""
+        pairs = -(-count // 2)
+        parts = rng.standard_normal((pairs, *self._amplitude.shape, 2), dtype=np.float32)
+        noise = parts.view(np.complex64)[..., 0]
+        fields = fft2(noise * self._amplitude)[:, :self._shape[0], :self._shape[1]]
+        return np.concatenate([fields.real, fields.imag])[:count]  # the parts are independent
+
+
+@njit(cache=True, nogil=True)
+def feasible(mission: Mission, uav: int, row: int, column: int, battery: int,
+             out: np.ndarray) -> None:
+    """Find the safe actions (paper, Sec. II-A): on the map, and with battery enough to fly home.
+
+    With an empty battery that is no-op alone.
+
+    Args:
+        mission: the rules.
+        uav: its terminal is home.
+        row: cell of the UAV.
+        column: cell of the UAV.
+        battery: left [hovers].
         out: (6,) bool, overwritten.
     """
     ny, nx = mission.steps_home.shape[1:]
@@ -112,19 +150,38 @@ def feasible(mission: Mission, uav: int, row: int, column: int, battery: int, ou
     out[NO_OP] = battery == 0
     for action in range(NO_OP):
         to_row, to_column = row + MOVES[action, 0], column + MOVES[action, 1]
-        out[action] = (0 <= to_row < ny and 0 <= to_column < nx and
-                       mission.steps_home[uav, to_row, to_column] * move_cost <= battery - COSTS[action])
+        out[action] = (
+            0 <= to_row < ny and 0 <= to_column < nx and
+            mission.steps_home[uav, to_row, to_column] * move_cost <= battery - COSTS[action])
+
+
+def safe_actions(action: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Replace actions that are not feasible by the first feasible one.
+
+    That is hovering where the battery allows it, otherwise a move after which home can still be
+    reached, and no-op after landing.
+
+    Args:
+        action: (E, U) int, of any policy.
+        mask: (E, U, 6) bool, feasible actions, as `marl.features.observe` returns them.
+
+    Returns:
+        (E, U) int64 feasible actions.
+    """
+    action = np.asarray(action, dtype=np.int64)
+    allowed = np.take_along_axis(mask, action[..., None], axis=-1)[..., 0]
+    return np.where(allowed, action, mask.argmax(axis=-1))
 
 
 @njit(cache=True, nogil=True)
 def rate(snr_db: float, rate_scale: float) -> float:
-    """Data units per slot (paper, Eq. 6: R = log2(1 + SNR) [bit/s/Hz])."""
+    """Return data units per slot (paper, Eq. 6: R = log2(1 + SNR) [bit/s/Hz])."""
     return rate_scale * np.log2(1.0 + 10.0 ** (snr_db / 10.0))
 
 
 @njit(cache=True, nogil=True)
 def assign(strength: np.ndarray, max_rate: bool, out: np.ndarray) -> None:
-    """Give UAVs devices: a UAV has at most one device and a device at most one UAV (paper, Eq. 7 and 8).
+    """Match UAVs and devices, each with at most one of the other (paper, Eq. 7 and 8).
 
     Args:
         strength: (U, K) of each link, -inf where it cannot be used; overwritten.
@@ -153,7 +210,8 @@ def assign(strength: np.ndarray, max_rate: bool, out: np.ndarray) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _sense(mission, frame, flying, lasting, rng):
+def _sense(mission: Mission, frame: Frame, flying: np.ndarray, lasting: np.ndarray,
+           rng: np.random.Generator) -> None:
     """Draw this slot's SNRs and assign devices, in the flights that are still flying."""
     uavs, devices = mission.snr_db.shape[:2]
     of_slot = np.sqrt(1.0 - mission.shadowing_share)
@@ -175,13 +233,15 @@ def _sense(mission, frame, flying, lasting, rng):
                     snr_db = np.float32(-np.inf)
                 frame.snr_db[e, u, k] = snr_db
                 # A UAV with an empty battery has landed and collects no more.
-                usable = frame.battery[e, u] > 0 and frame.data_units[e, k] > 0 and snr_db >= mission.threshold_db
+                usable = (frame.battery[e, u] > 0 and frame.data_units[e, k] > 0
+                          and snr_db >= mission.threshold_db)
                 strength[u, k] = snr_db if usable else -np.inf
         assign(strength, mission.max_rate, frame.assigned[e])
 
 
 @njit(cache=True, nogil=True)
-def _step(mission, frame, action, lasting, rng):
+def _step(mission: Mission, frame: Frame, action: np.ndarray, lasting: np.ndarray,
+          rng: np.random.Generator) -> np.ndarray:
     flights, uavs = action.shape
     collected = np.zeros((flights, uavs), dtype=np.float32)
     flying = np.zeros(flights, dtype=np.bool_)

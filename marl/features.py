@@ -1,6 +1,6 @@
-"""What agents and mixer see of a frame: observations, feasible actions, state; the paper's, scaled to about one.
+"""Features of a frame for agents and mixer: those of the paper (Sec. III-A), scaled to about one.
 
-The replay memory keeps frames, which are a fifth of the size, and this module makes the same features of them again.
+The replay memory keeps frames, which take a fifth of the memory, and makes features of them again.
 """
 
 import numpy as np
@@ -15,27 +15,26 @@ OWN_FEATURES = ACTION_COUNT + 2  # feasible actions, battery, battery needed
 STATE_UAV_FEATURES = 5  # battery, battery needed, x, y, done
 STATE_DEVICE_FEATURES = 3  # data left, x, y
 
-SNR_SCALE_DB = 20.0
-SNR_RANGE = (-2.0, 3.0)  # a link that is not detected shows the lowest value
-
 
 def observation_size(mission: Mission) -> int:
+    """Return the number of features that one agent sees."""
     return DEVICE_FEATURES * mission.devices + UAV_FEATURES * (mission.uavs - 1) + OWN_FEATURES
 
 
 def state_size(mission: Mission) -> int:
+    """Return the number of features that the mixer sees."""
     return STATE_UAV_FEATURES * mission.uavs + STATE_DEVICE_FEATURES * mission.devices
 
 
 def observe(mission: Mission, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
-    """Observations and feasible actions (paper, Sec. III-A).
+    """Return observations and feasible actions.
 
     Args:
-        mission: the one that the frames belong to.
+        mission: that the frames belong to.
         frame: E frames.
 
     Returns:
-        (E, U, observation_size) float32, and (E, U, 6) bool
+        (E, U, observation_size) float32, and (E, U, 6) bool.
     """
     shape = frame.battery.shape
     observation = np.empty((*shape, observation_size(mission)), dtype=np.float32)
@@ -45,25 +44,26 @@ def observe(mission: Mission, frame: Frame) -> tuple[np.ndarray, np.ndarray]:
 
 
 def global_state(mission: Mission, frame: Frame) -> np.ndarray:
-    """State of E frames (paper, Sec. III-A): (E, state_size) float32."""
+    """Return the (E, state_size) float32 state of E frames."""
     state = np.empty((len(frame.battery), state_size(mission)), dtype=np.float32)
     _global_state(mission, frame, state)
     return state
 
 
 @njit(cache=True, nogil=True)
-def _scaled_snr(mission, snr_db):
-    return min(max((snr_db - mission.threshold_db) / SNR_SCALE_DB, SNR_RANGE[0]), SNR_RANGE[1])
+def _scaled_snr(mission: Mission, snr_db: float) -> float:
+    """Return the SNR over the threshold in 20 dB; a link that is not detected shows -2."""
+    return min(max((snr_db - mission.threshold_db) / 20.0, -2.0), 3.0)
 
 
 @njit(cache=True, nogil=True)
-def _length_scale_m(mission):
-    """The longer side of the lattice."""
+def _length_scale_m(mission: Mission) -> float:
+    """Return the longer side of the lattice [m]."""
     return max(max(mission.steps_home.shape[1:]) - 1, 1) * mission.step_m
 
 
 @njit(cache=True, nogil=True)
-def _observe(mission, frame, observation, mask):
+def _observe(mission: Mission, frame: Frame, observation: np.ndarray, mask: np.ndarray) -> None:
     flights, uavs, devices = frame.snr_db.shape
     scale_m = _length_scale_m(mission)
     for e in range(flights):
@@ -78,8 +78,9 @@ def _observe(mission, frame, observation, mask):
                 out[at] = _scaled_snr(mission, snr_db)
                 out[at + 1] = reachable
                 out[at + 2] = frame.data_units[e, k] / mission.data_units[k] if reachable else 0.0
-                dx, dy = (mission.known_m[k, 0] - x_m) / scale_m, (mission.known_m[k, 1] - y_m) / scale_m
-                if np.isnan(dx):  # a device that nobody has located yet: no direction
+                dx = (mission.known_m[k, 0] - x_m) / scale_m
+                dy = (mission.known_m[k, 1] - y_m) / scale_m
+                if np.isnan(dx):  # not located yet: no direction
                     dx, dy = 0.0, 0.0
                 out[at + 3] = np.sqrt(dx**2 + dy**2)
                 out[at + 4] = dx
@@ -91,8 +92,10 @@ def _observe(mission, frame, observation, mask):
                     continue
                 dx = (frame.cell[e, v, 1] - column) * mission.step_m
                 dy = (frame.cell[e, v, 0] - row) * mission.step_m
-                distance_m = np.sqrt(dx**2 + dy**2 + (mission.altitude_m[v] - mission.altitude_m[u]) ** 2)
-                snr_db = mission.uav_link_db[0] + mission.uav_link_db[1] * np.log10(max(distance_m, 1.0))
+                dz = mission.altitude_m[v] - mission.altitude_m[u]
+                distance_m = np.sqrt(dx**2 + dy**2 + dz**2)
+                log_distance = np.log10(max(distance_m, 1.0))
+                snr_db = mission.uav_link_db[0] + mission.uav_link_db[1] * log_distance
                 out[at] = _scaled_snr(mission, snr_db)
                 if snr_db >= mission.threshold_db:
                     out[at + 1] = 1.0
@@ -112,7 +115,7 @@ def _observe(mission, frame, observation, mask):
 
 
 @njit(cache=True, nogil=True)
-def _global_state(mission, frame, state):
+def _global_state(mission: Mission, frame: Frame, state: np.ndarray) -> None:
     flights, uavs, devices = frame.snr_db.shape
     scale_m = _length_scale_m(mission)
     for e in range(flights):

@@ -1,9 +1,11 @@
-"""Pictures of a run: trajectories as in the paper, and what was collected against the real flights it took."""
+"""Figures of a run: trajectories as in the paper, and collected data against real flights."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -16,7 +18,6 @@ from radiotwin.files import atomic_path
 from radiotwin.scene import Scene
 from radiotwin.scene.preview import height_grid
 
-DPI = 130
 IDLE_COLOUR = "#555555"
 COLOURS = ["#0072b2", "#e69f00", "#009e73", "#d55e00", "#cc79a7", "#56b4e9",  # Okabe and Ito
            "#6a3d9a", "#f0e442"]
@@ -25,28 +26,28 @@ LEVEL_STYLES = ("--", ":", "-.")
 
 
 def choose_flight(flights: Flights, mission: Mission) -> int:
-    """The flight that collects what is nearest the median."""
+    """Return the index of the flight whose collected share is nearest the median."""
     ratio = flights.ratio(mission)
     return int(np.abs(ratio - np.median(ratio)).argmin())
 
 
 def draw_trajectories(scene: Scene, mission: Mission, flights: Flights, flight: int, known: Known,
                       path: Path | str) -> None:
-    """One flight over the city, a panel for each UAV.
+    """Write `trajectories_figure` as PNG."""
+    save(trajectories_figure(scene, mission, flights, flight, known), path)
+
+
+def trajectories_figure(scene: Scene, mission: Mission, flights: Flights, flight: int,
+                        known: Known) -> Figure:
+    """Draw one flight over the city, a panel for each UAV.
 
     Args:
         scene: the city, and the true positions of its devices.
         mission: that was flown.
         flights: a record.
-        flight: the one of them to draw.
-        known: positions that the UAVs believed in.
-        path: of the PNG file.
+        flight: index of the flight in it.
+        known: positions as the UAVs knew them.
     """
-    save(trajectories_figure(scene, mission, flights, flight, known), path)
-
-
-def trajectories_figure(scene: Scene, mission: Mission, flights: Flights, flight: int, known: Known) -> Figure:
-    """The figure that `draw_trajectories` saves."""
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     width_in = 5.6 * min(max((x_max - x_min) / (y_max - y_min), 0.6), 1.6)
     figure = Figure(figsize=(width_in * mission.uavs, 7.0), layout="constrained")
@@ -56,47 +57,51 @@ def trajectories_figure(scene: Scene, mission: Mission, flights: Flights, flight
     height_m, bounds = height_grid(scene, 400)
     collected = _collected_by_device(flights, flight, mission)
     for u, axes in enumerate(panels):
-        axes.imshow(np.ma.masked_less(height_m, 0.5), origin="lower", extent=bounds, cmap="Greys", vmin=0,
-                    vmax=2.2 * max(float(height_m.max()), 1.0), interpolation="nearest")
+        axes.imshow(np.ma.masked_less(height_m, 0.5), origin="lower", extent=bounds, cmap="Greys",
+                    vmin=0, vmax=2.2 * max(float(height_m.max()), 1.0), interpolation="nearest")
         _draw_path(axes, scene, mission, flights, flight, u, colours)
         _draw_devices(axes, scene, known, colours, collected[u] / mission.data_units)
         share = collected[u].sum() / mission.data_units.sum()
+        uav = scene.config.uavs[u]
         axes.set(xlim=(x_min, x_max), ylim=(y_min, y_max), aspect="equal", xlabel="x, east [m]",
-                 title=f"{scene.config.uavs[u].uav}, {scene.config.uavs[u].altitude_m:g} m: {share:.0%} of all data")
+                 title=f"{uav.uav}, {uav.altitude_m:g} m: {share:.0%} of all data")
     panels[0].set_ylabel("y, north [m]")
     figure.legend(handles=_legend(), loc="outside lower center", ncols=4, frameon=False)
-    figure.suptitle(f"{scene.config.name}: {flights.ratio(mission)[flight]:.1%} collected. Paths in the colour of the "
-                    "device that serves the UAV; percentages: what this UAV takes of a device's data")
+    figure.suptitle(
+        f"{scene.config.name}: {flights.ratio(mission)[flight]:.1%} collected. Paths in the colour "
+        "of the device that serves the UAV; percentages: what this UAV takes of a device's data")
     return figure
 
 
 def draw_curve(curves: dict[str, list[dict]], levels: dict[str, float], path: Path | str) -> None:
-    """Collected data against real episodes.
-
-    Args:
-        curves: name -> rows with `real_episodes`, `truth_ratio` and `truth_ratio_std`; rows without any real episode
-            are left out.
-        levels: name -> ratio of what needs no learning.
-        path: of the PNG file.
-    """
+    """Write `curve_figure` as PNG."""
     save(curve_figure(curves, levels), path)
 
 
 def curve_figure(curves: dict[str, list[dict]], levels: dict[str, float]) -> Figure:
-    """The figure that `draw_curve` saves."""
+    """Draw the collected share against real episodes.
+
+    Args:
+        curves: name -> rows with `real_episodes`, `truth_ratio` and `truth_ratio_std`; rows
+            without any real episode are left out.
+        levels: name of a baseline -> its share.
+    """
     figure = Figure(figsize=(8.5, 5.2), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     for number, (name, rows) in enumerate(curves.items()):
         rows = [row for row in rows if row["real_episodes"] > 0]
-        x, ratio, spread = (np.array([row[key] for row in rows]) for key in
-                            ("real_episodes", "truth_ratio", "truth_ratio_std"))
+        x, ratio, ratio_sd = (np.array([row[key] for row in rows]) for key in
+                              ("real_episodes", "truth_ratio", "truth_ratio_std"))
         colour = COLOURS[number % len(COLOURS)]
         axes.plot(x, ratio, marker=MARKERS[number % len(MARKERS)], color=colour, label=name)
-        axes.fill_between(x, ratio - spread, ratio + spread, color=colour, alpha=0.18, linewidth=0)
+        axes.fill_between(x, ratio - ratio_sd, ratio + ratio_sd, color=colour, alpha=0.18,
+                          linewidth=0)
     for style, (name, level) in zip(LEVEL_STYLES, levels.items()):
-        axes.axhline(level, color="black", linestyle=style, linewidth=1.1, label=f"{name}: {level:.2f}")
-    axes.set(xscale="log", ylim=(0, 1.02), xlabel="real episodes", ylabel="share of all data collected in the truth")
+        axes.axhline(level, color="black", linestyle=style, linewidth=1.1,
+                     label=f"{name}: {level:.2f}")
+    axes.set(xscale="log", ylim=(0, 1.02), xlabel="real episodes",
+             ylabel="share of all data collected in the truth")
     axes.grid(alpha=0.3, which="both")
     figure.legend(loc="outside lower center", ncols=3, frameon=False)
     return figure
@@ -109,7 +114,7 @@ def _device_colours(count: int) -> list:
 
 
 def _collected_by_device(flights: Flights, flight: int, mission: Mission) -> np.ndarray:
-    """(U, K) data units"""
+    """Return (U, K) data units."""
     collected = np.zeros((mission.uavs, mission.devices))
     for slot in range(flights.length[flight]):
         for u in range(mission.uavs):
@@ -119,56 +124,68 @@ def _collected_by_device(flights: Flights, flight: int, mission: Mission) -> np.
     return collected
 
 
-def _draw_path(axes, scene: Scene, mission: Mission, flights: Flights, flight: int, u: int, colours: list) -> None:
-    flying = flights.frames.battery[flight, :flights.length[flight], u] > 0
-    cells = flights.frames.cell[flight, :flights.length[flight], u][flying].astype(float)
-    served = flights.frames.assigned[flight, :flights.length[flight], u][flying]
+def _draw_path(axes: Axes, scene: Scene, mission: Mission, flights: Flights, flight: int, u: int,
+               colours: list) -> None:
+    slots = slice(0, flights.length[flight])
+    flying = flights.frames.battery[flight, slots, u] > 0
+    cells = flights.frames.cell[flight, slots, u][flying].astype(float)
+    served = flights.frames.assigned[flight, slots, u][flying]
     x_m = scene.lattice.x_m[0] + cells[:, 1] * mission.step_m
     y_m = scene.lattice.y_m[0] + cells[:, 0] * mission.step_m
-    # A little to the right of the direction of flight, so that the way back does not cover the way out.
+    # A little to the right of the direction of flight, so that the way back does not hide the way
+    # out.
     points = np.stack([x_m, y_m], axis=1)
     steps = np.diff(points, axis=0)
     aside = 0.12 * np.stack([steps[:, 1], -steps[:, 0]], axis=1)
     paint = [IDLE_COLOUR if k < 0 else colours[k] for k in served]
-    axes.add_collection(LineCollection(list(np.stack([points[:-1] + aside, points[1:] + aside], axis=1)),
-                                       colors=paint[:len(steps)], linewidths=2.4, capstyle="round"))
+    lines = np.stack([points[:-1] + aside, points[1:] + aside], axis=1)
+    axes.add_collection(LineCollection(list(lines), colors=paint[:len(steps)], linewidths=2.4,
+                                       capstyle="round"))
     stays = np.flatnonzero((steps == 0).all(axis=1))
     hovers: dict[tuple, list] = {}
     for slot in stays:
         hovers.setdefault((*points[slot], paint[slot]), []).append(slot)
-    for (at_x_m, at_y_m, colour), slots in hovers.items():
-        axes.plot(at_x_m, at_y_m, "o", color=colour, markersize=3 + 2.2 * np.sqrt(len(slots)), alpha=0.75)
+    for (at_x_m, at_y_m, colour), hovering in hovers.items():
+        axes.plot(at_x_m, at_y_m, "o", color=colour, alpha=0.75,
+                  markersize=3 + 2.2 * np.sqrt(len(hovering)))
     config = scene.config.uavs[u]
-    axes.plot(config.start_x_m, config.start_y_m, "s", color="black", markersize=9, markerfacecolor="none",
-              markeredgewidth=1.8)
-    axes.plot(config.terminal_x_m, config.terminal_y_m, "D", color="black", markersize=13, markerfacecolor="none",
-              markeredgewidth=1.8)
+    for x_m, y_m, marker, size in ((config.start_x_m, config.start_y_m, "s", 9),
+                                   (config.terminal_x_m, config.terminal_y_m, "D", 13)):
+        axes.plot(x_m, y_m, marker, color="black", markersize=size, markerfacecolor="none",
+                  markeredgewidth=1.8)
 
 
-def _draw_devices(axes, scene: Scene, known: Known, colours: list, share: np.ndarray) -> None:
+def _draw_devices(axes: Axes, scene: Scene, known: Known, colours: list,
+                  share: np.ndarray) -> None:
     for k, device in enumerate(scene.config.devices):
-        axes.plot(device.x_m, device.y_m, "^" if device.role == "anchor" else "*", color=colours[k],
-                  markersize=11 if device.role == "anchor" else 15, markeredgecolor="black", markeredgewidth=0.8)
+        marker, size = ("^", 11) if device.role == "anchor" else ("*", 15)
+        axes.plot(device.x_m, device.y_m, marker, color=colours[k], markersize=size,
+                  markeredgecolor="black", markeredgewidth=0.8)
         if device.role != "anchor" and device.device in known.position_m:
-            axes.plot(*known.position_m[device.device], "x", color="black", markersize=7, markeredgewidth=1.6)
+            axes.plot(*known.position_m[device.device], "x", color="black", markersize=7,
+                      markeredgewidth=1.6)
         label = device.device if share[k] < 0.005 else f"{device.device}: {share[k]:.0%}"
         right = device.x_m > np.mean(scene.config.extent.bounds[:2])
-        axes.annotate(label, (device.x_m, device.y_m), (-9 if right else 9, 6), textcoords="offset points", fontsize=9,
-                      ha="right" if right else "left", weight="bold" if share[k] >= 0.005 else "normal",
+        axes.annotate(label, (device.x_m, device.y_m), (-9 if right else 9, 6),
+                      textcoords="offset points", fontsize=9, ha="right" if right else "left",
+                      weight="bold" if share[k] >= 0.005 else "normal",
                       path_effects=[withStroke(linewidth=2.5, foreground="white")])
 
 
 def _legend() -> list[Line2D]:
-    def mark(marker: str, label: str, size: float, **style) -> Line2D:
-        return Line2D([], [], linestyle="", marker=marker, label=label, markersize=size, color="black", **style)
+    def mark(marker: str, label: str, size: float, **style: Any) -> Line2D:
+        return Line2D([], [], linestyle="", marker=marker, label=label, markersize=size,
+                      color="black", **style)
 
     return [mark("^", "anchor", 9), mark("*", "unknown device, true position", 12),
-            mark("x", "its estimate", 7, markeredgewidth=1.6), mark("s", "start", 9, markerfacecolor="none"),
-            mark("D", "terminal", 9, markerfacecolor="none"), mark("o", "hover, larger for longer", 8),
+            mark("x", "its estimate", 7, markeredgewidth=1.6),
+            mark("s", "start", 9, markerfacecolor="none"),
+            mark("D", "terminal", 9, markerfacecolor="none"),
+            mark("o", "hover, larger for longer", 8),
             Line2D([], [], color=IDLE_COLOUR, linewidth=2.4, label="no device serves the UAV")]
 
 
-def save(figure: Figure, path: Path | str, dpi: int = DPI) -> None:
+def save(figure: Figure, path: Path | str, dpi: int = 130) -> None:
     """Write a figure as PNG, whole or not at all."""
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=dpi)

@@ -1,18 +1,13 @@
-"""Flying whole flights with a policy, and what is recorded of them."""
+"""Fly whole flights with a policy, and record them."""
 
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 import pandas as pd
-import torch
 
 from marl.environment import Environment, Frame, empty_frame
-from marl.exploration import Exploration
-from marl.features import observe
-from marl.heuristics import greedy_actions, random_actions
 from marl.mission import Mission
-from marl.networks import Agent
 from radiotwin.scene import Scene
 
 
@@ -21,10 +16,10 @@ class Flights:
     """A record of E flights, slot by slot.
 
     Attributes:
-        frames: `Frame` of arrays (E, T, …): what there was before each action.
+        frames: `Frame` of arrays (E, T, …): the state before each action.
         action: (E, T, U) int8.
         collected: (E, T, U) float32 data units.
-        length: (E,) int32 slots until all batteries were empty; what lies behind is padding.
+        length: (E,) int32 slots until all batteries were empty; the rest is padding.
     """
 
     frames: Frame
@@ -33,103 +28,37 @@ class Flights:
     length: np.ndarray
 
     def ratio(self, mission: Mission) -> np.ndarray:
-        """(E,) collected data of all the data that waited."""
-        return self.collected.sum(axis=(1, 2), dtype=float) / self.frames.data_units[:, 0].sum(axis=1, dtype=float)
-
-
-def track_table(scene: Scene, mission: Mission, flights: Flights, flight: int) -> pd.DataFrame:
-    """One flight as a table: flight, uav, time_s, x_m, y_m, z_m, the device that served the UAV there (empty for none),
-    and collected [data units]; a row for every slot until the UAV's battery is empty."""
-    parts, frames = [], flights.frames
-    names = np.array([device.device for device in scene.config.devices] + [""])
-    for u, uav in enumerate(scene.config.uavs):
-        slots = np.arange(max(int((frames.battery[flight, :flights.length[flight], u] > 0).sum()), 1))
-        cell = frames.cell[flight, slots, u].astype(int)
-        parts.append(pd.DataFrame({
-            "flight": f"f{flight}", "uav": uav.uav, "time_s": scene.config.mission.slot_s * slots,
-            "x_m": scene.lattice.x_m[cell[:, 1]], "y_m": scene.lattice.y_m[cell[:, 0]], "z_m": mission.altitude_m[u],
-            "device": names[frames.assigned[flight, slots, u]], "collected": flights.collected[flight, slots, u]}))
-    return pd.concat(parts, ignore_index=True)
+        """Return the (E,) share of all data that was collected."""
+        waiting = self.frames.data_units[:, 0].sum(axis=1, dtype=float)
+        return self.collected.sum(axis=(1, 2), dtype=float) / waiting
 
 
 class Policy(Protocol):
     """Decides the actions of E flights, slot by slot."""
 
     def start(self, mission: Mission, flights: int) -> None:
-        """Forget the flights before."""
+        """Forget the flights before, and prepare for some new ones."""
 
     def act(self, frame: Frame) -> np.ndarray:
-        """(E, U) feasible actions."""
-
-
-class HeuristicPolicy:
-    """`random` or `greedy`."""
-
-    def __init__(self, name: str, rng: np.random.Generator):
-        self._decide = {"random": random_actions, "greedy": greedy_actions}[name]
-        self._rng = rng
-
-    def start(self, mission: Mission, flights: int) -> None:
-        self._mission = mission
-
-    def act(self, frame: Frame) -> np.ndarray:
-        return self._decide(self._mission, frame, self._rng)
-
-
-class AgentPolicy:
-    """The best action by the agents' values.
-
-    Args:
-        agent: its weights are read at every slot.
-        device: the torch device that the agent is on.
-        exploration: changes some actions; None: none.
-        guide: actions (T, U) of a plan, and (E,) slots that each flight follows it before the agents take over.
-    """
-
-    def __init__(self, agent: Agent, device: str = "cpu", exploration: Exploration | None = None,
-                 guide: tuple[np.ndarray, np.ndarray] | None = None):
-        self._agent, self._device, self._exploration, self._guide = agent, device, exploration, guide
-
-    def start(self, mission: Mission, flights: int) -> None:
-        self._mission = mission
-        self._memory = None
-        self._last = np.full((flights, mission.uavs), -1, dtype=np.int64)
-        self._slot = 0
-        if self._exploration is not None:
-            self._exploration.start(flights, mission.uavs)
-
-    @torch.inference_mode()
-    def act(self, frame: Frame) -> np.ndarray:
-        observation, mask = observe(self._mission, frame)
-        values, self._memory = self._agent(torch.from_numpy(observation).to(self._device)[None],
-                                           torch.from_numpy(self._last).to(self._device)[None], self._memory)
-        action = np.where(mask, values[0].cpu().numpy(), -np.inf).argmax(axis=-1)
-        if self._exploration is not None:
-            action = self._exploration.change(action, mask)
-        if self._guide is not None:
-            plan, slots = self._guide
-            wanted = plan[self._slot]
-            # A UAV that was lost cannot follow.
-            following = (slots > self._slot)[:, None] & mask[:, np.arange(len(wanted)), wanted]
-            action = np.where(following, wanted, action)
-        self._last, self._slot = action, self._slot + 1
-        return action
+        """Return (E, U) feasible actions."""
 
 
 class Replayed:
-    """The actions of earlier flights, flight by flight; only for as many, and where they are feasible.
+    """Repeat the actions of earlier flights: as many flights, in missions where they are feasible.
 
     Args:
         action: (E, T, U).
     """
 
-    def __init__(self, action: np.ndarray):
+    def __init__(self, action: np.ndarray) -> None:
         self._action = action
 
     def start(self, mission: Mission, flights: int) -> None:
+        """See `Policy`."""
         self._slot = 0
 
     def act(self, frame: Frame) -> np.ndarray:
+        """See `Policy`."""
         self._slot += 1
         return self._action[:, self._slot - 1]
 
@@ -139,9 +68,9 @@ def fly(environment: Environment, policy: Policy) -> Flights:
     mission, frame = environment.mission, environment.reset()
     count = len(frame.battery)
     policy.start(mission, count)
-    record = Flights(empty_frame((count, mission.longest), mission),
-                     np.zeros((count, mission.longest, mission.uavs), np.int8),
-                     np.zeros((count, mission.longest, mission.uavs), np.float32), np.zeros(count, np.int32))
+    shape = (count, mission.longest)
+    record = Flights(empty_frame(shape, mission), np.zeros((*shape, mission.uavs), np.int8),
+                     np.zeros((*shape, mission.uavs), np.float32), np.zeros(count, np.int32))
     slot, flying = 0, np.ones(count, dtype=bool)
     while flying.any():
         for kept, now in zip(record.frames, frame):
@@ -153,5 +82,37 @@ def fly(environment: Environment, policy: Policy) -> Flights:
         flying = ~environment.done
         slot += 1
     for kept, now in zip(record.frames, frame):
-        kept[:, slot:] = now[:, None]  # padding that is a place where a UAV can be
+        kept[:, slot:] = now[:, None]  # padding with a state that features can be made of
     return record
+
+
+def evaluate(mission: Mission, policy: Policy, flights: int, rng: np.random.Generator) -> Flights:
+    """Fly a policy to judge it; `rng` draws the shadowing."""
+    return fly(Environment(mission, flights, rng), policy)
+
+
+def track_table(scene: Scene, mission: Mission, flights: Flights, flight: int) -> pd.DataFrame:
+    """Return one flight as a table, a row for every slot until the UAV's battery is empty.
+
+    Args:
+        scene: names of UAVs and devices, and the lattice.
+        mission: that was flown.
+        flights: a record.
+        flight: index of the flight in it.
+
+    Returns:
+        flight, uav, time_s, x_m, y_m, z_m, device (that served the UAV there, empty for none),
+        collected [data units].
+    """
+    parts, frames = [], flights.frames
+    names = np.array([device.device for device in scene.config.devices] + [""])
+    for u, uav in enumerate(scene.config.uavs):
+        flying = frames.battery[flight, :flights.length[flight], u] > 0
+        slots = np.arange(max(int(flying.sum()), 1))
+        cell = frames.cell[flight, slots, u].astype(int)
+        parts.append(pd.DataFrame({
+            "flight": f"f{flight}", "uav": uav.uav, "time_s": scene.config.mission.slot_s * slots,
+            "x_m": scene.lattice.x_m[cell[:, 1]], "y_m": scene.lattice.y_m[cell[:, 0]],
+            "z_m": mission.altitude_m[u], "device": names[frames.assigned[flight, slots, u]],
+            "collected": flights.collected[flight, slots, u]}))
+    return pd.concat(parts, ignore_index=True)

@@ -1,37 +1,99 @@
-"""What needs no learning and no map: random flights, and greedy ones with distinct targets."""
+"""Flights without learning and map: random, greedy, and from one random cell to the next."""
+
+from collections.abc import Callable
 
 import numpy as np
 from numba import njit
+from typing_extensions import override
 
 from marl.environment import ACTION_COUNT, Frame, feasible
-from marl.mission import EAST, HOVER, NO_OP, NORTH, SOUTH, WEST, Mission
+from marl.flights import Policy
+from marl.learner import Learner
+from marl.mission import COSTS, EAST, HOVER, MOVES, NO_OP, NORTH, SOUTH, WEST, Mission
+from radiotwin.scene import Scene
+from radiotwin.survey.campaign import fly
+
+PATTERN = "random-waypoint"
+"""Pattern of `radiotwin.survey` that `waypoint_actions` flies."""
 
 
-def random_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> np.ndarray:
-    """(E, U) any feasible action, each with the same chance."""
-    return _random(mission, frame, rng)
+class HeuristicPolicy:
+    """Fly `random` or `greedy`."""
+
+    def __init__(self, name: str, rng: np.random.Generator) -> None:
+        self._decide = {"random": random_actions, "greedy": greedy_actions}[name]
+        self._rng = rng
+
+    def start(self, mission: Mission, flights: int) -> None:
+        """See `marl.flights.Policy`."""
+        self._mission = mission
+
+    def act(self, frame: Frame) -> np.ndarray:
+        """See `marl.flights.Policy`."""
+        return self._decide(self._mission, frame, self._rng)
 
 
-def greedy_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> np.ndarray:
-    """(E, U) each UAV, one after the other, claims the nearest device with data that nobody claimed, flies towards it
-    along the larger axis and hovers on top. Where that is not feasible: the other axis, then any feasible action."""
-    return _greedy(mission, frame, rng)
+class Random(Learner):
+    """`--algorithm random`: any feasible action in every slot."""
+
+    learns = uses_map = False
+    name = "random"
+
+    @override
+    def prepare(self, mission: Mission,
+                on_progress: Callable[[int], None]) -> list[dict[str, float]]:
+        return []
+
+    @override
+    def policy(self, rng: np.random.Generator) -> Policy:
+        return HeuristicPolicy(self.name, rng)
+
+
+class Greedy(Random):
+    """`--algorithm greedy`: to the nearest device with data that no other UAV has claimed."""
+
+    name = "greedy"
+
+
+def waypoint_actions(scene: Scene, mission: Mission, rng: np.random.Generator) -> np.ndarray:
+    """Return flights of all UAVs that measure: straight from one random cell to the next.
+
+    Battery that is left when no other cell can be flown to and home from is used to hover.
+
+    Args:
+        scene: its UAVs and buildings.
+        mission: the same, as arrays.
+        rng: of the paths.
+
+    Returns:
+        (T, U) int8 feasible actions.
+    """
+    moves = {tuple(move): action for action, move in enumerate(MOVES)
+             if action not in (HOVER, NO_OP)}
+    actions = np.full((mission.longest, mission.uavs), NO_OP, dtype=np.int8)
+    for u, uav in enumerate(scene.config.uavs):
+        flown = [moves[tuple(step)] for step in np.diff(fly(scene, uav, PATTERN, rng), axis=0)]
+        hovers = int(mission.battery[u]) - COSTS[flown].sum()
+        actions[:len(flown) + hovers, u] = [*flown, *[HOVER] * hovers]
+    return actions
 
 
 @njit(cache=True, nogil=True)
-def _random(mission, frame, rng):
+def random_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> np.ndarray:
+    """Return (E, U) feasible actions, all with the same probability."""
     flights, uavs = frame.battery.shape
     action = np.empty((flights, uavs), dtype=np.int64)
     mask = np.empty(ACTION_COUNT, dtype=np.bool_)
     for e in range(flights):
         for u in range(uavs):
-            feasible(mission, u, frame.cell[e, u, 0], frame.cell[e, u, 1], frame.battery[e, u], mask)
+            feasible(mission, u, frame.cell[e, u, 0], frame.cell[e, u, 1], frame.battery[e, u],
+                     mask)
             action[e, u] = _any_of(mask, rng)
     return action
 
 
 @njit(cache=True, nogil=True)
-def _any_of(mask, rng):
+def _any_of(mask: np.ndarray, rng: np.random.Generator) -> int:
     nth = int(rng.random() * mask.sum())
     for a in range(ACTION_COUNT):
         if mask[a]:
@@ -42,7 +104,13 @@ def _any_of(mask, rng):
 
 
 @njit(cache=True, nogil=True)
-def _greedy(mission, frame, rng):
+def greedy_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> np.ndarray:
+    """Return (E, U) greedy actions with distinct targets.
+
+    Each UAV, one after the other, claims the nearest device with data that nobody claimed, flies
+    towards it along the larger axis and hovers on top. Where that is not feasible: the other axis,
+    then any feasible action.
+    """
     flights, uavs = frame.battery.shape
     devices = len(mission.data_units)
     action = np.empty((flights, uavs), dtype=np.int64)
@@ -57,7 +125,8 @@ def _greedy(mission, frame, rng):
             for k in range(devices):
                 dx = mission.known_m[k, 0] - column * mission.step_m
                 dy = mission.known_m[k, 1] - row * mission.step_m
-                if frame.data_units[e, k] > 0 and not claimed[k] and dx**2 + dy**2 < nearest:
+                near = dx**2 + dy**2 < nearest
+                if frame.data_units[e, k] > 0 and not claimed[k] and near:
                     target, nearest = k, dx**2 + dy**2
             feasible(mission, u, row, column, frame.battery[e, u], mask)
             if target < 0:

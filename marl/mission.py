@@ -1,26 +1,28 @@
-"""The mission as arrays: what the UAVs fly over, what they collect, and what they know."""
+"""The mission as arrays: the map, the data to collect, and the knowledge of the UAVs."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
+from radiotwin.scene.config import UavConfig
 from radiotwin.survey.grid import HOVER_COST, MOVE_COST, UNREACHABLE, FlightGrid
 from radiotwin.survey.statistical import LOS_LAW
 
 HOVER, NORTH, WEST, SOUTH, EAST, NO_OP = range(6)
-MOVES = np.array([(0, 0), (1, 0), (0, -1), (-1, 0), (0, 1), (0, 0)], dtype=np.int64)  # (row, column) of each action
-# The battery is counted in whole hovers, so that it is exact.
-UNIT = HOVER_COST
-MOST_HOVERS = 20_000  # of a flight: batteries are counted in 16 bits
-COSTS = np.array([1, *[round(MOVE_COST / UNIT)] * 4, 0], dtype=np.int64)
+MOVES = np.array([(0, 0), (1, 0), (0, -1), (-1, 0), (0, 1), (0, 0)], dtype=np.int64)
+"""(row, column) of each action."""
+COSTS = np.array([1, *[round(MOVE_COST / HOVER_COST)] * 4, 0], dtype=np.int64)
+"""Battery cost of each action, in whole hovers, so that the battery is counted exactly."""
+MAX_HOVERS = 20_000  # of a battery, which is counted in 16 bits
 
 
 class Mission(NamedTuple):
-    """All that a flight depends on; U UAVs, K devices, a lattice of ny x nx cells at each UAV's altitude.
+    """All that a flight depends on; U UAVs, K devices, a lattice of ny x nx cells at each altitude.
 
     A tuple of arrays, because compiled functions take it as it is.
 
@@ -30,18 +32,22 @@ class Mission(NamedTuple):
         steps_home: (U, ny, nx) int64 moves to the UAV's terminal.
         start: (U, 2) int64 cell (row, column) where each UAV starts.
         battery: (U,) int64 at take-off, in hovers (half battery units).
-        altitude_m: (U,)
+        altitude_m: (U,) [m]
         data_units: (K,) float64 waiting at each device.
-        known_m: (K, 2) float64 horizontal positions of the devices as the UAVs know them, relative to the lattice's
-            south-west corner; NaN where nobody knows. They decide what agents see, never what they receive.
-        step_m: lattice step.
+        known_m: (K, 2) float64 horizontal positions of the devices as the UAVs know them, relative
+            to the lattice's south-west corner [m]; NaN where unknown. They decide what agents see,
+            never what they receive.
+        step_m: lattice step [m].
         rate_scale: data units per slot and bit/s/Hz.
-        threshold_db: SNR from which on a link works.
-        detection_db: SNR below which a receiver does not detect anything.
-        uav_link_db: (2,) SNR between two UAVs at 1 m [dB], and its slope per decade of distance (the LoS law).
-        max_rate: whether a UAV that loses its best device to another one idles (the paper's Eq. 8); otherwise the
-            strongest remaining pair is matched until none is left.
-        shadowing_share, shadowing_m: see `Shadowing`; with 0 all of it is drawn anew in every slot.
+        threshold_db: least SNR of a usable link [dB].
+        detection_db: SNR below which a receiver does not detect anything [dB].
+        uav_link_db: (2,) SNR between two UAVs at 1 m [dB], and its slope per decade of distance
+            (the LoS law).
+        max_rate: whether a UAV that loses its best device to another one idles (the paper's
+            Eq. 8); otherwise the strongest remaining pair is matched until none is left.
+        shadowing_share: share of the shadowing's variance that stays for a flight; the rest is
+            drawn anew in every slot.
+        shadowing_m: distance over which the correlation of the part that stays falls to 1/e [m].
     """
 
     snr_db: np.ndarray
@@ -63,63 +69,66 @@ class Mission(NamedTuple):
 
     @property
     def uavs(self) -> int:
+        """Number of UAVs."""
         return len(self.start)
 
     @property
     def devices(self) -> int:
+        """Number of devices."""
         return len(self.data_units)
 
     @property
     def longest(self) -> int:
-        """Slots of the longest possible flight: one that hovers until the battery is empty."""
+        """Slots of the longest possible flight, which hovers until the battery is empty."""
         return int(self.battery.max())
 
 
 @dataclass(frozen=True)
 class Known:
-    """Where the UAVs believe the devices are: device -> (x, y) [m]; those that are missing nobody has located."""
+    """Positions of the devices as the UAVs know them.
+
+    Attributes:
+        position_m: device -> (x, y) [m]; devices without a known position are missing.
+    """
 
     position_m: dict[str, tuple[float, float]]
 
     @classmethod
+    def of(cls, devices: Iterable[Any]) -> "Known":
+        """Return the positions of `Twin.devices`, or of a scene's, where they are known."""
+        return cls({d.device: (d.x_m, d.y_m) for d in devices
+                    if np.isfinite([d.x_m, d.y_m]).all()})
+
+    @classmethod
     def truth(cls, scene: Scene) -> "Known":
-        """All true positions: more than a real UAV knows."""
-        return cls({d.device: (d.x_m, d.y_m) for d in scene.config.devices})
+        """Return all true positions: more than a real UAV knows."""
+        return cls.of(scene.config.devices)
 
     @classmethod
     def anchors(cls, scene: Scene) -> "Known":
-        """What is known before the first flight."""
-        return cls({d.device: (d.x_m, d.y_m) for d in scene.config.devices if d.role == "anchor"})
+        """Return the positions that are known before the first flight."""
+        return cls.of(d for d in scene.config.devices if d.role == "anchor")
 
 
-def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: str = "matching") -> Mission:
-    """The mission of a scene in a radio map: the truth's, or a twin's.
+def make_mission(scene: Scene, radio_map: RadioMap, known: Known,
+                 assignment: str = "matching") -> Mission:
+    """Return the mission of a scene in a radio map: the truth's, or a twin's.
 
     Args:
         scene: its UAVs, radio, batteries and data; the buildings keep UAVs out.
-        radio_map: over the scene's lattice; its `sigma_db`, where it has one, is drawn in every slot. A device that it
-            lacks is never heard, and nothing below the scene's sensitivity is.
+        radio_map: over the scene's lattice. A device that it lacks is never heard, and nothing
+            below the scene's sensitivity is. Its `sigma_db`, if any, is the standard deviation of
+            shadowing that is drawn in every slot; with the attributes `shadowing_share` and
+            `shadowing_length_m` (see `radiotwin.twin.shadowing`) a part of it stays for a flight.
         known: positions that the agents see.
         assignment: `matching` or `max-rate`.
 
     Raises:
-        BadInput: no UAV, no device, a map of another lattice, or a battery that does not reach the terminal.
+        BadInput: no UAV, no device, a map of another lattice or with impossible attributes, or a
+            battery that does not reach the terminal.
     """
+    _check(scene, radio_map, assignment)
     config, lattice = scene.config, scene.lattice
-    path = scene.folder / "scene.toml"
-    if assignment not in ("matching", "max-rate"):
-        raise BadInput(f"assignment {assignment!r} is unknown; allowed are matching, max-rate")
-    if not config.uavs or not config.devices:
-        raise BadInput(f"{path}: a mission needs at least one UAV and one device, here are {len(config.uavs)} and "
-                       f"{len(config.devices)}; add [[uavs]] or [[devices]] tables")
-    if radio_map.gain_db.shape[1:] != lattice.shape or \
-            not np.allclose(radio_map.lattice.positions_m, lattice.positions_m):
-        raise BadInput(f"the radio map's lattice {radio_map.gain_db.shape[1:]} (z, y, x) is not that of {path} "
-                       f"{lattice.shape}; make the map for this scene")
-    for uav in config.uavs:
-        if not 1 <= uav.battery / UNIT <= MOST_HOVERS:
-            raise BadInput(f"{path}: uav {uav.uav!r}: battery = {uav.battery:g}; a mission allows {UNIT:g} to "
-                           f"{MOST_HOVERS * UNIT:g}")
     levels = [int(np.abs(lattice.z_m - uav.altitude_m).argmin()) for uav in config.uavs]
     to_snr_db = config.radio.tx_power_dbm - config.radio.noise_dbm
     shape = (len(config.uavs), len(config.devices), *lattice.shape[1:])
@@ -134,26 +143,62 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known, assignment: st
             sigma_db[:, k] = np.nan_to_num(radio_map.dataset["sigma_db"].values[row, levels])
     starts, homes = zip(*(_ends(scene, uav, level) for uav, level in zip(config.uavs, levels)))
     origin_m = np.array([lattice.x_m[0], lattice.y_m[0]])
-    known_m = np.array([known.position_m.get(d.device, (np.nan, np.nan)) for d in config.devices]) - origin_m
+    known_m = np.array([known.position_m.get(d.device, (np.nan, np.nan)) for d in config.devices])
     return Mission(
-        snr_db, sigma_db, np.array(homes), np.array(starts),
-        np.array([int(uav.battery / UNIT + 1e-9) for uav in config.uavs]),
-        np.array([uav.altitude_m for uav in config.uavs], dtype=float),
-        np.full(len(config.devices), float(config.mission.data_units)), known_m, lattice.step_m,
-        float(config.mission.rate_scale), float(config.radio.snr_threshold_db),
-        float(config.gain_limit_db + to_snr_db),
-        np.array([to_snr_db + LOS_LAW.intercept_db, 10 * LOS_LAW.slope]), assignment == "max-rate")
+        snr_db, sigma_db, steps_home=np.array(homes), start=np.array(starts),
+        battery=np.array([int(uav.battery / HOVER_COST + 1e-9) for uav in config.uavs]),
+        altitude_m=np.array([uav.altitude_m for uav in config.uavs], dtype=float),
+        data_units=np.full(len(config.devices), float(config.mission.data_units)),
+        known_m=known_m - origin_m, step_m=lattice.step_m,
+        rate_scale=float(config.mission.rate_scale),
+        threshold_db=float(config.radio.snr_threshold_db),
+        detection_db=float(config.gain_limit_db + to_snr_db),
+        uav_link_db=np.array([to_snr_db + LOS_LAW.intercept_db, 10 * LOS_LAW.slope]),
+        max_rate=assignment == "max-rate",
+        shadowing_share=float(radio_map.dataset.attrs.get("shadowing_share", 0.0)),
+        shadowing_m=float(radio_map.dataset.attrs.get("shadowing_length_m", 50.0)))
 
 
-def _ends(scene: Scene, uav, level: int) -> tuple[np.ndarray, np.ndarray]:
-    """The start cell, and the (ny, nx) moves home."""
+def _check(scene: Scene, radio_map: RadioMap, assignment: str) -> None:
+    config, lattice, path = scene.config, scene.lattice, scene.folder / "scene.toml"
+    if assignment not in ("matching", "max-rate"):
+        raise BadInput(f"assignment {assignment!r} is unknown; allowed are matching, max-rate")
+    if not config.uavs or not config.devices:
+        raise BadInput(
+            f"{path}: a mission needs at least one UAV and one device, here are "
+            f"{len(config.uavs)} and {len(config.devices)}; add [[uavs]] or [[devices]] tables")
+    if radio_map.gain_db.shape[1:] != lattice.shape or \
+            not np.allclose(radio_map.lattice.positions_m, lattice.positions_m):
+        raise BadInput(f"the radio map's lattice {radio_map.gain_db.shape[1:]} (z, y, x) is not "
+                       f"that of {path} {lattice.shape}; make the map for this scene")
+    for uav in config.uavs:
+        if not 1 <= uav.battery / HOVER_COST <= MAX_HOVERS:
+            raise BadInput(f"{path}: uav {uav.uav!r}: battery = {uav.battery:g}; a mission allows "
+                           f"{HOVER_COST:g} to {MAX_HOVERS * HOVER_COST:g}")
+    attributes = radio_map.dataset.attrs
+    share, length_m = (attributes.get(name, 1.0)
+                       for name in ("shadowing_share", "shadowing_length_m"))
+    if not (_number(share) and 0 <= share <= 1 and _number(length_m) and 0 < length_m < np.inf):
+        raise BadInput(f"the radio map's attributes shadowing_share = {share}, shadowing_length_m "
+                       f"= {length_m}: allowed are a share from 0 to 1 and a length above 0; make "
+                       "the map again")
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, int | float | np.number)
+
+
+def _ends(scene: Scene, uav: UavConfig, level: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the start cell, and the (ny, nx) moves home."""
     lattice = scene.lattice
-    start, terminal = ((round((y_m - lattice.y_m[0]) / lattice.step_m), round((x_m - lattice.x_m[0]) / lattice.step_m))
-                       for x_m, y_m in ((uav.start_x_m, uav.start_y_m), (uav.terminal_x_m, uav.terminal_y_m)))
+    start, terminal = ((round((y_m - lattice.y_m[0]) / lattice.step_m),
+                        round((x_m - lattice.x_m[0]) / lattice.step_m))
+                       for x_m, y_m in ((uav.start_x_m, uav.start_y_m),
+                                        (uav.terminal_x_m, uav.terminal_y_m)))
     home = FlightGrid(~scene.blocked[level], terminal).steps_to(terminal)
     needed = home[start] * MOVE_COST
     if needed > uav.battery:
         moves = "there is no way" if home[start] == UNREACHABLE else f"{needed:g} are needed"
-        raise BadInput(f"uav {uav.uav!r}: battery = {uav.battery:g} does not reach from its start to its terminal "
-                       f"({moves}); raise it in {scene.folder / 'scene.toml'}")
+        raise BadInput(f"uav {uav.uav!r}: battery = {uav.battery:g} does not reach from its start "
+                       f"to its terminal ({moves}); raise it in {scene.folder / 'scene.toml'}")
     return np.array(start), home

@@ -1,17 +1,18 @@
-"""Random numbers: a stream of its own for everything that is drawn, all from one seed."""
+"""Random numbers: an independent stream for every purpose, all from one seed."""
 
 import numpy as np
 
-PURPOSES = ("learning", "real flight", "decisions", "choice", "twin evaluation", "truth evaluation", "planning")
+PURPOSES = ("learning", "real flight", "decisions", "choice", "twin evaluation",
+            "truth evaluation", "planning")
 
 
 def stream(seed: int, purpose: str, number: int = 0) -> np.random.Generator:
-    """The stream of a purpose.
+    """Return the generator of a purpose.
 
     Args:
         seed: of the run.
         purpose: one of `PURPOSES`.
         number: of the replica, flight or round, where there are several.
     """
-    # Not from 0, because numpy takes [1, 2, 0] for [1, 2].
+    # Counted from 1, because numpy takes [1, 2, 0] for [1, 2].
     return np.random.default_rng([seed, PURPOSES.index(purpose) + 1, number + 1])

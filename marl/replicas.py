@@ -1,37 +1,36 @@
-"""Replicas that learn side by side: one in this process, several in a process each.
-
-Processes, because three of them use two cores a quarter better than three threads do (`benchmarks/marl_speed.py`).
-Where this process may use one core only, they learn one after the other in it, which comes to the same.
-"""
+"""Replicas of a trainer that train side by side, each in a process of its own."""
 
 import multiprocessing
 import pickle
 import traceback
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.connection import Connection
+from typing import Any
 
-from marl.mission import Mission
-from marl.settings import LearnerSettings
 from marl.threads import keep_memory, limit_threads, usable_cores
-from marl.trainer import Trainer
+from marl.training import Trainer
 from radiotwin.errors import RunFailed
 
 
 class Replicas:
-    """Trainers with equal initial weights and random numbers of their own; to be closed.
+    """Trainers side by side; to be closed.
+
+    Processes, because three of them use two cores a quarter better than three threads do. With a
+    single replica or core they train one after the other in this process, to the same result.
 
     Args:
-        count: of the replicas.
-        settings, mission, horizon, seed, device: of each `Trainer`.
+        arguments: of each `Trainer`.
     """
 
-    def __init__(self, count: int, settings: LearnerSettings, mission: Mission, horizon: int, seed: int,
-                 device: str = "cpu"):
-        arguments = [(settings, mission, horizon, seed, number, device) for number in range(count)]
-        here = count == 1 or usable_cores() == 1
-        self._replicas: list = [(_Local if here else _Remote)(*each) for each in arguments]
-        self._pool = ThreadPoolExecutor(1 if here else count)  # only waits for the processes, where there are any
+    def __init__(self, arguments: Sequence[tuple]) -> None:
+        here = len(arguments) == 1 or usable_cores() == 1
+        kind = _Local if here else _Remote
+        self._replicas: list[Any] = [kind(*each) for each in arguments]
+        # The threads only wait for the processes.
+        self._pool = None if here else ThreadPoolExecutor(len(arguments))
 
-    def call(self, method: str, *arguments, each: list | None = None) -> list:
+    def call(self, method: str, *arguments: Any, each: list | None = None) -> list:
         """Call a method of all trainers at once.
 
         Args:
@@ -40,9 +39,15 @@ class Replicas:
             each: one more argument for every replica, after the others.
 
         Returns:
-            the result of every replica
+            The result of every replica.
+
+        Raises:
+            RunFailed: a process has ended.
         """
         own = [()] * len(self._replicas) if each is None else [(one,) for one in each]
+        if self._pool is None:
+            return [replica.call(method, *arguments, *mine)
+                    for replica, mine in zip(self._replicas, own)]
         calls = [self._pool.submit(replica.call, method, *arguments, *mine)
                  for replica, mine in zip(self._replicas, own)]
         return [call.result() for call in calls]
@@ -51,14 +56,15 @@ class Replicas:
         """End the processes."""
         for replica in self._replicas:
             replica.close()
-        self._pool.shutdown()
+        if self._pool is not None:
+            self._pool.shutdown()
 
 
 class _Local:
-    def __init__(self, *arguments):
+    def __init__(self, *arguments: Any) -> None:
         self._trainer = Trainer(*arguments)
 
-    def call(self, method: str, *arguments):
+    def call(self, method: str, *arguments: Any) -> Any:
         return getattr(self._trainer, method)(*arguments)
 
     def close(self) -> None:
@@ -66,7 +72,7 @@ class _Local:
 
 
 class _Remote:
-    def __init__(self, *arguments):
+    def __init__(self, *arguments: Any) -> None:
         # A forked process would inherit the locks of threads that it does not have.
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
@@ -74,13 +80,14 @@ class _Remote:
         self._process.start()
         other.close()
 
-    def call(self, method: str, *arguments):
+    def call(self, method: str, *arguments: Any) -> Any:
         try:
             _send(self._pipe, (method, arguments))
             done, result = _receive(self._pipe)
         except (EOFError, OSError):
-            raise RunFailed("a process that trains a replica has ended, perhaps for lack of memory; start the same "
-                            "command with --resume to go on from the last checkpoint") from None
+            raise RunFailed("a process that trains a replica has ended, perhaps for lack of "
+                            "memory; start the same command with --resume to go on from the last "
+                            "checkpoint") from None
         if not done:
             raise RuntimeError(f"in a replica's process:\n{result}")
         return result
@@ -91,28 +98,27 @@ class _Remote:
         self._process.kill()
 
 
-def _serve(pipe, arguments) -> None:
+def _serve(pipe: Connection, arguments: tuple) -> None:
     """Answer calls until the other end of the pipe closes."""
     limit_threads(1)
     keep_memory()
     trainer = Trainer(*arguments)
-    while True:
-        try:
+    try:
+        while True:
             method, call = _receive(pipe)
-        except (EOFError, KeyboardInterrupt):
-            return
-        try:
-            _send(pipe, (True, getattr(trainer, method)(*call)))
-        except KeyboardInterrupt:
-            return
-        except Exception:
-            _send(pipe, (False, traceback.format_exc()))
+            try:
+                answer = True, getattr(trainer, method)(*call)
+            except Exception:
+                answer = False, traceback.format_exc()
+            _send(pipe, answer)
+    except (EOFError, OSError, KeyboardInterrupt):  # closed, or interrupted
+        return
 
 
-def _send(pipe, message) -> None:
-    """As plain bytes: `pipe.send` would hand over tensors as shared memory, one file each."""
+def _send(pipe: Connection, message: tuple) -> None:
+    """Send plain bytes: `pipe.send` would hand over tensors as shared memory, one file each."""
     pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
 
 
-def _receive(pipe):
+def _receive(pipe: Connection) -> tuple:
     return pickle.loads(pipe.recv_bytes())

@@ -1,4 +1,4 @@
-"""One run, from its settings to its folder: configuration, metrics, checkpoints, comparison, figures."""
+"""One run and its folder: configuration, metrics, checkpoints, comparison, figures."""
 
 import hashlib
 import json
@@ -10,13 +10,14 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from marl.algorithm import Outcome, run_algorithm
+from marl.algorithm1 import Outcome, run_algorithm
 from marl.figures import choose_flight, draw_curve, draw_trajectories
-from marl.flights import track_table
+from marl.flights import evaluate, track_table
+from marl.learner import make_learner
 from marl.mission import Known, Mission, make_mission
 from marl.randomness import stream
-from marl.settings import LEARNERS, LearnerSettings, RunSettings
-from marl.strategies import evaluate, make_strategy
+from marl.registry import learner_class
+from marl.settings import LearnerSettings, RunSettings
 from marl.threads import keep_memory, limit_threads, torch_device
 from radiotwin.console import print_rows
 from radiotwin.errors import BadInput
@@ -28,6 +29,7 @@ from radiotwin.survey import read_truth
 
 TRAINED_IN = {"nn": "NN twin", "log-distance": "log-distance twin", "kriging": "kriging twin",
               "raytrace": "ray-traced twin", "truth": "the truth"}
+BASELINES = ("planner", "greedy", "random")  # in every table
 
 
 @dataclass(frozen=True)
@@ -35,9 +37,10 @@ class Session:
     """A run and its folder.
 
     Args:
-        run, learner: settings.
+        run: settings of the run.
+        learner: settings of learning.
         out: folder of the results.
-        resume: go on with what is in it.
+        resume: go on with the run in it.
     """
 
     run: RunSettings
@@ -46,33 +49,34 @@ class Session:
     resume: bool
 
     def execute(self) -> None:
-        """Run it all, write it all, and print the table at the end.
+        """Run, write the folder, and print the table.
 
         Raises:
-            BadInput: a scene or truth that cannot be used, a folder that is taken, or settings that are not those of
-                the run to be resumed.
+            BadInput: a scene or truth that cannot be used, a folder that is taken, or settings
+                that are not those of the run to be resumed.
         """
         limit_threads(1)
         keep_memory()
         scene = Scene.load(self.run.scene)
         truth = read_truth(scene, self.run.truth)
         scene.check_map(truth)
-        make_mission(scene, truth, Known.truth(scene), self.run.assignment)  # complains before anything is written
-        torch_device(self.run.device)
+        # Complain before anything is written.
+        make_mission(scene, truth, Known.truth(scene), self.run.assignment)
+        device = torch_device(self.run.device)
         self._claim_folder(_world(scene, truth))
         runs: dict[str, RunSettings] = {self.run.twin: self.run}
-        if self.run.compare and self.run.algorithm in LEARNERS:
+        if self.run.compare and learner_class(self.run.algorithm).learns:
             runs |= {twin: self.run.model_copy(update={"twin": twin})
                      for twin in ("nn", "log-distance", "truth") if twin != self.run.twin}
         outcomes = {}
         episodes = len(runs) * self.run.real_episodes * self.run.episodes
         with progress("first real episode", total=episodes) as advance:
             for twin, run in runs.items():
-                def named(count: int, text: str | None = None, twin: str = twin) -> None:
+                def on_progress(count: int, text: str | None = None, twin: str = twin) -> None:
                     advance(count, text and f"{TRAINED_IN[twin]}: {text}")
                 folder = self.out if run is self.run else self.out / "compare" / twin
-                outcomes[twin] = run_algorithm(run, self.learner, scene, truth, folder, self.resume,
-                                               _Log(folder), named, torch_device(self.run.device))
+                outcomes[twin] = run_algorithm(run, self.learner, scene, truth, folder,
+                                               self.resume, _Log(folder), on_progress, device)
         self._write(scene, truth, outcomes)
 
     def _claim_folder(self, world: dict[str, str]) -> None:
@@ -82,85 +86,94 @@ class Session:
             try:
                 before = json.loads(path.read_text(encoding="utf-8"))
             except (OSError, ValueError):
-                raise BadInput(f"{path} is not there or damaged, so there is nothing to resume in {self.out}; start "
-                               "the run without --resume") from None
+                raise BadInput(f"{path} is not there or damaged, so there is nothing to resume in "
+                               f"{self.out}; start the run without --resume") from None
             for group in config:
                 for name, value in config[group].items():
-                    if before.get(group, {}).get(name) != value:
-                        if group == "world":
-                            raise BadInput(f"the {name} is not what it was when the run in {self.out} was started; put "
-                                           "it back, or give another --out")
-                        raise BadInput(f"--{name.replace('_', '-')} {value}: the run in {self.out} was started with "
-                                       f"{before.get(group, {}).get(name)}; resume it with the options that it was "
-                                       "started with, or give another --out")
+                    if before.get(group, {}).get(name) == value:
+                        continue
+                    if group == "world":
+                        raise BadInput(f"the {name} has changed since the run in {self.out} was "
+                                       "started; put it back, or give another --out")
+                    raise BadInput(
+                        f"--{name.replace('_', '-')} {value}: the run in {self.out} was started "
+                        f"with {before.get(group, {}).get(name)}; resume it with the options that "
+                        "it was started with, or give another --out")
             return
         if self.out.exists() and (not self.out.is_dir() or any(self.out.iterdir())):
-            raise BadInput(f"{self.out} exists and is not an empty folder; --resume goes on with the run in it, --out "
-                           "names another folder")
+            raise BadInput(f"{self.out} exists and is not an empty folder; --resume goes on with "
+                           "the run in it, --out names another folder")
         with atomic_path(path) as temporary:
             temporary.write_text(json.dumps(config, indent=1), encoding="utf-8")
 
     def _config(self) -> dict:
-        return {"run": self.run.model_dump(mode="json"), "learner": self.learner.model_dump(mode="json")}
+        return {"run": self.run.model_dump(mode="json"),
+                "learner": self.learner.model_dump(mode="json")}
 
     def _write(self, scene: Scene, truth: RadioMap, outcomes: dict[str, Outcome]) -> None:
         main = outcomes[self.run.twin]
         real = make_mission(scene, truth, main.known, self.run.assignment)
-        entries = [_entry(self.run.algorithm, twin, outcome.rows[-1]) for twin, outcome in outcomes.items()]
+        entries = [_entry(self.run.algorithm, twin, outcome.rows[-1])
+                   for twin, outcome in outcomes.items()]
         trained_in = real
         if main.twin is not None:
-            trained_in = make_mission(scene, main.twin.radio_map(scene), main.known, self.run.assignment)
-        for name in ("planner", "greedy", "random"):
-            if name != self.run.algorithm:
-                entries.append(self._without_learning(name, trained_in, real, main.rows[-1]["real_episodes"]))
+            trained_in = make_mission(scene, main.twin.radio_map(scene), main.known,
+                                      self.run.assignment)
+        baselines = [name for name in BASELINES if name != self.run.algorithm]
+        entries += [self._baseline(name, trained_in, real, main.rows[-1]["real_episodes"])
+                    for name in baselines]
         table = pd.DataFrame(entries)
         with atomic_path(self.out / "comparison.csv") as temporary:
             table.to_csv(temporary, index=False)
         levels = {entry["method"]: entry["truth_ratio"] for entry in entries
-                  if entry["method"] in ("planner", "greedy", "random") and entry["method"] != self.run.algorithm}
-        curves = {f"{self.run.algorithm} in {TRAINED_IN[twin]}": outcome.rows for twin, outcome in outcomes.items()}
+                  if entry["method"] in baselines}
+        curves = {f"{self.run.algorithm} in {TRAINED_IN[twin]}": outcome.rows
+                  for twin, outcome in outcomes.items()}
         draw_curve(curves, levels, self.out / "curve.png")
         flights, typical = main.flights, choose_flight(main.flights, real)
         with atomic_path(self.out / "flights.csv") as temporary:
             track_table(scene, real, flights, typical).to_csv(temporary, index=False)
         draw_trajectories(scene, real, flights, typical, main.known, self.out / "trajectories.png")
-        print_rows(f"Collected in the truth ({self.run.truth}), of all data; mean and standard deviation of "
-                   f"{self.run.flights} flights",
-                   {"method": "left", "trained in": "left", "real episodes": "right", "collected": "right",
-                    "±": "right"},
-                   [[row.method, row.trained_in, f"{row.real_episodes:,}", f"{row.truth_ratio:.3f}",
-                     f"{row.truth_ratio_std:.3f}"] for row in table.itertuples()])
+        print_rows(f"Collected in the truth ({self.run.truth}), of all data; mean and standard "
+                   f"deviation of {self.run.flights} flights",
+                   {"method": "left", "trained in": "left", "real episodes": "right",
+                    "collected": "right", "±": "right"},
+                   [[row.method, row.trained_in, f"{row.real_episodes:,}",
+                     f"{row.truth_ratio:.3f}", f"{row.truth_ratio_std:.3f}"]
+                    for row in table.itertuples()])
 
-    def _without_learning(self, name: str, trained_in: Mission, real: Mission, real_episodes: int) -> dict:
-        strategy = make_strategy(self.run.model_copy(update={"algorithm": name}), self.learner, trained_in, 1, "cpu")
-        strategy.prepare(trained_in, lambda _: None)
-        policy = strategy.policy(stream(self.run.seed, "decisions"))
-        ratio = evaluate(real, policy, self.run.flights, stream(self.run.seed, "truth evaluation")).ratio(real)
-        needs = {"planner": TRAINED_IN[self.run.twin], "greedy": "", "random": ""}[name]
-        # Random flights need nothing; greedy ones the positions, and a plan the map, which the measured flights gave
-        # unless they were told.
-        told = name == "random" or self.run.twin == "truth" or (name == "greedy" and self.run.privileged)
-        return {"method": name, "trained_in": needs, "real_episodes": 0 if told else real_episodes,
-                "truth_ratio": float(ratio.mean()), "truth_ratio_std": float(ratio.std())}
+    def _baseline(self, name: str, trained_in: Mission, real: Mission, real_episodes: int) -> dict:
+        run = self.run.model_copy(update={"algorithm": name})
+        learner = make_learner(run, self.learner, trained_in, 1)
+        learner.prepare(trained_in, lambda _: None)
+        ratio = evaluate(real, learner.policy(stream(run.seed, "decisions")), run.flights,
+                         stream(run.seed, "truth evaluation")).ratio(real)
+        # Random flights need no real ones. Greedy flights need the positions and a plan the map:
+        # both come from the real flights, unless the settings give them.
+        free = (name == "random" or run.twin == "truth"
+                or (name == "greedy" and run.privileged))
+        row = {"real_episodes": 0 if free else real_episodes, "truth_ratio": float(ratio.mean()),
+               "truth_ratio_std": float(ratio.std())}
+        return _entry(name, run.twin, row)
 
 
 def _entry(method: str, twin: str, row: dict) -> dict:
-    learned = method in (*LEARNERS, "planner")
-    return {"method": method, "trained_in": TRAINED_IN[twin] if learned else "",
+    trained_in = TRAINED_IN[twin] if learner_class(method).uses_map else ""
+    return {"method": method, "trained_in": trained_in,
             **{name: row[name] for name in ("real_episodes", "truth_ratio", "truth_ratio_std")}}
 
 
 def _world(scene: Scene, truth: RadioMap) -> dict[str, str]:
-    """What a resumed run must find as it was."""
+    """Return hashes of what must not change before a run is resumed."""
     declared = hashlib.sha256((scene.folder / "scene.toml").read_bytes()).hexdigest()
     measured = hashlib.sha256(np.ascontiguousarray(truth.gain_db).tobytes()).hexdigest()
     return {"city": scene.content_hash(), "scene.toml": declared, "truth": measured}
 
 
 class _Log:
-    """Writes `metrics.csv` and TensorBoard events of one folder; called after every round with all rows so far."""
+    """Write `metrics.csv` and TensorBoard events of one folder after every round."""
 
-    def __init__(self, folder: Path):
+    def __init__(self, folder: Path) -> None:
         self._folder, self._rows, self._blocks = folder, 0, 0
         self._writer: Any = None
 

@@ -4,10 +4,10 @@ import argparse
 import sys
 from pathlib import Path
 
-from marl.command import exit_status
 from marl.experiments.records import Run, begun, finished
 from marl.experiments.studies import STUDIES, with_settings
-from radiotwin.console import say
+from radiotwin.command import exit_status
+from radiotwin.console import say, show_warnings_plainly
 from radiotwin.errors import BadInput
 
 OUT, FIGURES = Path("docs/results/experiments"), Path("docs/results/figures")
@@ -31,10 +31,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--jobs", metavar="INTEGER", default="1", help="runs side by side, a core each [1]")
     parser.add_argument("--out", type=Path, default=OUT, help=f"folder of the JSON files and tables [{OUT}]")
     given = parser.parse_args(arguments)
-    return exit_status(lambda: _run(given), "what is finished is kept")
+    return exit_status(lambda: _run(given), "what is finished is kept: the same command with --resume goes on")
 
 
 def _run(given: argparse.Namespace) -> None:
+    show_warnings_plainly()
     if given.name not in (*STUDIES, "all"):
         raise BadInput(f"study {given.name!r} is unknown; allowed are {', '.join(STUDIES)}, all")
     seeds, jobs = _count("--seeds", given.seeds), _count("--jobs", given.jobs)

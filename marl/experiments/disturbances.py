@@ -14,14 +14,15 @@ import torch
 
 from marl.disturbances import Disturbance, DisturbedEnvironment
 from marl.experiments.learning import scene_folder
-from marl.flights import AgentPolicy, HeuristicPolicy, Policy, fly
-from marl.learner import Learner
+from marl.flights import Policy, fly
+from marl.heuristics import HeuristicPolicy
 from marl.mission import Known, Mission, make_mission
 from marl.planner import PlanPolicy, plan
+from marl.qmix import QNetworks
 from marl.randomness import stream
 from marl.replanning import ReplanPolicy
 from marl.settings import LearnerSettings
-from marl.trainer import Trainer
+from marl.training import AgentPolicy, Trainer
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
 from radiotwin.survey import segmented_truth
@@ -153,9 +154,9 @@ def train(world: World, episodes: int, settings: LearnerSettings, flights: int, 
     Returns:
         the policy that collected most at the looks after the blocks, and these
     """
-    trainer = DisturbedTrainer(settings, world.believed, episodes, seed)
+    trainer = DisturbedTrainer(QNetworks, settings, world.believed, episodes, seed)
     trainer.disturbance = world.disturbance
-    best = Learner(settings, world.believed, seed).agent
+    best = QNetworks(settings, world.believed, seed).agent
     highest = -1.0
     curve: list[dict] = []
     with progress("training", total=episodes) as advance:
@@ -163,12 +164,12 @@ def train(world: World, episodes: int, settings: LearnerSettings, flights: int, 
             trainer.enter(world.real[len(curve) % len(world.real)], teacher)
             block = min(BLOCK, episodes - trainer.episodes)
             record = trainer.train(block)
-            present = AgentPolicy(trainer.learner.agent)
+            present = AgentPolicy(trainer.networks.agent)
             ratio = float(world.fly(present, flights, stream(seed, "choice")).mean())
             if ratio > highest:
                 highest = ratio
                 with torch.no_grad():
-                    best.load_state_dict(trainer.learner.agent.state_dict())
+                    best.load_state_dict(trainer.networks.agent.state_dict())
             curve.append({"episodes": trainer.episodes, "ratio": ratio, "train_ratio": record["train_ratio"]})
             advance(block)
     return AgentPolicy(best), curve

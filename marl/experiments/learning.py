@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from marl.algorithm import run_algorithm
+from marl.algorithm1 import run_algorithm
 from marl.figures import choose_flight
 from marl.flights import Flights
 from marl.mission import Mission, make_mission

@@ -13,7 +13,7 @@ import numpy as np
 
 import marl
 import radiotwin
-from marl.settings import LEARNERS, LearnerSettings, RunSettings
+from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 
@@ -22,6 +22,9 @@ EARLIER: dict[str, dict[str, Any]] = {
     "run": {"first_flight": "random", "measure": "policy", "twin_shadowing": "slot"},
     "learner": {"excursion_slots": 1.0}}
 """What was done before there was a setting for it, where that is not its default."""
+LEARNERS = ("fedqmix", "qmix", "iql")
+DELETED = {"mix": (True, False), "fly_again": (False,), "restart_epsilon": (0.0,), "restart_slots": (25_000,)}
+"""Settings of learning that old records have, with the values that say nothing."""
 MEASURING = ("first_flight", "measure", "twin_shadowing")
 
 
@@ -125,7 +128,9 @@ def filled(settings: dict) -> dict:
         settings = settings | {"learner": {}}
     if run.get("twin") == "truth":  # nothing is measured
         settings = settings | {"run": {name: value for name, value in run.items() if name not in MEASURING}}
-    return settings | {name: group | settings[name] for name, group in groups.items() if name in settings}
+    return settings | {name: {key: value for key, value in (group | settings[name]).items()
+                              if value not in DELETED.get(key, ())}
+                       for name, group in groups.items() if name in settings}
 
 
 def read_record(path: Path) -> dict:

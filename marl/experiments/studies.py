@@ -111,23 +111,18 @@ def pays(scenes: list[str], seeds: int) -> list[Run]:
 def tuning(scenes: list[str], seeds: int) -> list[Run]:
     """What might bring model-aided learning nearer to the planner, one change at a time; `earlier` ones are changes of
     what the preset was before."""
-    again, policy = {"fly_again": True}, {"measure": "policy"}
+    policy = {"measure": "policy"}
     earlier = policy | {"first_flight": "random", "twin_shadowing": "slot"}
     changes: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {  # of the learner, and of the run
         "as-it-is": ({}, {}), "shadowing-slot": ({}, {"twin_shadowing": "slot"}),
         "first-random": ({}, {"first_flight": "random"}), "excursions-1": ({"excursion_slots": 1.0}, {}),
-        "excursions-8": ({"excursion_slots": 8.0}, {}), "fly-again": (again, {}),
-        "shadowing-slot-fly-again": (again, {"twin_shadowing": "slot"}), "measure-policy": ({}, policy),
-        "measure-policy-fly-again": (again, policy),
-        "measure-policy-shadowing-slot-fly-again": (again, policy | {"twin_shadowing": "slot"}),
-        "restart-0.3": ({"restart_epsilon": 0.3}, {}), "lambda-0.6": ({"td_lambda": 0.6}, {}),
+        "excursions-8": ({"excursion_slots": 8.0}, {}), "measure-policy": ({}, policy),
+        "lambda-0.6": ({"td_lambda": 0.6}, {}),
         "lambda-0.95": ({"td_lambda": 0.95}, {}), "target-100": ({"target_every": 100}, {}),
         "epsilon-60k": ({"epsilon_slots": 60_000}, {}), "replay-800": ({"replay": 800}, {}),
-        "measure-planner": ({}, {"measure": "planner"}), "guide": ({}, {"guide": "planner"}),
+        "guide": ({}, {"guide": "planner"}),
         "episodes-1600": ({}, {"episodes": 1600}), "earlier": ({}, earlier),
-        "earlier-excursions-1": ({"excursion_slots": 1.0}, earlier), "earlier-fly-again": (again, earlier),
-        "earlier-restart-0.3": ({"restart_epsilon": 0.3}, earlier),
-        "earlier-measure-planner": ({}, earlier | {"measure": "planner"})}
+        "earlier-excursions-1": ({"excursion_slots": 1.0}, earlier)}
     return [learning("tuning", scene, "traced", seed, "qmix", changes=of_learner, name=name, **of_run)
             for seed in range(seeds) for scene in scenes for name, (of_learner, of_run) in changes.items()]
 
@@ -150,7 +145,7 @@ def learning(study: str, scene: str, truth: str, seed: int, algorithm: str, twin
     name = name or (f"{algorithm}-{twin}" if algorithm not in ("greedy", "random") else algorithm)
     return Run(study, f"{label(scene)}-{truth}-{name}", "learning",
                {"run": settings.model_dump(mode="json", exclude={"seed", "compare"}) | {"scene": scene},
-                "learner": learner(**{"mix": algorithm != "iql"} | (changes or {}))}, seed)
+                "learner": learner(**(changes or {}))}, seed)
 
 
 def learner(**changes: Any) -> dict[str, Any]:

@@ -5,16 +5,16 @@ from pathlib import Path
 
 import numpy as np
 
+from marl.algorithm1 import Reality, location_errors_m
 from marl.environment import Environment
 from marl.experiments.learning import scene_folder
-from marl.flights import Flights, HeuristicPolicy, Replayed, fly
+from marl.flights import Flights, Replayed, evaluate, fly
+from marl.heuristics import PATTERN, HeuristicPolicy
+from marl.learner import make_learner
 from marl.mission import Known, Mission
 from marl.planner import PlanPolicy, plan
 from marl.randomness import stream
-from marl.reality import Reality, known_by, location_errors_m
 from marl.settings import LearnerSettings, RunSettings
-from marl.strategies import evaluate, make_strategy
-from marl.waypoints import PATTERN
 from radiotwin.closeloop.corrected import corrected_twin
 from radiotwin.closeloop.run import close_loop
 from radiotwin.compare import score_map
@@ -77,11 +77,11 @@ def train_in(settings: dict, seed: int, folder: Path, keep: Callable[[], None]) 
     twin = None if name == "truth" else _learnt(name, seed, scene, measured, folder)
     keep()
     reality = Reality(scene, truth, "matching", settings["noise_db"], seed)
-    known = Known.truth(scene) if twin is None else known_by(twin)
+    known = Known.truth(scene) if twin is None else Known.of(twin.devices)
     real = reality.mission(known)
     inside = real if twin is None else reality.twin_mission(twin, known, measured)
     run = RunSettings(algorithm="qmix", episodes=settings["episodes"], real_episodes=1, seed=seed)
-    strategy = make_strategy(run, LearnerSettings.model_validate(settings["learner"]), inside, 1, "cpu")
+    strategy = make_learner(run, LearnerSettings.model_validate(settings["learner"]), inside, 1)
     try:
         with progress(f"training, {name}", total=run.episodes) as advance:
             looks = strategy.prepare(inside, advance)
@@ -171,4 +171,4 @@ def _errors(twin: Twin, scene: Scene, truth: RadioMap) -> dict:
     """Of the map and of the unknown devices' positions."""
     scores = {row["links"]: row["rmse_db"] for row in score_map("twin", twin.radio_map(scene), truth)}
     return {"map_rmse_db": scores["all"], "map_rmse_los_db": scores["LoS"], "map_rmse_nlos_db": scores["NLoS"],
-            "location_errors_m": location_errors_m(scene, known_by(twin))}
+            "location_errors_m": location_errors_m(scene, Known.of(twin.devices))}

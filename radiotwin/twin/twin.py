@@ -123,9 +123,7 @@ class Twin:
         """Return mean and standard deviation of the level over a scene's lattice.
 
         For all devices that have a position, at faultless receivers. The mean is given below
-        sensitivity, too; attribute `gain_limit_db` says where detection ends. Where the twin
-        interpolates its residual, `shadowing_share` and `shadowing_length_m` are the variance's share
-        and the correlation length of that (Gudmundson 1991).
+        sensitivity, too; attribute `gain_limit_db` says where detection ends.
 
         Raises:
             BadInput: the twin was fitted without a 3D map.
@@ -153,9 +151,6 @@ class Twin:
                       "frequency_hz": scene.config.radio.frequency_hz,
                       "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene_hash,
                       "radiotwin_version": radiotwin.__version__}
-        if self.residual_field is not None:
-            attributes |= {"shadowing_share": self.residual_field.share,
-                           "shadowing_length_m": self.residual_field.length_m}
         names = [self.devices[i].device for i in known]
         return RadioMap.build(names, scene.lattice, mean_db, los, sd_db, attributes)
 

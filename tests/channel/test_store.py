@@ -28,7 +28,8 @@ def models(fitted_nn):
 @pytest.mark.parametrize("name", MODELS)
 def test_predictions_survive_bit_for_bit(name, models, world, tmp_path):
     solid = trimesh.creation.box(bounds=[[200, 300, 0], [240, 360, 40]])
-    links = replace(world(70, 2000).links, city=CityMap(solid.vertices, solid.faces))
+    links = replace(world(70, 2000).links, city=CityMap(solid.vertices, solid.faces),
+                    frequency_hz=2.4e9)
     path = tmp_path / "channel.safetensors"
     save_channel(models[name], path)
     loaded = load_channel(path)

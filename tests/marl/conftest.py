@@ -1,4 +1,4 @@
-"""Small missions, and the slow truth of the tests: the mission's rules, features and networks written a second time,
+"""Small missions, and slow references of the tests: the mission's rules, features and networks written a second time,
 number by number, without any code of the package."""
 
 import math
@@ -146,7 +146,7 @@ def shown_db(mission, snr_db):
 
 
 def observation(mission, frame, e, u):
-    """What UAV u of flight e sees: the list of its features."""
+    """Features of UAV u in flight e."""
     side_m = max(mission.steps_home.shape[1] - 1, mission.steps_home.shape[2] - 1, 1) * mission.step_m
     row, column = (int(i) for i in frame.cell[e, u])
     battery = int(frame.battery[e, u])
@@ -231,7 +231,7 @@ def mixed_value(weights, chosen, seen):
 
 @pytest.fixture(scope="session")
 def slow():
-    """The slow truth."""
+    """Slow reference implementations."""
     return SimpleNamespace(moves_home=moves_home, ways_home=ways_home, feasible=feasible, rate=rate, assign=assign,
                            usable=usable, observation=observation, state=state, agent_values=agent_values,
                            mixed_value=mixed_value, steps=STEPS, hovers=HOVERS, far=FAR)
@@ -239,7 +239,7 @@ def slow():
 
 @pytest.fixture(scope="session")
 def tiny():
-    """`tiny(seed, …)` is a mission of two UAVs and three devices on 5 x 5 cells, or what the options say."""
+    """`tiny(seed, …)` is a mission of two UAVs and three devices on 5 x 5 cells, unless options change it."""
     return lambda seed=0, **options: build(np.random.default_rng(seed), **options)
 
 

@@ -9,7 +9,7 @@ from marl.checkpoint import folder_content, load_checkpoint, restore_folder, sav
 from radiotwin.errors import BadInput
 
 
-def test_everything_comes_back(tmp_path):
+def test_every_type_of_value_comes_back(tmp_path):
     rng = np.random.default_rng(3)
     rng.random(5)
     state = {
@@ -28,7 +28,7 @@ def test_everything_comes_back(tmp_path):
     pd.testing.assert_frame_equal(back["tables"][0], state["tables"][0], check_dtype=False)
 
 
-def test_a_damaged_one_is_bad_input(tmp_path):
+def test_a_damaged_checkpoint_is_bad_input(tmp_path):
     path = tmp_path / "state.pt"
     save_checkpoint({"a": np.zeros(1000)}, path)
     path.write_bytes(path.read_bytes()[:500])
@@ -56,7 +56,7 @@ def test_a_folder_comes_back(tmp_path):
     assert (tmp_path / "other" / "a.json").read_text() == "{}"
 
 
-def test_what_another_version_wrote_is_refused(tmp_path):
+def test_a_checkpoint_of_another_version_is_refused(tmp_path):
     torch.save({"rows": []}, tmp_path / "state.pt")
     with pytest.raises(BadInput, match="another version.*start again"):
         load_checkpoint(tmp_path / "state.pt")

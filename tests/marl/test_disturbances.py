@@ -1,4 +1,4 @@
-"""Flights that do not go as was thought."""
+"""Flights with a disturbance."""
 
 import numpy as np
 import torch
@@ -6,9 +6,11 @@ import torch
 from marl.disturbances import Disturbance, DisturbedEnvironment
 from marl.environment import Environment
 from marl.features import observation_size
-from marl.flights import AgentPolicy, HeuristicPolicy, fly
+from marl.flights import fly
+from marl.heuristics import HeuristicPolicy
 from marl.mission import HOVER, NO_OP
-from marl.networks import Agent
+from marl.qmix import Agent
+from marl.training import AgentPolicy
 
 
 def flown(mission, disturbance, flights=200):
@@ -22,7 +24,7 @@ def test_nothing_happens_without_a_disturbance(tiny):
     np.testing.assert_array_equal(flown(mission, Disturbance(), 20).collected, calm.collected)
 
 
-def test_volumes_are_drawn_evenly_and_the_ratio_is_of_what_there_was(tiny):
+def test_volumes_are_uniform_and_the_ratio_refers_to_them(tiny):
     mission = tiny(0, snr_db=60.0, battery=(200, 200))
     flights = flown(mission, Disturbance(volume_spread=1.0), 2000)
     share = flights.frames.data_units[:, 0] / mission.data_units
@@ -32,7 +34,7 @@ def test_volumes_are_drawn_evenly_and_the_ratio_is_of_what_there_was(tiny):
     np.testing.assert_allclose(flights.ratio(mission), 1, atol=1e-5)  # all is collected, however much it was
 
 
-def test_one_uav_is_lost_stands_still_and_collects_no_more(tiny):
+def test_a_failed_uav_stays_where_it_is_and_collects_no_more(tiny):
     mission = tiny(0, uavs=2, battery=(40, 40))
     flights = flown(mission, Disturbance(loss=1.0))
     full = mission.battery[None]
@@ -49,7 +51,7 @@ def test_one_uav_is_lost_stands_still_and_collects_no_more(tiny):
     assert others > 0  # they go on
 
 
-def test_a_lost_uav_does_not_follow_the_plan_that_teaches(tiny):
+def test_a_failed_uav_does_not_follow_the_guide(tiny):
     mission = tiny(0, uavs=2, battery=(40, 40))
     agent = Agent(observation_size(mission), mission.uavs, 8, torch.Generator().manual_seed(0))
     plan = np.full((mission.longest, 2), HOVER)

@@ -7,8 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from marl.environment import ACTION_COUNT, Environment, assign, feasible, rate
-from marl.flights import HeuristicPolicy, fly
+from marl.environment import ACTION_COUNT, CorrelatedField, Environment, assign, feasible, rate
+from marl.flights import fly
+from marl.heuristics import HeuristicPolicy
+from marl.mission import HOVER
+from marl.planner import PlanPolicy
 
 FEW = settings(max_examples=40, deadline=None)
 
@@ -72,7 +75,7 @@ def test_a_flight_follows_the_rules_slot_by_slot(missions, slow, data, seed):
 
 @given(st.data(), st.sampled_from(["random", "greedy"]), st.integers(0, 2**32 - 1))
 @FEW
-def test_data_is_conserved_and_nobody_strands(missions, data, name, seed):
+def test_data_is_conserved_and_every_uav_gets_home(missions, data, name, seed):
     mission = data.draw(missions)
     environment = Environment(mission, 4, np.random.default_rng(seed))
     flights = fly(environment, HeuristicPolicy(name, np.random.default_rng(seed)))
@@ -105,7 +108,7 @@ def test_the_first_position_counts_and_the_last_does_not(tiny):
 
 
 @pytest.mark.parametrize("max_rate, expected", [(False, [0, 1]), (True, [0, -1])])
-def test_who_loses_its_best_device_gets_another_or_idles(max_rate, expected):
+def test_a_uav_that_loses_its_best_device_gets_another_or_idles(max_rate, expected):
     strength, out = np.array([[30.0, 12.0], [25.0, 11.0]]), np.zeros(2, dtype=np.int16)
     assign(strength, max_rate, out)
     assert out.tolist() == expected
@@ -145,3 +148,56 @@ def test_below_the_limit_of_detection_nothing_is_seen_and_nothing_collected(miss
     assert ((snr_db >= 15) | np.isneginf(snr_db)).all()
     for e, t, u in np.argwhere(flights.collected > 0):
         assert snr_db[e, t, u, flights.frames.assigned[e, t, u]] >= 15
+
+
+def test_fields_are_normal_and_their_correlation_falls_exponentially():
+    fields = CorrelatedField((30, 24), 20.0, 80.0).draw(3001, np.random.default_rng(0))
+    assert fields.shape == (3001, 30, 24) and fields.dtype == np.float32
+    assert abs(fields.mean()) < 0.02 and fields.var() == pytest.approx(1, abs=0.02)
+    for rows, columns in ((0, 1), (1, 0), (3, 0), (0, 8), (4, 3), (20, 0), (0, 23)):
+        product = (fields[:, rows:, columns:] * fields[:, :30 - rows, :24 - columns]).mean()
+        assert product == pytest.approx(np.exp(-20 * np.hypot(rows, columns) / 80), abs=0.04)
+    # The real and the imaginary part of a transform know nothing of each other.
+    assert abs((fields[:1500] * fields[1501:3001]).mean()) < 0.02
+    # The distribution is normal at a point.
+    assert np.mean(np.abs(fields[:, 5, 5]) < 1) == pytest.approx(0.6827, abs=0.03)
+
+
+@pytest.mark.parametrize("length_m", [1.0, 5000.0])
+def test_very_short_and_very_long_correlations_have_fields_too(length_m):
+    fields = CorrelatedField((12, 9), 20.0, length_m).draw(600, np.random.default_rng(0))
+    assert fields.var() == pytest.approx(1, abs=0.25)
+    assert (fields[:, 1:] * fields[:, :-1]).mean() == pytest.approx(np.exp(-20 / length_m) * fields.var(), abs=0.05)
+
+
+def test_a_share_of_the_shadowing_lasts_for_a_flight_and_the_rest_for_a_slot(tiny):
+    mission = tiny(0, uavs=2, devices=2, snr_db=20.0, sigma_db=np.array([3.0, 0.0]).reshape(1, 2, 1, 1),
+                   battery=(8, 8), data_units=[1e9, 1e9])
+    hover = PlanPolicy(np.full((8, 2), HOVER))
+    for share in (0.0, 0.6, 1.0):
+        world = mission._replace(shadowing_share=share, shadowing_m=60.0)
+        shown_db = fly(Environment(world, 3000, np.random.default_rng(1)), hover).frames.snr_db
+        off_db = shown_db[:, :, :, 0] - 20
+        assert off_db.std() == pytest.approx(3, abs=0.15)
+        between_slots = np.corrcoef(off_db[:, 0, 0], off_db[:, 5, 0])[0, 1]
+        assert between_slots == pytest.approx(share, abs=0.06)
+        # Both UAVs hover over the same cell, at other heights: what stays is the same for both.
+        assert np.corrcoef(off_db[:, 0, 0], off_db[:, 0, 1])[0, 1] == pytest.approx(share, abs=0.06)
+        assert (shown_db[..., 1] == 20).all()
+        assert abs(np.corrcoef(off_db[:-1, 0, 0], off_db[1:, 0, 0])[0, 1]) < 0.06  # another flight, another world
+
+
+def test_a_new_flight_draws_new_shadowing_and_the_others_keep_theirs(tiny):
+    mission = tiny(0, uavs=1, devices=1, snr_db=20.0, sigma_db=3.0, battery=(8,))._replace(shadowing_share=1.0)
+    environment = Environment(mission, 4, np.random.default_rng(0))
+    before = environment.reset().snr_db.copy()
+    after = environment.reset(np.array([True, False, False, True])).snr_db
+    assert ((before != after).ravel() == [True, False, False, True]).all()
+
+
+def test_the_same_seed_draws_the_same_shadowing(tiny):
+    mission = tiny(0, sigma_db=4.0)._replace(shadowing_share=0.7)
+    one, same, other = (fly(Environment(mission, 5, np.random.default_rng(seed)),
+                            HeuristicPolicy("greedy", np.random.default_rng(9))).frames.snr_db for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert not np.array_equal(one[:, 0], other[:, 0])

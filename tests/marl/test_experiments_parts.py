@@ -136,8 +136,8 @@ def test_learners_from_before_excursions_made_none():
 
 def test_the_tuning_table_says_what_differs_from_the_defaults_as_options():
     run = learning("tuning", "rdm", "traced", 0, "qmix", measure="policy",
-                   changes={"td_lambda": 0.6, "fly_again": True})
-    assert tables.options(run.settings) == "`--measure policy --td-lambda 0.6 --fly-again true`"
+                   changes={"td_lambda": 0.6})
+    assert tables.options(run.settings) == "`--measure policy --td-lambda 0.6`"
     assert tables.options(learning("tuning", "rdm", "traced", 0, "qmix").settings) == "as it is"
 
 

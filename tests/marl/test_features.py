@@ -29,7 +29,7 @@ def test_features_are_those_of_the_paper(missions, slow, data, seed, slots):
     assert np.isfinite(observation).all() and np.isfinite(state).all()
 
 
-def test_positions_are_what_is_known_not_what_is_true(tiny):
+def test_features_use_the_known_positions_not_the_true_ones(tiny):
     # The same radio, other beliefs: agents see them, and nothing else changes.
     mission = tiny(0)
     moved = mission._replace(known_m=mission.known_m + 8.0)

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 import marl.replicas
-from marl.federation import average
+from marl.fedqmix.federation import average
 from marl.mission import Known, make_mission
+from marl.qmix import QNetworks
 from marl.replicas import Replicas
 from marl.settings import PRESETS
-from marl.trainer import Trainer
+from marl.training import Trainer
 from radiotwin.errors import RunFailed
 from radiotwin.survey import segmented_truth
 
@@ -20,9 +21,14 @@ def mission(small_scene):
     return make_mission(small_scene, segmented_truth(small_scene), Known.truth(small_scene))
 
 
+def arguments(mission):
+    """Of two trainers."""
+    return [(QNetworks, SETTINGS, mission, 100, 0, number) for number in range(2)]
+
+
 def trainers(mission, settings=SETTINGS):
     """Three replicas that have learned different things."""
-    made = [Trainer(settings, mission, 100, 0, stream) for stream in range(3)]
+    made = [Trainer(QNetworks, settings, mission, 100, 0, number) for number in range(3)]
     for trainer in made:
         trainer.train(8)
     return made
@@ -50,7 +56,7 @@ def test_replicas_share_no_memory_after_averaging(mission, federate_all):
     for name, weights in replicas[0].weights().items():
         np.testing.assert_array_equal(weights, mean[name])
         np.testing.assert_array_equal(weights, replicas[2].weights()[name])
-    pointers = [{tensor.data_ptr() for tensor in replica.learner.parameters()} for replica in replicas]
+    pointers = [{tensor.data_ptr() for tensor in replica.networks.parameters()} for replica in replicas]
     assert not pointers[0] & pointers[1] and not pointers[1] & pointers[2]
     others = [replica.weights() for replica in replicas[1:]]
     replicas[0].train(4)
@@ -70,8 +76,8 @@ def test_federating_all_averages_moments_and_target_networks(mission):
 
 def test_processes_learn_the_same_as_this_one(mission, monkeypatch):
     monkeypatch.setattr(marl.replicas, "usable_cores", lambda: 2)
-    here = [Trainer(SETTINGS, mission, 100, 0, stream) for stream in range(2)]
-    replicas = Replicas(2, SETTINGS, mission, 100, 0)
+    here = [Trainer(*each) for each in arguments(mission)]
+    replicas = Replicas(arguments(mission))
     try:
         records = replicas.call("train", 8)
         assert records == [trainer.train(8) for trainer in here]
@@ -94,8 +100,8 @@ def test_processes_learn_the_same_as_this_one(mission, monkeypatch):
 
 def test_on_one_core_replicas_learn_in_this_process(mission, monkeypatch):
     monkeypatch.setattr(marl.replicas, "usable_cores", lambda: 1)
-    here = [Trainer(SETTINGS, mission, 100, 0, stream) for stream in range(2)]
-    replicas = Replicas(2, SETTINGS, mission, 100, 0)
+    here = [Trainer(*each) for each in arguments(mission)]
+    replicas = Replicas(arguments(mission))
     try:
         assert replicas.call("train", 8) == [trainer.train(8) for trainer in here]
         assert not any(hasattr(replica, "_process") for replica in replicas._replicas)

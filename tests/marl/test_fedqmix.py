@@ -1,6 +1,5 @@
 """`python -m marl.fedqmix`, as a user runs it."""
 
-import argparse
 import csv
 import json
 import os
@@ -14,7 +13,7 @@ import time
 import pytest
 
 from marl.checkpoint import load_checkpoint
-from marl.fedqmix import settings_of
+from marl.options import settings_of
 
 SMALL = ("--truth segmented --real-episodes 2 --episodes 40 --batch 8 --replay 40 --flights 8 "
          "--planner-iterations 300 ")
@@ -117,6 +116,8 @@ def flat(value):
     ("--episodes 0", ["--episodes 0", "≥ 1"]),
     ("--compare perhaps", ["--compare perhaps", "true|false"]),
     ("--twin magic", ["--twin magic", "nn|log-distance|kriging|raytrace|truth"]),
+    ("--algorithm magic", ["--algorithm magic", "fedqmix|qmix|iql|greedy|planner|random"]),
+    ("--fly-again true", ["No such option: --fly-again"]),
     ("--batch 64 --replay 32", ["replay 32", "64"]),
     ("--guide planner --algorithm greedy", ["guide planner", "greedy does not learn"]),
     ("--device tpu", ["--device tpu", "auto|cpu|cuda"]),
@@ -129,13 +130,13 @@ def test_bad_input_is_one_message_and_leaves_nothing(words, parts, small_scene, 
     assert not list(tmp_path.iterdir())
 
 
-def test_the_preset_paper_begins_and_doubts_as_the_paper_does_unless_told_otherwise():
-    run, learner = settings_of(argparse.Namespace(preset="paper"))
+def test_the_preset_paper_measures_and_trains_as_the_paper_does_unless_options_differ():
+    run, learner = settings_of({"preset": "paper"})
     assert (run.real_episodes, run.episodes) == (30, 1000)
     assert (run.first_flight, run.measure, run.twin_shadowing) == ("random", "policy", "slot")
     assert learner.excursion_slots == 1 and learner.td_lambda == 0
-    run, _ = settings_of(argparse.Namespace(preset="paper", first_flight="waypoints"))
+    run, _ = settings_of({"preset": "paper", "first_flight": "waypoints"})
     assert (run.first_flight, run.measure, run.twin_shadowing) == ("waypoints", "policy", "slot")
-    run, _ = settings_of(argparse.Namespace())
+    run, _ = settings_of({})
     assert (run.real_episodes, run.first_flight, run.measure) == (10, "waypoints", "waypoints")
     assert run.twin_shadowing == "fitted"

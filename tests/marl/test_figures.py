@@ -1,12 +1,19 @@
-"""The figures show what was flown."""
+"""Figures of a run."""
 
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection
 
 from marl.environment import Environment
-from marl.figures import choose_flight, curve_figure, draw_curve, draw_trajectories, trajectories_figure
-from marl.flights import HeuristicPolicy, fly
+from marl.figures import (
+    choose_flight,
+    curve_figure,
+    draw_curve,
+    draw_trajectories,
+    trajectories_figure,
+)
+from marl.flights import fly
+from marl.heuristics import HeuristicPolicy
 from marl.mission import Known
 
 ROWS = [{"real_episodes": real, "truth_ratio": ratio, "truth_ratio_std": 0.02} for real, ratio in

@@ -1,11 +1,14 @@
-"""Greedy claims and random choice."""
+"""Greedy claims, random choice, and flights from one random cell to the next."""
 
 import numpy as np
+import pytest
 
 from marl.environment import Environment
-from marl.flights import HeuristicPolicy, fly
-from marl.heuristics import greedy_actions, random_actions
+from marl.features import observe
+from marl.flights import fly
+from marl.heuristics import HeuristicPolicy, greedy_actions, random_actions, waypoint_actions
 from marl.mission import EAST, HOVER, NORTH
+from marl.planner import PlanPolicy
 
 
 def test_greedy_uavs_claim_different_devices_fly_the_longer_way_first_and_hover_on_top(tiny):
@@ -29,7 +32,7 @@ def test_greedy_turns_to_another_device_when_one_is_empty(tiny):
     assert greedy_actions(mission, environment.frame, np.random.default_rng(0)).tolist() == [[NORTH]]
 
 
-def test_greedy_ignores_devices_that_nobody_has_located(tiny):
+def test_greedy_ignores_devices_without_a_known_position(tiny):
     mission = tiny(0, uavs=1, devices=2, battery=(30,), known_m=[[np.nan, np.nan], [40.0, 80.0]], snr_db=20.0)
     environment = Environment(mission, 1, np.random.default_rng(0))
     assert greedy_actions(mission, environment.reset(), np.random.default_rng(0)).tolist() == [[NORTH]]
@@ -48,3 +51,38 @@ def test_greedy_collects_more_than_random(city_mission):
                           HeuristicPolicy(name, np.random.default_rng(0))).ratio(mission) for name in
                       ("greedy", "random"))
     assert greedy.mean() > chance.mean() + 0.1
+
+
+def seen(mission, policy):
+    """Distinct cells that all UAVs fly over."""
+    cells = fly(Environment(mission, 1, np.random.default_rng(0)), policy).frames.cell[0]
+    return len(np.unique(cells.reshape(-1, 2), axis=0))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_every_action_is_feasible_and_all_uavs_land_with_an_empty_battery(small_scene, city_mission, seed):
+    actions = waypoint_actions(small_scene, city_mission, np.random.default_rng(seed))
+    assert actions.shape == (city_mission.longest, city_mission.uavs)
+    environment, policy = Environment(city_mission, 1, np.random.default_rng(0)), PlanPolicy(actions)
+    frame = environment.reset()
+    policy.start(city_mission, 1)
+    uavs = np.arange(city_mission.uavs)
+    for _ in range(city_mission.longest):
+        action = policy.act(frame)
+        assert observe(city_mission, frame)[1][0, uavs, action[0]].all()
+        environment.step(action)
+    assert environment.done.all()
+    assert (city_mission.steps_home[uavs, frame.cell[0, :, 0], frame.cell[0, :, 1]] == 0).all()
+
+
+def test_waypoint_flights_cover_more_cells_than_random_steps(small_scene, city_mission):
+    about, steps = (np.mean([seen(city_mission, make(np.random.default_rng(seed))) for seed in range(20)])
+                    for make in (lambda rng: PlanPolicy(waypoint_actions(small_scene, city_mission, rng)),
+                                 lambda rng: HeuristicPolicy("random", rng)))
+    assert about > 1.2 * steps
+
+
+def test_the_same_seed_gives_the_same_waypoint_flights(small_scene, city_mission):
+    one, same, other = (waypoint_actions(small_scene, city_mission, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert (one != other).any()

@@ -13,11 +13,10 @@ from gymnasium.utils.env_checker import check_env  # noqa: E402
 from pettingzoo.test import parallel_api_test, parallel_seed_test  # noqa: E402
 
 from marl.central_env import CentralEnv, CentralVectorEnv  # noqa: E402
-from marl.environment import Environment  # noqa: E402
+from marl.environment import Environment, safe_actions  # noqa: E402
 from marl.features import global_state, observe  # noqa: E402
 from marl.mission import HOVER, NO_OP  # noqa: E402
 from marl.parallel_env import HarvestEnv  # noqa: E402
-from marl.safe_actions import safe  # noqa: E402
 
 
 def test_pettingzoos_own_tests_pass(city_mission):
@@ -95,10 +94,10 @@ def test_one_flight_is_the_first_of_the_batched(city_mission):
     assert [one for one, _ in rewards] != [two for _, two in rewards], "another seed draws another shadowing"
 
 
-def test_what_is_not_feasible_is_replaced_and_nobody_strands(city_mission):
+def test_infeasible_actions_are_replaced_and_every_uav_gets_home(city_mission):
     mask = np.array([[[True, False, True, False, False, False], [False, False, True, True, False, False],
                       [False] * 5 + [True]]])
-    assert safe(np.array([[2, 0, 1]]), mask).tolist() == [[2, 2, NO_OP]]
+    assert safe_actions(np.array([[2, 0, 1]]), mask).tolist() == [[2, 2, NO_OP]]
     env = HarvestEnv(city_mission)
     env.reset(seed=0)
     replaced = False

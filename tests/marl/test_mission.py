@@ -26,7 +26,7 @@ def test_the_snr_is_power_plus_gain_minus_noise_at_the_uavs_altitude(small_scene
                                        at_altitude["sigma_db"].sel(device=device.device).values)
 
 
-def test_what_is_not_detected_is_never_heard(small_scene):
+def test_a_link_without_gain_has_no_snr(small_scene):
     truth = segmented_truth(small_scene)
     dataset = truth.dataset.copy(deep=True)
     dataset["gain_db"].values[2, :, 3, 4] = np.nan
@@ -60,7 +60,7 @@ def test_batteries_are_counted_in_whole_hovers(small_scene):
     assert mission.battery.tolist() == [81, 81] and mission.longest == 81
 
 
-def test_known_positions_are_relative_to_the_lattice_and_nan_where_nobody_knows(small_scene):
+def test_known_positions_are_relative_to_the_lattice_and_nan_where_unknown(small_scene):
     mission = make_mission(small_scene, segmented_truth(small_scene), Known.anchors(small_scene))
     for device, known_m in zip(small_scene.config.devices, mission.known_m):
         if device.role == "anchor":
@@ -94,3 +94,15 @@ def test_bad_input_is_refused(small_scene):
     far = [uav.model_copy(update={"terminal_x_m": 300.0, "battery": 3.0}) for uav in small_scene.config.uavs]
     with pytest.raises(BadInput, match="battery = 3 does not reach"):
         make_mission(changed(small_scene, uavs=far), truth, known)
+
+
+def test_a_maps_attributes_say_how_long_its_errors_last(small_scene):
+    truth, known = segmented_truth(small_scene), Known.truth(small_scene)
+    assert make_mission(small_scene, truth, known).shadowing_share == 0
+    lasting = truth.dataset.assign_attrs(shadowing_share=0.7, shadowing_length_m=80.0)
+    mission = make_mission(small_scene, RadioMap(lasting), known)
+    assert (mission.shadowing_share, mission.shadowing_m) == (0.7, 80.0)
+    for bad in ({"shadowing_share": 1.5}, {"shadowing_length_m": 0.0}, {"shadowing_length_m": np.nan},
+                {"shadowing_share": "much"}):
+        with pytest.raises(BadInput, match="a share from 0 to 1 and a length above 0"):
+            make_mission(small_scene, RadioMap(lasting.assign_attrs(bad)), known)

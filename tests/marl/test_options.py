@@ -1,11 +1,11 @@
 """Options made of settings."""
 
-import argparse
-
 import pytest
+import typer
 from pydantic import BaseModel, Field
+from typer.testing import CliRunner
 
-from marl.options import add_options, checked
+from marl.options import checked, with_settings
 from radiotwin.errors import BadInput
 
 
@@ -15,37 +15,54 @@ class Settings(BaseModel):
     loud: bool = Field(False, description="whether it makes noise")
 
 
-def parsed(*words):
-    parser = argparse.ArgumentParser()
-    add_options(parser, Settings, "settings", without=set())
-    return parser.parse_args(words)
+class Others(BaseModel):
+    step_m: float = Field(2.0, description="step of the grid")
+    hidden: int = Field(1, description="not shown")
 
 
-def test_defaults_stand_where_nothing_is_given():
-    assert checked(parsed(), Settings(count=5)) == Settings(count=5)
+def invoke(*words):
+    """Exit status, output, and what the command was given."""
+    seen, app = {}, typer.Typer(rich_markup_mode=None)
+
+    @app.command()
+    @with_settings(Settings, Others, without={"hidden"})
+    def command(given: dict[str, str], resume: bool = False) -> None:
+        seen.update(given, resume=resume)
+
+    done = CliRunner().invoke(app, words)
+    return done.exit_code, " ".join(done.output.split()), seen
+
+
+def test_defaults_are_used_where_nothing_is_given():
+    assert invoke() == (0, "", {"resume": False})
+    assert checked({}, Settings(count=5)) == Settings(count=5)
+
+
+def test_a_command_is_given_the_options_as_text_besides_its_own():
+    assert invoke("--count", "4", "--step-m", "many", "--resume")[2] == {"count": "4", "step_m": "many", "resume": True}
+    assert checked({"count": "4", "step_m": "many"}, Settings(count=5)) == Settings(count=4)
+    assert invoke("--hidden", "1")[0] == 2
 
 
 @pytest.mark.parametrize("word, value", [("true", True), ("1", True), ("false", False), ("False", False),
                                          ("no", False), ("0", False)])
 def test_booleans_parse_as_booleans(word, value):
-    assert checked(parsed("--loud", word), Settings()).loud is value
+    assert checked({"loud": word}, Settings()).loud is value
 
 
-@pytest.mark.parametrize("words, parts", [
-    (("--count", "0"), ("--count 0", "a whole number ≥ 1, ≤ 9")),
-    (("--count", "2.5"), ("--count 2.5", "a whole number")),
-    (("--share", "many"), ("--share many", "a number > 0")),
-    (("--loud", "perhaps"), ("--loud perhaps", "true|false"))])
-def test_a_wrong_value_is_one_message_that_says_what_is_allowed(words, parts):
+@pytest.mark.parametrize("given, parts", [
+    ({"count": "0"}, ("--count 0", "a whole number ≥ 1, ≤ 9")), ({"count": "2.5"}, ("--count 2.5", "a whole number")),
+    ({"share": "many"}, ("--share many", "a number > 0")), ({"loud": "perhaps"}, ("--loud perhaps", "true|false"))])
+def test_a_wrong_value_is_one_message_that_says_what_is_allowed(given, parts):
     with pytest.raises(BadInput) as error:
-        checked(parsed(*words), Settings())
+        checked(given, Settings())
     assert all(part in str(error.value) for part in parts)
     assert "\n" not in str(error.value)
 
 
-def test_help_shows_every_field_with_its_default(capsys):
-    with pytest.raises(SystemExit):
-        parsed("--help")
-    shown = " ".join(capsys.readouterr().out.split())
-    for part in ("how many; 50 % will do [3]", "of the whole [0.5]", "whether it makes noise [false]"):
+def test_help_shows_every_field_with_its_default():
+    status, shown, _ = invoke("--help")
+    assert status == 0
+    for part in ("--count INTEGER How many; 50 % will do [3].", "Of the whole [0.5].",
+                 "Whether it makes noise [false].", "--step-m NUMBER", "--loud true|false"):
         assert part in shown

@@ -1,4 +1,4 @@
-"""Planning again in flight."""
+"""Re-planning in flight."""
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ def policy(mission, linked, every=4, iterations=200):
 
 
 @pytest.mark.parametrize("linked", [True, False])
-def test_every_action_is_feasible_whatever_happens(tiny, slow, linked):
+def test_every_action_is_feasible_under_disturbance(tiny, slow, linked):
     mission = tiny(1, sigma_db=2.0, battery=(30, 25))
     rng = np.random.default_rng(0)
     flights = fly(DisturbedEnvironment(mission, 8, rng, Disturbance(1.0, 1.0)), policy(mission, linked))
@@ -29,7 +29,7 @@ def test_every_action_is_feasible_whatever_happens(tiny, slow, linked):
 
 
 @pytest.mark.parametrize("linked", [True, False])
-def test_where_all_goes_as_planned_it_flies_the_plan_or_a_better_one(tiny, linked):
+def test_without_disturbance_it_flies_the_plan_or_a_better_one(tiny, linked):
     mission = tiny(2, battery=(30, 30))
     first = plan(mission, 1000, 0)
     flights = fly(Environment(mission, 2, np.random.default_rng(0)), policy(mission, linked))
@@ -38,7 +38,7 @@ def test_where_all_goes_as_planned_it_flies_the_plan_or_a_better_one(tiny, linke
     np.testing.assert_array_equal(never.action[0], first.actions)
 
 
-def test_what_is_seen_in_flight_is_worth_something(tiny):
+def test_data_seen_in_flight_improve_the_plan(tiny):
     """Three devices that only one UAV reaches, one at a time; what they have is known on arrival."""
     mission = tiny(3, rows=9, columns=9, uavs=2, devices=5, battery=(46, 46), data_units=np.full(5, 1500.0),
                    snr_db=np.where(np.random.default_rng(0).random((2, 5, 9, 9)) < 0.1, 25.0, -np.inf))

@@ -3,15 +3,14 @@
 import numpy as np
 import pytest
 
-import marl.algorithm
-import marl.strategies
-from marl.algorithm import run_algorithm
-from marl.flights import HeuristicPolicy
+import marl.algorithm1
+import marl.qmix
+from marl.algorithm1 import Reality, learn_twin, location_errors_m, run_algorithm
+from marl.flights import evaluate
+from marl.heuristics import HeuristicPolicy
 from marl.mission import Known, make_mission
-from marl.reality import Reality, known_by, learn_twin, location_errors_m
 from marl.settings import PRESETS, RunSettings
-from marl.strategies import evaluate
-from marl.trainer import Trainer
+from marl.training import Trainer
 from radiotwin.errors import BadInput
 from radiotwin.survey import segmented_truth
 
@@ -56,7 +55,7 @@ def test_a_real_flight_measures_every_device_in_every_slot_until_it_lands(small_
     assert measured.devices.loc[measured.devices["role"] == "unknown", ["x_m", "y_m"]].isna().all().all()
 
 
-def test_what_is_measured_is_what_the_mission_received(small_scene, reality):
+def test_measurements_are_the_gains_that_the_mission_drew(small_scene, reality):
     table = reality.measurements().table
     truth = segmented_truth(small_scene)
     index = truth.lattice.index_of(table[["receiver_x_m", "receiver_y_m", "receiver_z_m"]].to_numpy())
@@ -77,8 +76,8 @@ def test_below_sensitivity_is_blank(small_scene):
     assert np.isnan(level_db).any() and np.nanmin(level_db) >= -80.0
 
 
-def test_the_twin_tells_positions_of_unknown_devices_from_measurements_only(small_scene, reality):
-    known = known_by(learn_twin(reality, "nn", 0, None))
+def test_positions_of_unknown_devices_come_from_measurements_only(small_scene, reality):
+    known = Known.of(learn_twin(reality, "nn", 0, None).devices)
     errors_m = location_errors_m(small_scene, known)
     assert len(errors_m) == sum(d.role == "unknown" for d in small_scene.config.devices)
     assert (errors_m > 0).all() and np.median(errors_m) < 25
@@ -134,8 +133,8 @@ def test_training_happens_in_the_twins_map_and_judging_in_the_truths(small_scene
         return spy
 
     monkeypatch.setattr(Trainer, "enter", spy_enter)
-    monkeypatch.setattr(marl.strategies, "evaluate", spy_on(chosen))
-    monkeypatch.setattr(marl.algorithm, "evaluate", spy_on(judged))
+    monkeypatch.setattr(marl.qmix, "evaluate", spy_on(chosen))
+    monkeypatch.setattr(marl.algorithm1, "evaluate", spy_on(judged))
     outcome = execute(small_scene, run_settings(algorithm="qmix", twin="log-distance"))
     expected = make_mission(small_scene, outcome.twin.radio_map(small_scene), outcome.known)
     real = make_mission(small_scene, segmented_truth(small_scene), outcome.known)
@@ -147,7 +146,7 @@ def test_training_happens_in_the_twins_map_and_judging_in_the_truths(small_scene
     np.testing.assert_array_equal(judged[-1].snr_db, real.snr_db)
 
 
-def test_errors_of_positions_are_the_twins_also_where_agents_know_better(small_scene):
+def test_location_errors_are_the_twins_even_if_agents_see_true_positions(small_scene):
     rows = execute(small_scene, run_settings(algorithm="greedy", privileged=True)).rows
     assert rows[-1]["location_error_median_m"] > 0
 
@@ -171,25 +170,3 @@ def test_agents_see_estimates_in_the_twin_and_in_reality_alike(small_scene, monk
     seen.clear()
     execute(small_scene, run_settings(algorithm="qmix", privileged=True))
     np.testing.assert_allclose(seen[-1], true_m)
-
-
-def test_a_plan_in_the_latest_twin_may_fly_what_is_measured(small_scene, monkeypatch):
-    flown, planned = [], []
-    fly, plan = Reality.fly, marl.algorithm.plan
-
-    def seen(self, policy, known):
-        flown.append(fly(self, policy, known))
-        return flown[-1]
-
-    def noted(mission, iterations, seed):
-        planned.append(plan(mission, iterations, seed))
-        return planned[-1]
-
-    monkeypatch.setattr(Reality, "fly", seen)
-    monkeypatch.setattr(marl.algorithm, "plan", noted)
-    execute(small_scene, run_settings(algorithm="qmix", measure="planner"))
-    assert len(flown) == 3 and len(planned) == 2  # the first one is random
-    for flights, found in zip(flown[1:], planned):
-        slots = int(flights.length[0])
-        np.testing.assert_array_equal(flights.action[0, :slots], found.actions[:slots])
-    assert not np.array_equal(planned[0].actions, planned[1].actions)  # the twin has learnt in between

@@ -1,0 +1,371 @@
+"""QMIX: recurrent agents whose values a monotonic mixer combines (Rashid et al., ICML 2018).
+
+From top to bottom: the agent, the mixer, the loss and its update, and the learner that trains in
+one map after the other. Exploration, replay memory and schedules are in `marl.training`.
+"""
+
+import copy
+import math
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from typing_extensions import override
+
+from marl.environment import ACTION_COUNT, Frame
+from marl.features import global_state, observation_size, observe, state_size
+from marl.flights import Flights, Policy, evaluate
+from marl.gru import gru
+from marl.learner import Learner, Setup
+from marl.mission import Mission
+from marl.planner import PlanPolicy, plan
+from marl.randomness import stream
+from marl.replicas import Replicas
+from marl.settings import LearnerSettings
+from marl.training import AgentPolicy
+from radiotwin.channel.adam import Adam
+
+MAX_GRADIENT_NORM = 10.0
+MIN_GAIN = 0.02  # of the collected share, for a new plan to replace the one before
+
+
+class Agent(nn.Module):
+    """Action values of one UAV from what it has seen so far; all UAVs share the weights.
+
+    Args:
+        observation_size: of one UAV.
+        uavs: their number; each sees its own number as a one-hot vector.
+        hidden: width.
+        generator: of the initial weights.
+    """
+
+    def __init__(self, observation_size: int, uavs: int, hidden: int,
+                 generator: torch.Generator) -> None:
+        super().__init__()
+        self.uavs, self.hidden = uavs, hidden
+        self.encoder = nn.Linear(observation_size + ACTION_COUNT + uavs, hidden)
+        self.memory = nn.GRU(hidden, hidden)
+        self.head = nn.Linear(hidden, ACTION_COUNT)
+        _initialise(self, generator)
+
+    def forward(self, observation: Tensor, last_action: Tensor, memory: Tensor | None = None,
+                ) -> tuple[Tensor, Tensor]:
+        """Walk through a sequence.
+
+        Args:
+            observation: (T, E, U, observation_size)
+            last_action: (T, E, U) int64, of the slot before; -1 in the first one.
+            memory: (1, E * U, hidden) from the slot before the first; None for zero.
+
+        Returns:
+            (T, E, U, 6) action values, and the memory after the last slot.
+        """
+        slots, flights = observation.shape[:2]
+        # The product of a matrix and a one-hot vector is a column of it: an embedding.
+        weight, size = self.encoder.weight, observation.shape[-1]
+        rows = torch.cat([weight[:, size:size + ACTION_COUNT].t(),
+                          weight.new_zeros(1, self.hidden)])
+        encoded = nn.functional.linear(observation, weight[:, :size], self.encoder.bias)
+        encoded = encoded + nn.functional.embedding(last_action % (ACTION_COUNT + 1), rows)
+        encoded = torch.relu(encoded + weight[:, size + ACTION_COUNT:].t())
+        encoded = encoded.reshape(slots, flights * self.uavs, self.hidden)
+        remembered, memory = gru(encoded, memory, self.memory)
+        return self.head(remembered).reshape(slots, flights, self.uavs, ACTION_COUNT), memory
+
+
+class Mixer(nn.Module):
+    """Q_tot of all UAVs from the values of their actions and the state; monotonic in each value.
+
+    Args:
+        state_size: of the mission.
+        uavs: of the mission.
+        width: of the mixing layer.
+        generator: of the initial weights.
+    """
+
+    def __init__(self, state_size: int, uavs: int, width: int,
+                 generator: torch.Generator) -> None:
+        super().__init__()
+        self.uavs, self.width = uavs, width
+        self.first_weight = nn.Linear(state_size, uavs * width)
+        self.first_bias = nn.Linear(state_size, width)
+        self.last_weight = nn.Linear(state_size, width)
+        self.value = nn.Sequential(nn.Linear(state_size, width), nn.ReLU(), nn.Linear(width, 1))
+        _initialise(self, generator)
+
+    def forward(self, chosen: Tensor, state: Tensor) -> Tensor:
+        """Return Q_tot (…) of (…, U) values and (…, state_size) states."""
+        # Absolute weights from the hypernetworks keep the mixing monotonic.
+        first = self.first_weight(state).abs().unflatten(-1, (self.uavs, self.width))
+        mixed = (chosen.unsqueeze(-1) * first).sum(-2) + self.first_bias(state)
+        mixed = nn.functional.elu(mixed) * self.last_weight(state).abs()
+        return mixed.sum(-1) + self.value(state).squeeze(-1)
+
+
+@torch.no_grad()
+def _initialise(module: nn.Module, generator: torch.Generator) -> None:
+    """Draw weights from PyTorch's own distributions, but not from its global generator."""
+    for layer in module.modules():
+        if isinstance(layer, nn.Linear | nn.GRU):
+            width = layer.in_features if isinstance(layer, nn.Linear) else layer.hidden_size
+            for parameter in layer.parameters():
+                parameter.uniform_(-1 / math.sqrt(width), 1 / math.sqrt(width),
+                                   generator=generator)
+
+
+class QNetworks:
+    """Agent and mixer, their target copies, and the optimiser.
+
+    Args:
+        settings: of learning.
+        mission: gives the sizes.
+        seed: of the initial weights.
+        device: torch device.
+    """
+
+    mixes = True
+
+    def __init__(self, settings: LearnerSettings, mission: Mission, seed: int,
+                 device: str = "cpu") -> None:
+        generator = torch.Generator().manual_seed(seed)
+        self.settings, self.device, self.updates = settings, device, 0
+        self.agent = Agent(observation_size(mission), mission.uavs, settings.hidden, generator)
+        self.modules: dict[str, nn.Module] = {"agent": self.agent.to(device)}
+        if self.mixes:
+            mixer = Mixer(state_size(mission), mission.uavs, settings.mixing_width, generator)
+            self.modules["mixer"] = mixer.to(device)
+        self.targets = copy.deepcopy(self.modules)
+        self.optimiser = Adam(self.parameters())
+
+    def parameters(self) -> list[Tensor]:
+        """Return the weights that are learned."""
+        return [weight for module in self.modules.values() for weight in module.parameters()]
+
+    def update(self, flights: Flights, mission: Mission, learning_rate: float) -> dict[str, float]:
+        """Make one step of gradient descent on the squared TD errors of some flights.
+
+        Args:
+            flights: a batch, recorded in this mission's map or an earlier one.
+            mission: makes the features.
+            learning_rate: of this step.
+
+        Returns:
+            `loss`, `gradient_norm` and `mean_value` (mean of Q_tot).
+        """
+        settings = self.settings
+        observation, mask, state, action, reward, valid = self._tensors(flights, mission)
+        last_action = torch.cat([torch.full_like(action[:1], -1), action[:-1]])
+        values, _ = self.agent(observation, last_action)
+        chosen = self.mix(values.gather(-1, action.unsqueeze(-1)).squeeze(-1), state, self.modules)
+        with torch.no_grad():
+            target_values, _ = self.targets["agent"](observation, last_action)
+            # Double Q-learning: the online network chooses the action, the target network
+            # gives its value.
+            ranked = (values.detach() if settings.double_q else target_values)
+            best = ranked.masked_fill(~mask, -torch.inf).argmax(-1, keepdim=True)
+            best = self.mix(target_values.gather(-1, best).squeeze(-1), state, self.targets)
+            target = td_lambda_targets(reward, best, valid, settings.discount, settings.td_lambda)
+        count = valid.sum() * chosen[0, 0].numel()
+        loss = ((chosen - target) * valid).square().sum() / count
+        gradients = torch.autograd.grad(loss, self.parameters())
+        norm = torch.stack([gradient.norm() for gradient in gradients]).norm()
+        scale = (MAX_GRADIENT_NORM / norm).clamp(max=1.0)
+        self.optimiser.step([gradient * scale for gradient in gradients], learning_rate)
+        self.updates += 1
+        if self.updates % settings.target_every == 0:
+            self.copy_to_targets()
+        mean = (chosen.detach() * valid).sum() / valid.sum() / chosen[0, 0].numel()
+        return {"loss": float(loss.detach()), "gradient_norm": float(norm),
+                "mean_value": float(mean)}
+
+    def mix(self, values: Tensor, state: Tensor, modules: dict[str, nn.Module]) -> Tensor:
+        """Return the values that are learned: (T, E) Q_tot of (T, E, U) values of actions."""
+        return modules["mixer"](values, state)
+
+    def copy_to_targets(self) -> None:
+        """Copy the online networks to the target networks."""
+        for name, module in self.modules.items():
+            self.targets[name].load_state_dict(module.state_dict())
+
+    def _tensors(self, flights: Flights, mission: Mission) -> tuple[Tensor, ...]:
+        """Return features (T, E, …), actions (T, E, U), reward and validity (T, E) of a batch."""
+        count, slots = flights.action.shape[:2]
+        flat = Frame(*(array.swapaxes(0, 1).reshape(count * slots, *array.shape[2:])
+                       for array in flights.frames))
+        none = np.zeros((count * slots, 0), np.float32)
+        state = global_state(mission, flat) if self.mixes else none
+        observation, mask, state = (
+            torch.from_numpy(array).to(self.device).unflatten(0, (slots, count))
+            for array in (*observe(mission, flat), state))
+        action = torch.from_numpy(flights.action.swapaxes(0, 1).astype(np.int64))
+        reward = flights.collected.sum(axis=2).T / np.float32(self.settings.reward_scale)
+        valid = (np.arange(slots)[:, None] < flights.length[None]).astype(np.float32)
+        return (observation, mask, state, action.to(self.device),
+                *(torch.from_numpy(array).to(self.device) for array in (reward, valid)))
+
+    def weights(self) -> dict[str, np.ndarray]:
+        """Return copies of the weights that are averaged over replicas.
+
+        With `federate_all` also of the target networks and of the optimiser's moments.
+        """
+        return {name: tensor.detach().cpu().numpy().copy() for name, tensor in self._federated()}
+
+    @torch.no_grad()
+    def set_weights(self, weights: dict[str, np.ndarray]) -> None:
+        """Copy averaged weights into the networks."""
+        for name, parameter in self._federated():
+            parameter.copy_(torch.from_numpy(weights[name]))
+
+    def _federated(self) -> list[tuple[str, Tensor]]:
+        modules, moments = dict(self.modules), {}
+        if self.settings.federate_all:
+            modules |= {f"target_{name}": module for name, module in self.targets.items()}
+            moments = {"mean": self.optimiser.mean, "square": self.optimiser.square}
+        return [(f"{name}.{part}", tensor) for name, module in modules.items()
+                for part, tensor in module.named_parameters()] + \
+               [(f"{name}.{number}", tensor) for name, tensors in moments.items()
+                for number, tensor in enumerate(tensors)]
+
+    def state(self) -> dict:
+        """Return a checkpoint."""
+        return {"updates": self.updates, "optimiser": self.optimiser.state_dict(),
+                **{name: module.state_dict() for name, module in self.modules.items()},
+                **{f"target_{name}": module.state_dict() for name, module in self.targets.items()}}
+
+    def load_state(self, state: dict) -> None:
+        """Go on from a checkpoint."""
+        self.updates = state["updates"]
+        self.optimiser.load_state_dict(state["optimiser"])
+        for name in self.modules:
+            self.modules[name].load_state_dict(state[name])
+            self.targets[name].load_state_dict(state[f"target_{name}"])
+
+
+def td_lambda_targets(reward: Tensor, best: Tensor, valid: Tensor, discount: float,
+                      td_lambda: float) -> Tensor:
+    """Return TD(λ) returns: G_t = r_t + γ ((1 - λ) V_{t+1} + λ G_{t+1}), backwards.
+
+    Args:
+        reward: (T, E) or (T, E, 1)
+        best: (T, E) or (T, E, U) value of the best action in each slot.
+        valid: as `reward`; 0 behind the end of a flight, where nothing is worth anything.
+        discount: γ.
+        td_lambda: λ.
+
+    Returns:
+        Targets in the shape of `best`.
+    """
+    ahead = torch.cat([valid[1:], torch.zeros_like(valid[:1])])
+    following = torch.cat([best[1:], torch.zeros_like(best[:1])])
+    target = reward + discount * (1 - td_lambda) * ahead * following
+    if td_lambda > 0:
+        decay = discount * td_lambda * ahead
+        for slot in range(len(best) - 2, -1, -1):
+            target[slot].addcmul_(decay[slot], target[slot + 1])
+    return target
+
+
+class QMIX(Learner):
+    """`--algorithm qmix`: train one replica in each map.
+
+    After every block of `federate_every` episodes the current policy is evaluated in the map that
+    it is trained in; the best one there, earlier rounds included, is the one that flies.
+    """
+
+    networks: type[QNetworks] = QNetworks
+
+    def __init__(self, setup: Setup, replicas: int = 1) -> None:
+        super().__init__(setup)
+        run, settings, mission, self.replicas = setup.run, setup.settings, setup.mission, replicas
+        self._current = self.networks(settings, mission, run.seed, setup.device).agent
+        self._best = copy.deepcopy(self._current)
+        self._episodes = 0
+        self._actions: np.ndarray | None = None  # of the guide's plan
+        horizon = setup.rounds * run.episodes
+        self._trainers = Replicas([(self.networks, settings, mission, horizon, run.seed, number,
+                                    setup.device) for number in range(replicas)])
+
+    @override
+    def prepare(self, mission: Mission,
+                on_progress: Callable[[int], None]) -> list[dict[str, float]]:
+        run, settings = self.setup.run, self.setup.settings
+        if run.guide == "planner":
+            self._actions = self._better_plan(mission)
+        self._trainers.call("enter", mission, self._actions)
+        records, left = [], run.episodes
+        highest = self._ratio(mission, self._best) if self._episodes else -np.inf
+        while left:
+            block = min(left, settings.federate_every)
+            trained, weights = self._train(block)
+            left, self._episodes = left - block, self._episodes + block
+            _load(self._current, weights)
+            ratio = self._ratio(mission, self._current)
+            if not ratio <= highest:  # also where it is NaN, so that the last one flies
+                highest = ratio
+                _load(self._best, weights)
+            records.append({"episodes": self._episodes, "twin_ratio": ratio} | trained)
+            on_progress(block)
+        return records
+
+    def _train(self, episodes: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
+        """Train for some episodes; return the record to be logged, and the new weights."""
+        [record], [weights] = self._trainers.call("train", episodes), self._trainers.call("weights")
+        return record, weights
+
+    def _ratio(self, mission: Mission, agent: Agent) -> float:
+        """Return the share that a policy collects, always in the same shadowing.
+
+        NaN without `selection_flights`.
+        """
+        flights, seed = self.setup.settings.selection_flights, self.setup.run.seed
+        if not flights:
+            return np.nan
+        self.selection_flights += flights
+        policy = AgentPolicy(agent, self.setup.device)
+        flown = evaluate(mission, policy, flights, stream(seed, "choice"))
+        return float(flown.ratio(mission).mean())
+
+    def _better_plan(self, mission: Mission) -> np.ndarray:
+        """Plan anew, but keep the plan before unless the new one is clearly better.
+
+        A teacher that changes its mind every round teaches little.
+        """
+        run = self.setup.run
+        new = plan(mission, run.planner_iterations, run.seed).actions
+        if self._actions is None:
+            return new
+        self.selection_flights += 2 * run.flights
+        before, after = (
+            evaluate(mission, PlanPolicy(actions), run.flights, stream(run.seed, "choice"))
+            .ratio(mission).mean() for actions in (self._actions, new))
+        return new if after > before + MIN_GAIN else self._actions
+
+    @override
+    def policy(self, rng: np.random.Generator) -> Policy:
+        return AgentPolicy(self._best, self.setup.device)
+
+    @override
+    def state(self, last: bool) -> dict:
+        # The replicas' memories are most of a checkpoint.
+        return {"episodes": self._episodes, "best": self._best.state_dict(),
+                "actions": self._actions, "selection_flights": self.selection_flights,
+                "replicas": None if last else self._trainers.call("state")}
+
+    @override
+    def load_state(self, state: dict) -> None:
+        self._episodes, self._actions = state["episodes"], state["actions"]
+        self.selection_flights = state["selection_flights"]
+        self._best.load_state_dict(state["best"])
+        if state["replicas"] is not None:
+            self._trainers.call("load_state", each=state["replicas"])
+
+    @override
+    def close(self) -> None:
+        self._trainers.close()
+
+
+@torch.no_grad()
+def _load(agent: nn.Module, weights: dict[str, np.ndarray]) -> None:
+    for name, parameter in agent.named_parameters():
+        parameter.copy_(torch.from_numpy(weights[f"agent.{name}"]))

@@ -1,0 +1,87 @@
+"""How long the errors of a twin's map last: nearby, and over a flight, they are much the same.
+
+`sigma_db` of a map is the size of its errors. Drawn anew in every slot of a simulated flight, it
+would pay to hover anywhere and wait for a lucky slot, which no real world rewards. So the share of
+the variance that stays, and the distance over which it does, are estimated from the residuals of
+the measurements and written into the map's attributes.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from radiotwin.channel.residual_field import ResidualField
+from radiotwin.inference.gaussian import standardised
+from radiotwin.measurements import Measurements
+from radiotwin.radiomap import RadioMap
+from radiotwin.twin.twin import Twin
+
+MAX_LINKS = 300  # of a device, in the estimate
+MIN_SHARE = 0.05  # that is worth drawing: a small share takes as long to draw as a large one
+
+
+class Shadowing(NamedTuple):
+    """Correlation of a map's errors.
+
+    Attributes:
+        share: of the variance that stays for a flight; the rest is independent in every slot.
+        length_m: distance over which the correlation of the part that stays falls to 1/e [m]
+            (Gudmundson 1991, Electronics Letters 27).
+    """
+
+    share: float = 0.0
+    length_m: float = 50.0
+
+
+def with_shadowing(radio_map: RadioMap, twin: Twin, measurements: Measurements, limit_db: float,
+                   seed: int) -> RadioMap:
+    """Return a twin's map with the attributes `shadowing_share` and `shadowing_length_m`.
+
+    Args:
+        radio_map: `twin.radio_map(scene)`.
+        twin: where it interpolates, the correlation is that of its residual field, because it
+            leaves next to no residual; otherwise that of `fit_shadowing`.
+        measurements: that the twin was fitted to.
+        limit_db: gain below which nothing is detected [dB].
+        seed: of the selection of links.
+    """
+    if twin.residual_field is not None:
+        found = Shadowing(twin.residual_field.share, twin.residual_field.length_m)
+    else:
+        found = fit_shadowing(radio_map, measurements, limit_db, seed)
+    # A correlation within one cell cannot be distinguished from one within one slot.
+    if found.length_m < radio_map.lattice.step_m or found.share < MIN_SHARE:
+        found = Shadowing()
+    return RadioMap(radio_map.dataset.assign_attrs(shadowing_share=float(found.share),
+                                                   shadowing_length_m=float(found.length_m)))
+
+
+def fit_shadowing(radio_map: RadioMap, measurements: Measurements, limit_db: float,
+                  seed: int) -> Shadowing:
+    """Estimate the correlation of a map's errors by maximum likelihood (`ResidualField`).
+
+    Args:
+        radio_map: of a twin, with `sigma_db`.
+        measurements: that the twin was fitted to; receivers belong to the nearest cell.
+        limit_db: gain below which nothing is detected [dB]; a link without level enters with its
+            mean below it.
+        seed: of the selection of links.
+    """
+    lattice, rng = radio_map.lattice, np.random.default_rng(seed)
+    axes = zip((lattice.z_m, lattice.y_m, lattice.x_m), measurements.receiver_m.T[::-1])
+    cell = [np.abs(axis_m[:, None] - there_m).argmin(axis=0) for axis_m, there_m in axes]
+    rows = []
+    for number, device in enumerate(measurements.devices["device"]):
+        if device in radio_map.devices:
+            mine = np.flatnonzero(measurements.device_index == number)
+            rows.append(rng.choice(mine, min(MAX_LINKS, len(mine)), replace=False))
+    some = np.sort(np.concatenate(rows))
+    names = measurements.devices["device"].to_numpy()[measurements.device_index[some]]
+    at = (np.array([radio_map.devices.index(name) for name in names]),
+          *(axis[some] for axis in cell))
+    mean_db = radio_map.gain_db[at].astype(float)
+    sigma_db = radio_map.dataset["sigma_db"].values[at].astype(float)
+    residual = standardised(measurements.level_db[some], mean_db, sigma_db, limit_db)
+    field = ResidualField().fit(measurements.device_index[some], measurements.receiver_m[some],
+                                residual, seed)
+    return Shadowing(field.share, field.length_m)

@@ -1,0 +1,265 @@
+"""Training: schedules, exploration, memory, reproducibility, and a small mission learned to near its optimum."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from marl.environment import Environment
+from marl.features import observation_size, observe
+from marl.flights import fly
+from marl.heuristics import HeuristicPolicy
+from marl.iql import IndependentNetworks
+from marl.mission import HOVER, Mission
+from marl.qmix import Agent, QNetworks
+from marl.settings import LearnerSettings
+from marl.training import AgentPolicy, Exploration, Replay, Trainer
+
+SETTINGS = LearnerSettings(hidden=8, mixing_width=4, parallel=4, batch=4, replay=12, epsilon_slots=400)
+POLICY = 5  # an action that nothing in these masks allows: whoever flies it is not on an excursion
+GIB = 2**30
+
+
+def test_schedules_are_linear_and_counted_in_slots_and_episodes(tiny):
+    trainer = Trainer(QNetworks, SETTINGS, tiny(0), 40, 0)
+    assert trainer.epsilon == 1.0 and trainer.learning_rate == SETTINGS.learning_rate
+    trainer.train(20)
+    assert trainer.epsilon == pytest.approx(1.0 - 0.95 * min(trainer.slots / 400, 1))
+    assert trainer.learning_rate == pytest.approx((2e-3 + 2e-4) / 2)
+    trainer.train(40)
+    assert trainer.learning_rate == pytest.approx(2e-4) and trainer.epsilon == pytest.approx(0.05)
+
+
+def test_there_is_an_update_for_every_so_many_episodes_once_a_batch_is_there(tiny):
+    settings = SETTINGS.model_copy(update={"parallel": 3, "batch": 4, "episodes_per_update": 2})
+    trainer = Trainer(QNetworks, settings, tiny(0), 40, 0)
+    for episodes, updates in ((3, 0), (3, 2), (6, 5)):  # the first three flights are less than a batch
+        trainer.train(episodes)
+        assert trainer.networks.updates == updates
+    trainer.train(1)  # fewer than fit side by side
+    assert trainer.episodes == 13 and trainer.networks.updates == 5
+
+
+@pytest.mark.parametrize("networks", [QNetworks, IndependentNetworks])
+def test_the_same_seed_learns_the_same_weights_and_another_replica_others(tiny, networks):
+    mission = tiny(0, sigma_db=1.0)
+    trainers = [Trainer(networks, SETTINGS, mission, 40, 0, number) for number in (0, 0, 1)]
+    start = [parameter.detach().clone() for parameter in trainers[2].networks.parameters()]
+    assert all(torch.equal(a, b) for a, b in zip(start, trainers[0].networks.parameters()))
+    records = [trainer.train(12) for trainer in trainers]
+    assert records[0] == records[1] != records[2]
+    one, same, other = (list(trainer.networks.parameters()) for trainer in trainers)
+    assert all(torch.equal(a, b) for a, b in zip(one, same))
+    assert any(not torch.equal(a, b) for a, b in zip(one, other))
+
+
+def test_a_quarter_of_the_flights_follow_a_plan_and_the_help_for_the_others_fades(tiny):
+    mission, plan = tiny(0), np.full((20, 2), HOVER)
+    trainer = Trainer(QNetworks, SETTINGS, mission, 40, 0)
+    trainer.enter(mission, plan)
+    slots = np.array([trainer._followed_slots(10) for _ in range(200)])
+    assert (slots[:, :3] == 20).all()
+    assert slots[:, 3:].min() == 0 and slots[:, 3:].max() == 20 and abs(slots[:, 3:].mean() - 10) < 1
+    trainer.episodes = 30
+    assert np.array([trainer._followed_slots(10)[3:] for _ in range(200)]).max() == 5
+    trainer.episodes = 40
+    assert trainer._followed_slots(1).tolist() == [20] and trainer._followed_slots(10)[3:].max() == 0
+
+
+def test_a_trainer_goes_on_from_its_state_to_the_bit(tiny):
+    mission = tiny(0, sigma_db=1.0)
+    unbroken, stopped, again = (Trainer(QNetworks, SETTINGS, mission, 40, seed) for seed in (0, 0, 3))
+    unbroken.train(8)
+    expected = unbroken.train(16)
+    stopped.train(8)
+    again.load_state(stopped.state())
+    assert again.train(16) == expected
+    for one, other in zip(unbroken.networks.parameters(), again.networks.parameters()):
+        assert torch.equal(one, other)
+
+
+def test_a_small_mission_is_learnt_to_95_percent_of_its_optimum(tiny):
+    # Two devices in opposite corners, heard well in the corner and badly one cell beside it; both UAVs start in the
+    # middle. There and back costs 16 of 24 hovers, so a UAV spends 8 hovers and the slot of its leaving in a corner,
+    # and passes a cell beside it twice. More of a device than one UAV takes is never there to be had.
+    snr_db = np.full((2, 2, 5, 5), -np.inf)
+    for k, (corner, beside) in enumerate([((0, 0), [(0, 1), (1, 0)]), ((4, 4), [(4, 3), (3, 4)])]):
+        snr_db[(slice(None), k, *corner)] = 25.0
+        for cell in beside:
+            snr_db[(slice(None), k, *cell)] = 10.0
+    mission = tiny(0, devices=2, snr_db=snr_db, battery=(24, 24), data_units=[10_000.0, 10_000.0],
+                   known_m=[[0, 0], [80, 80]])
+    well, badly = (100 * math.log2(1 + 10 ** (snr_db / 10)) for snr_db in (25.0, 10.0))
+    optimum = 2 * (9 * well + 2 * badly) / 20_000
+    settings = LearnerSettings(hidden=32, mixing_width=16, epsilon_slots=30_000, target_every=20, replay=500,
+                               episodes_per_update=2)
+    trainer = Trainer(QNetworks, settings, mission, 3000, 0)
+    trainer.train(3000)
+    rng = np.random.default_rng(0)
+    ratio = fly(Environment(mission, 1, rng), AgentPolicy(trainer.networks.agent)).ratio(mission)[0]
+    assert 0.95 * optimum <= ratio <= optimum * (1 + 1e-6)
+
+
+@pytest.fixture
+def agent(city_mission):
+    return Agent(observation_size(city_mission), city_mission.uavs, 8, torch.Generator().manual_seed(0))
+
+
+def test_without_exploration_the_feasible_action_of_greatest_value_is_flown(city_mission, agent):
+    rng = np.random.default_rng(0)
+    flights = fly(Environment(city_mission, 3, rng), AgentPolicy(agent))
+    count, slots = flights.action.shape[:2]
+    for e in range(count):
+        frames = type(flights.frames)(*(array[e] for array in flights.frames))
+        observation, mask = observe(city_mission, frames)
+        last = np.concatenate([np.full((1, city_mission.uavs), -1), flights.action[e, :-1]]).astype(np.int64)
+        values, _ = agent(torch.from_numpy(observation)[:, None], torch.from_numpy(last)[:, None])
+        best = np.where(mask, values[:, 0].detach().numpy(), -np.inf).argmax(-1)
+        np.testing.assert_array_equal(flights.action[e, :flights.length[e]], best[:flights.length[e]])
+
+
+@pytest.mark.parametrize("mean_slots", [1.0, 4.0])
+def test_exploration_is_as_frequent_as_epsilon_says_and_safe(city_mission, agent, mean_slots):
+    rng = np.random.default_rng(0)
+    environment = Environment(city_mission, 400, rng)
+    explored = AgentPolicy(agent, exploration=Exploration(0.4, mean_slots, np.random.default_rng(1)))
+    certain = AgentPolicy(agent)
+    frame = environment.reset()
+    for policy in (explored, certain):
+        policy.start(city_mission, 400)
+    one, other = explored.act(frame), certain.act(frame)
+    # An explored action is the best one by chance once in as many cases as there are feasible actions.
+    feasible = observe(city_mission, frame)[1][0, 0].sum()
+    expected = 0.4 / (mean_slots - 0.4 * (mean_slots - 1)) * (1 - 1 / feasible)
+    assert abs((one != other).mean() - expected) < 4 * np.sqrt(expected * (1 - expected) / one.size)
+    environment = Environment(city_mission, 50, rng)
+    fly(environment, AgentPolicy(agent, exploration=Exploration(1.0, mean_slots, rng)))
+    home = city_mission.steps_home[np.arange(2), environment.frame.cell[..., 0], environment.frame.cell[..., 1]]
+    assert (home == 0).all()
+
+
+def test_a_guided_flight_follows_the_plan_for_its_number_of_slots(city_mission, agent):
+    rng = np.random.default_rng(0)
+    plan = fly(Environment(city_mission, 1, rng), HeuristicPolicy("greedy", rng)).action[0]
+    slots = np.array([0, 7, len(plan)])
+    flights = fly(Environment(city_mission, 3, rng), AgentPolicy(agent, guide=(plan, slots)))
+    np.testing.assert_array_equal(flights.action[1, :7], plan[:7])
+    np.testing.assert_array_equal(flights.action[2, :flights.length[2]], plan[:flights.length[2]])
+    assert not np.array_equal(flights.action[0, :7], plan[:7])
+
+
+def explored(exploration, slots, flights=2000, feasible=lambda slot: [0, 1, 2, 3, 4]):
+    """(slots, flights) actions of one UAV in each flight whose policy always says POLICY."""
+    exploration.start(flights, 1)
+    actions = []
+    for slot in range(slots):
+        mask = np.zeros((flights, 1, 6), dtype=bool)
+        mask[..., feasible(slot)] = True
+        actions.append(exploration.change(np.full((flights, 1), POLICY), mask)[:, 0])
+    return np.array(actions)
+
+
+@pytest.mark.parametrize("epsilon, mean_slots", [(0.05, 1.0), (0.05, 4.0), (0.6, 4.0), (1.0, 4.0)])
+def test_epsilon_is_the_share_of_the_slots_that_are_explored(epsilon, mean_slots):
+    actions = explored(Exploration(epsilon, mean_slots, np.random.default_rng(0)), 300)
+    assert (actions[100:] != POLICY).mean() == pytest.approx(epsilon, rel=0.02)  # the first slots remember the start
+
+
+def test_an_excursion_keeps_its_action_and_is_as_long_as_it_should():
+    actions = explored(Exploration(0.01, 4.0, np.random.default_rng(1)), 400)
+    lengths, kinds = [], []
+    for flight in actions[:-60].T:  # excursions that begin late would be cut off
+        starts = np.flatnonzero((flight[1:] != POLICY) & (flight[:-1] == POLICY)) + 1
+        for start in starts[starts < 300]:
+            stop = start + np.argmax(flight[start:] == POLICY)
+            lengths.append(stop - start)
+            kinds.append(flight[start])
+    assert np.mean(lengths) == pytest.approx(4.0, rel=0.05)
+    assert np.bincount(kinds, minlength=5) / len(kinds) == pytest.approx([0.2] * 5, abs=0.03)
+
+
+def test_an_excursion_ends_where_its_action_is_not_feasible():
+    def feasible(slot):
+        return [1] if slot < 3 else [2]
+    actions = explored(Exploration(1.0, 1000.0, np.random.default_rng(2)), 5, feasible=feasible)
+    assert (actions[:3] == 1).all() and (actions[3] == POLICY).mean() > 0.95 and (actions[4] == 2).all()
+
+
+def test_longer_excursions_lead_further():
+    def distance(mean_slots):
+        actions = explored(Exploration(1.0, mean_slots, np.random.default_rng(3)), 10, feasible=lambda slot: [1, 3])
+        return np.abs((actions == 1).sum(0) - (actions == 3).sum(0).astype(int)).mean()
+    assert distance(1.0) == pytest.approx(np.sqrt(2 * 10 / np.pi), rel=0.1)  # a random walk's
+    assert distance(8.0) > 1.8 * distance(1.0)
+
+
+def flown(mission, count, seed):
+    """Random flights; what they collected first is replaced by a number that tells them apart."""
+    rng = np.random.default_rng(seed)
+    flights = fly(Environment(mission, count, rng), HeuristicPolicy("random", rng))
+    flights.collected[:, 0, 0] = 100 * seed + np.arange(count)
+    return flights
+
+
+def names(flights):
+    return flights.collected[:, 0, 0].astype(int)
+
+
+def test_the_oldest_flights_are_overwritten(tiny):
+    mission = tiny(0)
+    replay = Replay(5, mission)
+    for seed in range(4):  # eight flights into five places
+        replay.add(flown(mission, 2, seed))
+    assert replay.size == 5
+    assert sorted(names(replay.sample(5, np.random.default_rng(0)))) == [101, 200, 201, 300, 301]
+
+
+def test_samples_are_different_flights_with_equal_chances_cut_to_the_longest(tiny):
+    mission = tiny(0)
+    replay = Replay(20, mission)
+    replay.add(flown(mission, 10, 0))
+    rng, counts = np.random.default_rng(1), np.zeros(10)
+    for _ in range(500):
+        sample = replay.sample(4, rng)
+        which = names(sample)
+        assert len(set(which)) == 4
+        assert sample.action.shape[1] == sample.length.max() == sample.frames.snr_db.shape[1]
+        counts[which] += 1
+    assert np.abs(counts / 2000 - 0.1).max() < 4 * np.sqrt(0.1 * 0.9 / 2000)
+
+
+def test_stored_flights_come_back_whole(tiny):
+    mission = tiny(1)
+    replay, flights = Replay(3, mission), flown(mission, 3, 0)
+    replay.add(flights)
+    sample = replay.sample(3, np.random.default_rng(0))
+    for row, source in enumerate(names(sample)):
+        slots = sample.length[row]
+        assert slots == flights.length[source]
+        for kept, original in zip((*sample.frames, sample.action), (*flights.frames, flights.action)):
+            np.testing.assert_array_equal(kept[row, :slots], original[source, :slots])
+
+
+def test_the_state_restores_the_memory(tiny):
+    mission = tiny(0)
+    replay, other = Replay(5, mission), Replay(5, mission)
+    for seed in range(4):
+        replay.add(flown(mission, 2, seed))
+    other.load_state(replay.state())
+    for memory in (replay, other):
+        memory.add(flown(mission, 1, 9))
+    one, two = (memory.sample(3, np.random.default_rng(0)) for memory in (replay, other))
+    for kept, again in zip((*one.frames, one.action, one.collected), (*two.frames, two.action, two.collected)):
+        np.testing.assert_array_equal(kept, again)
+
+
+@pytest.mark.parametrize("battery", [60.0, 80.0])
+def test_three_replicas_of_five_thousand_flights_of_the_papers_missions_take_at_most_0_7_gib(battery):
+    uavs, devices = 3, 10
+    mission = Mission(
+        np.zeros((uavs, devices, 2, 2), np.float32), np.zeros((uavs, devices, 2, 2), np.float32),
+        np.zeros((uavs, 2, 2), np.int64), np.zeros((uavs, 2), np.int64), np.full(uavs, int(2 * battery)),
+        np.zeros(uavs), np.ones(devices), np.zeros((devices, 2)), 20.0, 100.0, 10.0, -np.inf, np.zeros(2), False)
+    # Zeros are not yet taken from the system, so this needs no memory.
+    assert 3 * Replay(5000, mission).bytes < 0.7 * GIB
