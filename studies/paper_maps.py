@@ -1,15 +1,15 @@
-"""Scene folders of the paper's published maps, which are not in this repository.
+"""Write scene folders of the paper's published maps, which are not in this repository.
 
-    python benchmarks/paper_maps.py MAP.json FOLDER
+    python -m studies.paper_maps MAP.json FOLDER    # runs/paper_rbm, runs/paper_rdm
 
 The maps come with the code of Chen et al. (github.com/Cirrick/Multi_UAV_Data_Harvesting, BSD-3), as JSON with
 `extent_m`, `buildings_xmin_ymin_xmax_ymax_height_m`, `device_xy`, `anchor_index`, `data_units`, `start`, `terminal`
-(metres) and `battery`. Radio as published: 43 dB transmit power, -60 dB noise, 10 dB threshold. Devices are put at
-1.5 m. The sensitivity is so low that every link is measured.
+(metres) and `battery`. Radio as published: 43 dB transmit power, -60 dB noise, 10 dB threshold. Devices are
+1.5 m high. The sensitivity is so low that every link is measured.
 """
 
-import argparse
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from radiotwin.scene.generator import building_meshes
 from radiotwin.scene.materials import Material
 from radiotwin.scene.writer import CityShape, write_city
 
-MARGIN_M = 100.0
+MARGIN_M = 100.0  # of ground around the extent
 
 
 def build_paper_scene(path: Path, folder: Path) -> None:
@@ -54,13 +54,5 @@ def build_paper_scene(path: Path, folder: Path) -> None:
         write_config(config, temporary / "scene.toml")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("map", type=Path)
-    parser.add_argument("folder", type=Path)
-    arguments = parser.parse_args()
-    build_paper_scene(arguments.map, arguments.folder)
-
-
 if __name__ == "__main__":
-    main()
+    build_paper_scene(Path(sys.argv[1]), Path(sys.argv[2]))

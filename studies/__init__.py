@@ -1,0 +1,1 @@
+"""What made `docs/results`: studies and benchmarks, run by `python -m studies` (docs/results.md)."""
