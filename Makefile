@@ -26,7 +26,7 @@ help:
 	@echo "make test    set up, then every test"
 	@echo "make check   ruff and mypy"
 	@echo "make docs    the site, in site/; runs the examples"
-	@echo "make bench   what takes how long (the studies of docs/results.md are started one by one)"
+	@echo "make bench   what takes how long; \`python -m studies --list\` lists all studies"
 	@echo "make llvm    set up only: the package and a libLLVM for tracing"
 	@echo "make clean   remove the environment and what the tools left"
 
@@ -49,7 +49,7 @@ docs: $(INSTALLED)
 	cd build/docs && OMP_NUM_THREADS=1 $(abspath $(BIN))/mkdocs build --strict -f $(CURDIR)/mkdocs.yml -d $(CURDIR)/site
 
 bench: llvm
-	$(BIN)/python benchmarks/run.py
+	$(BIN)/python -m studies speed --out build/speed --resume
 
 # The second run does nothing, until what is to be installed has changed.
 $(INSTALLED): pyproject.toml constraints.txt
@@ -78,4 +78,4 @@ llvm: $(INSTALLED)
 
 clean:
 	rm -rf $(VENV) build dist site *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
-	find radiotwin marl tests benchmarks -name __pycache__ -prune -exec rm -rf {} +
+	find radiotwin marl tests studies -name __pycache__ -prune -exec rm -rf {} +

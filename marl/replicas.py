@@ -1,6 +1,6 @@
 """Replicas that learn side by side: one in this process, several in a process each.
 
-Processes, because three of them use two cores a quarter better than three threads do (`benchmarks/marl_speed.py`).
+Processes, because three of them use two cores a quarter better than three threads do (`python -m studies speed`).
 Where this process may use one core only, they learn one after the other in it, which comes to the same.
 """
 

@@ -1,1 +1,1 @@
-"""What made `docs/results`: studies and benchmarks, run by `python -m studies` (docs/results.md)."""
+"""Studies and benchmarks that made `docs/results`, run by `python -m studies`."""

@@ -18,7 +18,7 @@ def main(
     list_: Annotated[bool, Flag("--list", help="List the studies.")] = False,
     report: Annotated[bool, Flag("--report", help="Only remake tables and figures.")] = False,
     seeds: Annotated[int | None, Flag(min=1, max=1000, help="How many, from 0.")] = None,
-    only: Annotated[str | None, Flag(metavar="A,B", help="Parts of rows' names, or NAME:SEED.")] = None,
+    only: Annotated[str | None, Flag(metavar="A,B", help="Parts of names, or NAME:SEED.")] = None,
     resume: Annotated[bool, Flag("--resume", help="Keep finished rows, run the others.")] = False,
     jobs: Annotated[int, Flag(min=1, max=1000, help="Processes, one row each.")] = 1,
     out: Annotated[Path, Flag(help="Folder of rows, tables and figures.")] = Path("docs/results"),
@@ -39,8 +39,8 @@ def main(
             kept = len(read_rows(name, out))
             todo = missing_rows(name, seeds or load_study(name).seeds, only, out)
             if kept and not resume:
-                raise BadInput(f"{out / name}.json holds {kept} finished rows; --resume keeps them, "
-                               "--out names another folder, --report only makes table and figures")
+                raise BadInput(f"{out / name}.json holds {kept} finished rows; --resume keeps "
+                               "them, --out names another folder, --report runs nothing")
             for row in run_rows(name, todo, out, jobs):
                 say(f"{name} {row['name']} seed {row['seed']}: {row['cpu_s']:.0f} CPU s")
         for each in [name] if name else MODULES:

@@ -45,15 +45,15 @@ def find_hidden(seed: int, settings: dict) -> dict:
                                         hold_out=hold_out))
         oracle_rmse_db = _oracle_rmse_db(hidden, report["base"], hold_out)
     effects, error, truth = report["effects"], report["error"], hidden.answer["effects"]
-    scores = ("rmse_db", "bias_db", "std_db", "correlation", "nll")
+    columns = ("rmse_db", "bias_db", "std_db", "correlation", "nll")
     return {
         "hidden": truth, "base": report["base"], **summary(report),
         "gains_nats": [round(effect["evidence"]["heldout_nll_gain"]) for effect in effects],
         "indistinguishable": [effect["indistinguishable_from"] for effect in effects],
         "recovered": [recovered(effect, effects) for effect in truth],
         "parameters": [effect["parameters"] for effect in effects],
-        **{when: {name: error[when][name] for name in scores} for when in ("before", "after")},
-        "nlos_rmse_db": {when: error["by_los"]["nlos"][when]["rmse_db"] for when in ("before", "after")},
+        **{when: {name: error[when][name] for name in columns} for when in ("before", "after")},
+        "nlos_rmse_db": {when: each["rmse_db"] for when, each in error["by_los"]["nlos"].items()},
         "baselines": {name: each["rmse_db"] for name, each in report["baselines"].items()},
         "oracle_rmse_db": oracle_rmse_db}
 
@@ -121,7 +121,8 @@ def recovered(hidden: dict, effects: list[dict]) -> dict:
         return {"clock_error_s": here.get("positions_late_by_s", np.nan) - hidden["late_s"]}
     if name == "missing_obstacle" and mine:
         pairs = [(np.hypot(box["x_m"]["value"] - tower["centre_m"][0],
-                           box["y_m"]["value"] - tower["centre_m"][1]), box["height_m"], tower["height_m"])
+                           box["y_m"]["value"] - tower["centre_m"][1]),
+                  box["height_m"], tower["height_m"])
                  for box in mine for tower in hidden["obstacles"]]
         centre_m, height, true_m = min(pairs, key=lambda pair: pair[0])
         return {"centre_error_m": centre_m, "height_error_m": height["value"] - true_m,
@@ -129,15 +130,16 @@ def recovered(hidden: dict, effects: list[dict]) -> dict:
                 "boxes": len(mine), "towers": len(hidden["obstacles"])}
     if name == "removed_obstacle" and values:
         corners = np.array(hidden["corners_m"])
-        middle_m = 0.5 * (corners.min(axis=0) + corners.max(axis=0))
-        return {"centre_error_m": np.hypot(values["x_m"] - middle_m[0], values["y_m"] - middle_m[1])}
+        away_m = 0.5 * (corners.min(axis=0) + corners.max(axis=0)) - (values["x_m"], values["y_m"])
+        return {"centre_error_m": np.hypot(*away_m)}
     if name == "device_position_error" and values:
         found_m = here.get("x_m", np.nan), here.get("y_m", np.nan)
         return {"position_error_m": np.hypot(*np.subtract(found_m, hidden["true_m"][:2]))}
     if name == "antenna_pattern" and "receiver" in hidden and "tilt_deg" in here:
         return {"tilt_error_deg": here["tilt_deg"] - hidden["tilt_deg"]}
     if name == "antenna_pattern" and "device" in hidden and "azimuth_deg" in here:
-        return {"azimuth_error_deg": (here["azimuth_deg"] - hidden["azimuth_deg"] + 180) % 360 - 180}
+        off_deg = here["azimuth_deg"] - hidden["azimuth_deg"]
+        return {"azimuth_error_deg": (off_deg + 180) % 360 - 180}
     return {}
 
 
@@ -153,7 +155,7 @@ def hidden_table(rows: pd.DataFrame) -> str:
     by_family = [_family_line(name, cases[cases["name"] == name]) for name in families]
     parts = [f"**Hidden effects in traced cities** ({len(cases)} cases; RMSE of held-out links)\n\n"
              + markdown(heads, by_family)]
-    heads = ["hidden", "seed", "named first", "also named", "recovered", "before [dB]", "after", "oracle"]
+    heads = ["hidden", "seed", *heads[1:3], "recovered", *heads[4:7]]
     ordered = sorted(cases.itertuples(), key=lambda row: (row.seed, families.index(row.name)))
     parts.append("**Case by case**\n\n" + markdown(heads, [_case_line(row) for row in ordered]))
     heads = ["city", "held out by", "named", "before", "after", ""]
@@ -179,11 +181,14 @@ def _family_line(family: str, cases: pd.DataFrame) -> list[str]:
     errors: dict[str, list[str]] = {}
     for name, value in _errors(cases["recovered"]):
         errors.setdefault(name, []).append(f"{value:+.1f}")
-    columns = (cases["before"].str["rmse_db"], cases["after"].str["rmse_db"], cases["oracle_rmse_db"],
-               *(cases["baselines"].str[name] for name in ("log_distance", "regression_kriging")))
-    return [f"`{family}`", right, ", ".join(f"`{name}` {count}" for name, count in others.most_common()),
-            "; ".join(f"{name.rsplit('_error_', 1)[0]} {', '.join(values)} {UNITS[name.split('_')[-1]]}"
-                      for name, values in errors.items()), *(f"{each.mean():.2f}" for each in columns)]
+    rmse_db = (cases[when].str["rmse_db"] for when in ("before", "after"))
+    scores = [*rmse_db, cases["oracle_rmse_db"],
+              *(cases["baselines"].str[key] for key in ("log_distance", "regression_kriging"))]
+    texts = [f"{name.rsplit('_error_', 1)[0]} {', '.join(values)} {UNITS[name.split('_')[-1]]}"
+             for name, values in errors.items()]
+    also = ", ".join(f"`{name}` {count}" for name, count in others.most_common())
+    return [f"`{family}`", right, also, "; ".join(texts),
+            *(f"{each.mean():.2f}" for each in scores)]
 
 
 def _errors(recovered_lists: Iterable[list[dict]]) -> list[tuple[str, float]]:
@@ -196,8 +201,8 @@ def _case_line(row: tuple) -> list[str]:
     first = "–" if hidden else "no effect ✓"
     if row.named:
         first = f"`{row.named[0]}`" + (" ✓" if row.named[0] in hidden else "")
-    errors = ", ".join(f"{name.rsplit('_', 1)[0].replace('_error', '').replace('_', ' ')} {value:+.1f} "
-                       f"{UNITS[name.rsplit('_', 1)[1]]}" for name, value in _errors([row.recovered]))
+    errors = ", ".join(f"{name.split('_error_')[0]} {value:+.1f} {UNITS[name.split('_')[-1]]}"
+                       for name, value in _errors([row.recovered]))
     rmse_db = (row.before["rmse_db"], row.after["rmse_db"], row.oracle_rmse_db)
     return [f"`{row.name}`", str(row.seed), first, counted(row.named[1:]), errors,
             *(f"{value:.2f}" for value in rmse_db)]

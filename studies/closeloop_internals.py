@@ -32,8 +32,8 @@ def base_rmse_db(measurements: Measurements, scene: Scene, base: str, hold_out: 
 def draw_from_base(world: int, base: str, seed: int) -> Measurements:
     """Return the case `nothing`, `world`, with levels drawn from a base that was fitted to it.
 
-    Errors are Student's t with the fitted scale; levels are in the receivers' steps, and blank below
-    the limit.
+    Errors are Student's t with the fitted scale; levels are in the receivers' steps, and blank
+    below the limit.
     """
     measurements = case("nothing", world).measurements
     side, fit = _fitted(world, base)
@@ -61,7 +61,7 @@ def named_rmse_db(loop: Loop) -> float:
 
 
 def turned_rmse_db(loop: Loop) -> float:
-    """Return the same with every sector antenna turned by 180°, everything else fitted again [dB]."""
+    """Return the same with every sector antenna turned by 180° and all else fitted again [dB]."""
     model, sides, fits = loop.search.explained, [], []
     for side in model.sides:
         parts = []
@@ -78,7 +78,7 @@ def turned_rmse_db(loop: Loop) -> float:
 
 
 def locate_held_out(loop: Loop, after: bool) -> pd.DataFrame:
-    """Locate devices of each fold by what was learnt from the others, with radii calibrated on those.
+    """Locate devices of each fold by what was learnt from the others, with calibrated radii.
 
     Args:
         loop: with a flight a fold.
@@ -92,8 +92,8 @@ def locate_held_out(loop: Loop, after: bool) -> pd.DataFrame:
     folds = [records.select(model.index == index) for index in range(len(models))]
     area_m, rng, rows = whole_area(models[0], records), np.random.default_rng(0), []
     for index, (corrected, fold) in enumerate(zip(models, folds)):
-        power = calibrated_temper(models[:index] + models[index + 1:], folds[:index] + folds[index + 1:],
-                                  area_m, 0)
+        others, elsewhere = (each[:index] + each[index + 1:] for each in (models, folds))
+        power = calibrated_temper(others, elsewhere, area_m, 0)
         chosen = rng.permutation(np.unique(fold.device))[:DEVICES_A_FOLD]
         asked = fold.select(np.isin(fold.device, chosen))
         for found in locate(replace(corrected, temper=power), asked, area_m):

@@ -84,15 +84,16 @@ def _parameters(report: dict, effect: str, prefix: str) -> dict[str, float]:
 
 def azimuth_errors_deg(report: dict) -> dict[str, float]:
     """Return how far each sector with an antenna of its own looks from the published azimuth."""
+    found_deg = _parameters(report, "antenna_pattern", "azimuth_deg")
     return {name: (value - AZIMUTHS_DEG[name] + 180) % 360 - 180
-            for name, value in sorted(_parameters(report, "antenna_pattern", "azimuth_deg").items())}
+            for name, value in found_deg.items()}
 
 
 def floor_errors_db(report: dict, folder: Path) -> np.ndarray:
-    """Return floors minus readings without a transmitter, which no fit has read [dB]; NaN for none."""
+    """Return floors minus readings without a transmitter, which no fit has read [dB], or NaN."""
     noise_db = pd.read_csv(folder / "noise_only.csv").groupby("rx_id")["noise_db"].median()
     floors_db = _parameters(report, "noise_floor_censoring", "floor")
-    return np.array([value - noise_db.get(receiver, np.nan) for receiver, value in floors_db.items()])
+    return np.array([value - noise_db.get(name, np.nan) for name, value in floors_db.items()])
 
 
 def _located(found: pd.DataFrame) -> dict:
@@ -104,6 +105,10 @@ def _located(found: pd.DataFrame) -> dict:
             for day, rows in by_day.items()}
 
 
+def _text(found: dict) -> str:
+    return f"{found['median_m']}, {100 * found['within_radius']:.0f} %"
+
+
 def real_table(rows: pd.DataFrame) -> str:
     """Return errors, and days and how well transmitters are located of `powder_frs`."""
     by_name, lines = rows.set_index("name"), []
@@ -113,8 +118,8 @@ def real_table(rows: pd.DataFrame) -> str:
             row["before_db"], row["named_db"], row["after_db"],
             row["baselines_db"].get("regression_kriging"))), counted(row["named"])])
     parts = ["**Real measurements**\n\n" + markdown(
-        ["set", "held out by", "log-distance [dB]", "named effects", "with interpolation", "kriging",
-         "named"], lines)]
+        ["set", "held out by", "log-distance [dB]", "named effects", "with interpolation",
+         "kriging", "named"], lines)]
     if "powder_frs" in by_name.index:
         days, found = (by_name.loc["powder_frs", key] for key in ("by_day_db", "located"))
         parts.append("**`powder_frs`**: RMSE by day, before → after [dB]\n\n" + markdown(
@@ -122,11 +127,10 @@ def real_table(rows: pd.DataFrame) -> str:
                             for day in sorted(days)]]))
         parts.append("**`powder_frs`**: median distance [m], and share within the 90 % radius\n\n"
                      + markdown(["day", "log-distance law", "corrected"], [
-                         [day, *(f"{found[when][day]['median_m']}, "
-                                 f"{100 * found[when][day]['within_radius']:.0f} %" for when in WHEN)]
+                         [day, *(_text(found[when][day]) for when in WHEN)]
                          for day in found["before"]]))
     return "\n\n".join(parts)
 
 
-STUDIES = {"real": Study("What does close-loop find in real measurements?", find_in_real, real_cases,
-                         real_table, seeds=1)}
+STUDIES = {"real": Study("What does close-loop find in real measurements?", find_in_real,
+                         real_cases, real_table, seeds=1)}

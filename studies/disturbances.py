@@ -1,9 +1,9 @@
 """Policy, plan and re-planning in missions that are not what was thought: `pays`.
 
-In the statistical truth. `volumes`: each device's data evenly from 0 to twice what the mission says.
-`positions`: every device is 20 to 40 m from where the UAVs, and their map, have it. `loss`: one UAV
-is lost in the first half of the flight. `everything`: all three. A policy is trained in other draws
-of the same kind than those that it is judged in.
+In the statistical truth. `volumes`: each device's data evenly from 0 to twice what the mission
+says. `positions`: every device is 20 to 40 m from where the UAVs, and their map, have it. `loss`:
+one UAV is lost in the first half of the flight. `everything`: all three. A policy is trained in
+other draws of the same kind than those that it is judged in.
 """
 
 from dataclasses import dataclass, replace
@@ -35,7 +35,8 @@ DISTURBANCES = {"nominal": Disturbance(), "volumes": Disturbance(volume_spread=1
                 "positions": Disturbance(), "loss": Disturbance(loss=1.0),
                 "everything": Disturbance(1.0, 1.0)}
 SCENARIOS = {"nominal": "as thought", "volumes": "data 0–2 × nominal",
-             "positions": "devices 20–40 m off", "loss": "a UAV is lost", "everything": "all three"}
+             "positions": "devices 20–40 m off", "loss": "a UAV is lost",
+             "everything": "all three"}
 METHODS = {"plan": "open-loop plan", "replan": "re-planning, link",
            "replan-no-link": "re-planning, no link", "policy": "policy, link",
            "policy-no-link": "policy, no link", "taught": "policy taught by the plan, link",
@@ -70,7 +71,7 @@ class World:
     disturbance: Disturbance
 
     def fly(self, policy: Policy, flights: int, rng: np.random.Generator) -> np.ndarray:
-        """Return the share of the data, `(flights,)`, as many flights in each of the real missions."""
+        """Return the share of the data, `(flights,)`, as many flights in each real mission."""
         each = -(-flights // len(self.real))
         return np.concatenate([
             fly(DisturbedEnvironment(mission, each, rng, self.disturbance), policy).ratio(mission)
@@ -82,10 +83,8 @@ def fly_disturbed(seed: int, settings: dict) -> dict:
 
     Args:
         seed: of everything random.
-        settings: `scene`, `scenario`, `method`, `flights`, `truths` (draws of the devices' positions, where
-            these are not what is thought), and of a policy `episodes`, `learner` (fields of
-            `LearnerSettings`), of a plan and of a policy that one teaches `planner_iterations`, of
-            re-planning `replan_every`, `replan_iterations`.
+        settings: `scene`, `scenario`, `method`, `flights`, `truths` (draws of the devices'
+            positions), and what the method needs: see `pays_cases`.
 
     Returns:
         `curve`: of a policy, its checks during training; `ratios`: of every flight.
@@ -93,8 +92,9 @@ def fly_disturbed(seed: int, settings: dict) -> dict:
     method = settings["method"].removesuffix("-no-link")
     linked, flights = method == settings["method"], settings["flights"]
     scene = Scene.load(tables.scene_folder(settings["scene"]))
-    world, learned = (make_world(scene, settings["scenario"], linked, settings["truths"],
-                                 stream(seed, purpose, 1)) for purpose in ("truth evaluation", "learning"))
+    drawn = scene, settings["scenario"], linked, settings["truths"]
+    world, learned = (make_world(*drawn, stream(seed, purpose, 1))
+                      for purpose in ("truth evaluation", "learning"))
     curve: dict[str, list] = {}
     policy: Policy
     actions = None
@@ -116,7 +116,8 @@ def fly_disturbed(seed: int, settings: dict) -> dict:
             "ratios": ratios.tolist()}
 
 
-def make_world(scene: Scene, scenario: str, linked: bool, truths: int, rng: np.random.Generator) -> World:
+def make_world(scene: Scene, scenario: str, linked: bool, truths: int,
+               rng: np.random.Generator) -> World:
     """Return the missions of a scenario.
 
     Args:
@@ -187,7 +188,8 @@ def train(world: World, episodes: int, settings: LearnerSettings, flights: int, 
             trainer.enter(world.real[len(curve["ratio"]) % len(world.real)], teacher)
             block = min(BLOCK, episodes - trainer.episodes)
             record = trainer.train(block)
-            ratio = float(world.fly(AgentPolicy(trainer.learner.agent), flights, stream(seed, "choice")).mean())
+            policy = AgentPolicy(trainer.learner.agent)
+            ratio = float(world.fly(policy, flights, stream(seed, "choice")).mean())
             if ratio > highest:
                 highest = ratio
                 with torch.no_grad():
@@ -204,7 +206,8 @@ def _scenarios(runs: dict[str, pd.DataFrame]) -> dict[str, dict[str, np.ndarray]
     names = [name for name in METHODS if any(run.endswith(f"-{name}") for run in runs)]
     return {label: {METHODS[name]: np.concatenate([*runs[f"{scenario}-{name}"]["ratios"]])
                     if f"{scenario}-{name}" in runs else np.array([]) for name in names}
-            for scenario, label in SCENARIOS.items() if any(run.startswith(scenario) for run in runs)}
+            for scenario, label in SCENARIOS.items()
+            if any(run.startswith(scenario) for run in runs)}
 
 
 def pays_table(rows: pd.DataFrame) -> str:
@@ -224,7 +227,7 @@ def pays_table(rows: pd.DataFrame) -> str:
 
 
 def pays_figures(rows: pd.DataFrame) -> dict[str, Figure]:
-    """Draw scenarios, a bar for each method; lines are the standard error of the mean of the flights."""
+    """Draw scenarios, a bar for each method; lines are the standard error of the mean."""
     found = list(tables.worlds(rows))
     figure, panels = tables.make_panels(len(found), 1, 3.8)
     for axes, (_, scene, runs) in zip(panels, found):

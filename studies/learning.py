@@ -24,9 +24,10 @@ from studies.tables import RATIO, Curve, last, markdown, number, over_seeds, sho
 CITIES = ("rbm", "rdm")
 PAPER_MAPS = ("runs/paper_rbm", "runs/paper_rdm")  # made by studies.paper_maps
 LABELS = {"fedqmix-nn": "model-aided FedQMIX", "qmix-nn": "model-aided QMIX",
-          "qmix-log-distance": "model-aided QMIX, log-distance twin", "qmix-truth": "QMIX on real episodes",
-          "fedqmix-raytrace": "FedQMIX, ray-traced twin", "iql-truth": "IQL on real episodes",
-          "planner-nn": "planner in the NN twin", "planner-raytrace": "planner in the ray-traced twin",
+          "qmix-log-distance": "model-aided QMIX, log-distance twin",
+          "qmix-truth": "QMIX on real episodes", "fedqmix-raytrace": "FedQMIX, ray-traced twin",
+          "iql-truth": "IQL on real episodes", "planner-nn": "planner in the NN twin",
+          "planner-raytrace": "planner in the ray-traced twin",
           "greedy": "greedy, distinct targets, true positions", "random": "random"}
 LEVELS = ("greedy", "random")  # need no real episode
 ENOUGH = 0.95  # of what both learners reach at least
@@ -40,8 +41,8 @@ def learn(seed: int, settings: dict) -> dict:
         settings: fields of `RunSettings` and `LearnerSettings`.
 
     Returns:
-        `curve`: columns, a value for each round; for the picture of FedQMIX, seed 0, `known_m`: positions
-        that the UAVs know at the end, and `flight`: the median one of the last evaluation.
+        `curve`: columns, a value for each round; for the picture of FedQMIX, seed 0, `known_m`:
+        positions that the UAVs know at the end, and `flight`: the median one at the end.
     """
     own = {"scene": tables.scene_folder(settings["scene"]), "seed": seed}
     run, learner = (model.model_validate({name: value for name, value in (settings | own).items()
@@ -50,7 +51,8 @@ def learn(seed: int, settings: dict) -> dict:
     scene = Scene.load(run.scene)
     truth = read_truth(scene, run.truth)
     scene.check_map(truth)
-    with progress(f"{run.algorithm}, seed {seed}", total=run.real_episodes * run.episodes) as advance:
+    episodes = run.real_episodes * run.episodes
+    with progress(f"{run.algorithm}, seed {seed}", total=episodes) as advance:
         outcome = run_algorithm(run, learner, scene, truth, None, False, lambda rows, blocks: None,
                                 advance, torch_device(run.device))
     result: dict[str, Any] = {"curve": pd.DataFrame(outcome.rows).to_dict("list")}
@@ -65,7 +67,7 @@ def learn(seed: int, settings: dict) -> dict:
     return result
 
 
-def case(scene: str, truth: str, algorithm: str, twin: str = "nn", **changes: Any) -> dict[str, Any]:
+def case(scene: str, truth: str, algorithm: str, twin: str = "nn", **changes: Any) -> dict:
     """Return the settings of a row: those of a preset (`fast`), and what is changed in them."""
     preset = changes.get("preset", "fast")
     run, learner = ({name: value for name, value in changes.items() if name in model.model_fields}
@@ -88,7 +90,8 @@ def curve_cases(seed: int) -> dict[str, dict]:
     kinds: dict[str, dict[str, Any]] = {
         "fedqmix-nn": {"algorithm": "fedqmix"}, "qmix-nn": {"algorithm": "qmix"},
         "qmix-log-distance": {"algorithm": "qmix", "twin": "log-distance"},
-        "qmix-truth": {"algorithm": "qmix"} | in_truth, "iql-truth": {"algorithm": "iql"} | in_truth,
+        "qmix-truth": {"algorithm": "qmix"} | in_truth,
+        "iql-truth": {"algorithm": "iql"} | in_truth,
         "planner-nn": {"algorithm": "planner"},
         **{name: {"algorithm": name, "real_episodes": 1} | in_truth for name in LEVELS}}
     traced = kinds | {"planner-raytrace": {"algorithm": "planner"} | after_one,
@@ -99,14 +102,15 @@ def curve_cases(seed: int) -> dict[str, dict]:
 def federation_cases(seed: int) -> dict[str, dict]:
     """Return FedQMIX and QMIX at equal simulated episodes of a replica, in all, and in equal time.
 
-    Exploration fades over the same share of training in all. Equal time is that of one core (equal in
-    all), of three or more (equal of a replica), and of two, where three replicas take 1.6 times as long
-    as one (study `speed`: 3 / 1.87).
+    Exploration fades over the same share of training in all. Equal time is that of one core (equal
+    in all), of three or more (equal of a replica), and of two, where three replicas take 1.6 times
+    as long as one (study `speed`: 3 / 1.87).
     """
     episodes = {"fedqmix-3x800": 800, "qmix-800": 800, "fedqmix-3x267": 267, "qmix-1280": 1280,
                 "qmix-2400": 2400, "fedqmix-3x800-weights": 800}
     return named_cases(CITIES, "segmented", {name: {
-        "algorithm": name.split("-")[0], "episodes": count, "federate_all": not name.endswith("weights"),
+        "algorithm": name.split("-")[0], "episodes": count,
+        "federate_all": not name.endswith("weights"),
         "epsilon_slots": round(PRESETS["fast"].epsilon_slots * count / 800)}
         for name, count in episodes.items()})
 
@@ -119,13 +123,15 @@ def tuning_cases(seed: int) -> dict[str, dict]:
              "measure-policy-fly-again": policy | again, "shadowing-slot-fly-again": slot | again,
              "measure-policy-shadowing-slot-fly-again": policy | slot | again, "earlier": earlier,
              "earlier-excursions-1": earlier | {"excursion_slots": 1.0},
-             "earlier-fly-again": earlier | again, "earlier-restart-0.3": earlier | {"restart_epsilon": 0.3},
+             "earlier-fly-again": earlier | again,
+             "earlier-restart-0.3": earlier | {"restart_epsilon": 0.3},
              "earlier-measure-planner": earlier | {"measure": "planner"}}
     return named_cases(CITIES, "traced", {name: {"algorithm": "qmix"} | changes
                                           for name, changes in kinds.items()})
 
 
-BEFORE = {"first_flight": "random", "measure": "policy", "twin_shadowing": "slot", "excursion_slots": 1.0}
+BEFORE = {"first_flight": "random", "measure": "policy", "twin_shadowing": "slot",
+          "excursion_slots": 1.0}
 """The defaults when the study `options` was made."""
 
 
@@ -134,17 +140,19 @@ def options_cases(seed: int) -> dict[str, dict]:
     qmix, plan = {"algorithm": "qmix"}, {"algorithm": "planner"}
     fixed = {"twin": "truth", "real_episodes": 1}
     aloof, greedy = {"algorithm": "random"} | fixed, {"algorithm": "greedy"} | fixed
-    paper, few = {"twin": "truth", "preset": "paper", "real_episodes": 2}, {"planner_iterations": 20_000}
+    paper = {"twin": "truth", "preset": "paper", "real_episodes": 2}
+    few, many, in_truth = {"planner_iterations": 20_000}, {"flights": 200}, {"twin": "truth"}
     traced = {"random": aloof, "greedy": greedy, "planner_nn": plan,
-              "planner_log-distance": plan | {"twin": "log-distance"}, "qmix_truth": qmix | {"twin": "truth"},
-              "qmix_nn": qmix, "qmix_log-distance": qmix | {"twin": "log-distance"}}
-    many = {"flights": 200}
-    segmented = {"random": aloof | many, "random_maxrate": aloof | many | {"assignment": "max-rate"},
+              "planner_log-distance": plan | {"twin": "log-distance"}, "qmix_nn": qmix,
+              "qmix_truth": qmix | in_truth, "qmix_log-distance": qmix | {"twin": "log-distance"}}
+    segmented = {"random": aloof | many,
+                 "random_maxrate": aloof | many | {"assignment": "max-rate"},
                  "greedy": greedy | many, "planner": plan | fixed | many | few,
                  "paper_iql": {"algorithm": "iql"} | paper, "paper_qmix": qmix | paper,
-                 "qmix_truth": qmix | {"twin": "truth"},
-                 "qmix_2real": qmix | {"real_episodes": 2, "episodes": 4000}, "qmix": qmix,
-                 "fedqmix": {"algorithm": "fedqmix"}, "qmix_guided": qmix | {"guide": "planner"} | few}
+                 "qmix_truth": qmix | in_truth, "qmix": qmix,
+                 "fedqmix": {"algorithm": "fedqmix"},
+                 "qmix_2real": qmix | {"real_episodes": 2, "episodes": 4000},
+                 "qmix_guided": qmix | {"guide": "planner"} | few}
     return {name: settings for scenes, truth, kinds in ((PAPER_MAPS, "segmented", segmented),
                                                        (CITIES, "traced", traced))
             for name, settings in named_cases(scenes, truth, {
@@ -160,16 +168,17 @@ def curve_table(rows: pd.DataFrame) -> str:
         for name, curve in curves.items():
             seeds, level = runs[name], name in LEVELS
             lines.append([LABELS[name], "" if level else number(curve.x[-1], 0),
-                          with_sd(last(seeds["curve"])), "" if level else number(curve.needed(target), 0),
-                          str(len(seeds)), number(seeds["cpu_s"].mean(), 0)])
-        heads = ["", "real episodes", "collected at the end", f"real episodes to {target:.3f}", "seeds",
-                 "CPU s each"]
-        parts.append(f"**{shown(scene, truth)}**\n\n{markdown(heads, lines)}{factors(curves, target)}")
+                          with_sd(last(seeds["curve"])),
+                          "" if level else number(curve.needed(target), 0), str(len(seeds)),
+                          number(seeds["cpu_s"].mean(), 0)])
+        table = markdown(["", "real episodes", "collected at the end",
+                          f"real episodes to {target:.3f}", "seeds", "CPU s each"], lines)
+        parts.append(f"**{shown(scene, truth)}**\n\n{table}{factors(curves, target)}")
     return "\n\n".join(parts) + (
-        "\n\n±: standard deviation over seeds. \"Real episodes to\": the first round whose mean over seeds "
-        f"is as high; the ratio is {ENOUGH:.0%} of what both model-aided FedQMIX and QMIX on real episodes "
-        "reach at least. Rounds of training in the truth are 800 episodes and the flights that choose the "
-        "policy, so there that column is an upper bound.")
+        '\n\n±: standard deviation over seeds. "Real episodes to": the first round whose mean over '
+        f"seeds is as high; the ratio is {ENOUGH:.0%} of what both model-aided FedQMIX and QMIX on "
+        "real episodes reach at least. Rounds of training in the truth are 800 episodes and the "
+        "flights that choose the policy, so there that column is an upper bound.")
 
 
 def common_ratio(curves: dict[str, Curve]) -> float:
@@ -189,8 +198,8 @@ def factors(curves: dict[str, Curve], target: float) -> str:
             texts.append(f"{LABELS[name]} {needed:.0f} (a factor of {real / needed:,.0f})"
                          if needed == needed else
                          f"{LABELS[name]} does not reach it in {curves[name].x[-1]:.0f}")
-    return f"\n\nQMIX without a twin takes {real:,.0f} or fewer for {target:.3f}; {'; '.join(texts)}." \
-        if texts else ""
+    return (f"\n\nQMIX without a twin takes {real:,.0f} or fewer for {target:.3f}; "
+            f"{'; '.join(texts)}.") if texts else ""
 
 
 def federation_table(rows: pd.DataFrame) -> str:
@@ -209,14 +218,14 @@ def federation_table(rows: pd.DataFrame) -> str:
         parts.append(f"**{scene}, statistical truth, 10 real episodes**\n\n{table}")
     return "\n\n".join(parts) + (
         "\n\nEqual for a replica: `fedqmix-3x800` and `qmix-800` (equal time where there are three "
-        "cores). Equal in all: `fedqmix-3x267` and `qmix-800`, `fedqmix-3x800` and `qmix-2400` (equal time "
-        "on one core). Equal time on two cores: `fedqmix-3x800` and `qmix-1280`. `weights`: moments and "
-        "target networks are not averaged.")
+        "cores). Equal in all: `fedqmix-3x267` and `qmix-800`, `fedqmix-3x800` and `qmix-2400` "
+        "(equal time on one core). Equal time on two cores: `fedqmix-3x800` and `qmix-1280`. "
+        "`weights`: moments and target networks are not averaged.")
 
 
 def options(settings: dict, without: tuple[str, ...] = ("scene", "truth", "algorithm"),
             changed: dict[str, Any] = {}) -> str:  # noqa: B006 - not written to
-    """Return what differs from today's defaults, with some changed, as options of `marl.fedqmix`."""
+    """Return what differs from the defaults (some `changed`), as options of `marl.fedqmix`."""
     defaults = RunSettings().model_dump(mode="json") | LearnerSettings().model_dump() | changed
     given = [f"--{name.replace('_', '-')} {str(value).lower()}" for name, value in settings.items()
              if name not in without and value != defaults[name]]
@@ -234,22 +243,23 @@ def tuning_table(rows: pd.DataFrame) -> str:
 
 
 def options_table(rows: pd.DataFrame) -> str:
-    """Return what each option collects in both cities; the learner's own settings are those of its preset."""
+    """Return what each option collects in both cities, options as `marl.fedqmix` has them."""
     cells: dict[str, dict[str, dict[str, str]]] = {"segmented": {}, "traced": {}}
     for truth, scene, runs in worlds(rows):
-        for name, seeds in runs.items():
+        for seeds in runs.values():
             settings = seeds["settings"].iloc[0]
-            own = tuple(LearnerSettings.model_fields) if settings["preset"] == "paper" else ("flights",)
-            text = options(settings, ("scene", "truth", "flights", *own), BEFORE | {"algorithm": ""})
+            own = LearnerSettings.model_fields if settings["preset"] == "paper" else ()
+            hide = ("scene", "truth", "flights", *own)  # the preset says what the learner's are
+            text = options(settings, hide, BEFORE | {"algorithm": ""})
             cells[truth].setdefault(text, {})[scene[-3:]] = f"{np.mean(last(seeds['curve'])):.3f}"
+    titles = {"segmented": "The paper's maps, statistical truth", "traced": "Ray-traced truth"}
     return "\n\n".join(f"**{title}**\n\n" + markdown(["options", "RBM", "RDM"], [
-        [text, *(ratio.get(scene, "") for scene in CITIES)] for text, ratio in cells[truth].items()])
-        for truth, title in (("segmented", "The paper's maps, statistical truth"),
-                             ("traced", "Ray-traced truth")))
+        [text, *(ratio.get(scene, "") for scene in CITIES)]
+        for text, ratio in cells[truth].items()]) for truth, title in titles.items())
 
 
 def curve_figures(rows: pd.DataFrame) -> dict[str, Figure]:
-    """Draw collected data against real episodes, a panel for each world; and the flights of FedQMIX."""
+    """Draw collected data against real episodes, a panel a world; and the flights of FedQMIX."""
     found = list(worlds(rows))
     figure, panels = tables.make_panels(len(found), 2, 4.1)
     for axes, (truth, scene, runs) in zip(panels, found):
@@ -300,9 +310,10 @@ def federation_figures(rows: pd.DataFrame) -> dict[str, Figure]:
 
 
 STUDIES = {
-    "curve": Study("How much is collected after how many real episodes?", learn, curve_cases, curve_table,
-                   curve_figures),
+    "curve": Study("How much is collected after how many real episodes?", learn, curve_cases,
+                   curve_table, curve_figures),
     "federation": Study("Does averaging replicas pay?", learn, federation_cases, federation_table,
                         federation_figures),
-    "tuning": Study("What brings the learner nearer to the planner?", learn, tuning_cases, tuning_table),
+    "tuning": Study("What brings the learner nearer to the planner?", learn, tuning_cases,
+                    tuning_table),
     "options": Study("What do the learner's options bring?", learn, options_cases, options_table)}

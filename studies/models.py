@@ -39,34 +39,38 @@ def score_models(seed: int, settings: dict) -> dict:
 
 
 def models_table(rows: pd.DataFrame) -> str:
-    """Return mean errors over the seeds, and how far the network is below the log-distance model."""
+    """Return mean errors over the seeds, and by how much the network's are lower."""
     parts, below = [], []
     for name, seeds in rows.groupby("name"):
-        scores, locations = (pd.concat(map(pd.DataFrame, seeds[key])) for key in ("scores", "locations"))
-        mean = scores.groupby(["against", "positions", "links", "model"], sort=False)["rmse_db"].mean()
+        scores, locations = (pd.concat(map(pd.DataFrame, seeds[key]))
+                             for key in ("scores", "locations"))
+        mean = scores.groupby(["against", "positions", "links", "model"])["rmse_db"].mean()
         # In the statistical truth every map is the law itself, so that the channel alone is judged.
-        where, digits = {"RMSE of the channel on held-out flights, at true positions, all / LoS / NLoS "
-                         "[dB]": (HELD_OUT, "true")}, (2, 2, 1)
+        where, digits = {"RMSE of the channel on held-out flights, at true positions, all / LoS / "
+                         "NLoS [dB]": (HELD_OUT, "true")}, (2, 2, 1)
         if name.endswith("traced"):
-            where, digits = {"RMSE on held-out flights, all / LoS / NLoS [dB]": (HELD_OUT, "estimated"),
-                             "on the whole map [dB]": ("whole map", "estimated")}, (1, 1, 0)
+            where = {"RMSE on held-out flights, all / LoS / NLoS [dB]": (HELD_OUT, "estimated"),
+                     "on the whole map [dB]": ("whole map", "estimated")}
+            digits = (1, 1, 0)
         lines = []
         for model, found in locations.groupby("model", sort=False):
             error_m = found["error_m"]
             errors_m = (error_m.median(), error_m.quantile(0.9), error_m.max())
-            lines.append([f"`{model}`", *(" / ".join(f"{mean[*each, links, model]:.2f}"
-                                                     for links in CLASSES) for each in where.values()),
-                          *(f"{value:.{digit}f}" for value, digit in zip(errors_m, digits)),
+            rmse_db = [" / ".join(f"{mean[*each, links, model]:.2f}" for links in CLASSES)
+                       for each in where.values()]
+            lines.append([f"`{model}`", *rmse_db, *map("{:.{}f}".format, errors_m, digits),
                           f"{(error_m <= found['credible_radius_m']).mean():.0%}"])
-        heads = ["model", *where, "position error, median [m]", "90 %", "worst", "within 90 % radius"]
+        heads = ["model", *where, "position error, median [m]", "90 %", "worst",
+                 "within 90 % radius"]
         city, kind = name.split("-")[0].upper(), "Ray-traced" if len(where) > 1 else "Statistical"
         parts.append(f"**{kind} truth, {city}** ({len(seeds)} seeds)\n\n{markdown(heads, lines)}")
         if len(where) > 1:
-            rmse_db = mean.unstack()
-            share = 1 - rmse_db["segmented_nn"] / rmse_db["log_distance"]
+            wide = mean.unstack()
+            share = 1 - wide["segmented_nn"] / wide["log_distance"]
             below.append([city, *(f"{100 * share[against, 'estimated', links]:.0f} %"
                                   for against in (HELD_OUT, "whole map") for links in CLASSES[:2])])
-    heads = ["city", "held-out flights, all links", "LoS links", "whole map, all links", "LoS links"]
+    heads = ["city", "held-out flights, all links", "LoS links", "whole map, all links",
+             "LoS links"]
     return "\n\n".join([*parts, "**RMSE of `segmented_nn` below that of `log_distance`**\n\n"
                         + markdown(heads, below)])
 

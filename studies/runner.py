@@ -1,4 +1,4 @@
-"""Run studies and keep their rows: one JSON file a study, of which its table and figures are made."""
+"""Run studies and keep their rows: one JSON file a study, the source of its table and figures."""
 
 import json
 import multiprocessing
@@ -78,8 +78,8 @@ def write_rows(name: str, rows: list[dict], out: Path) -> None:
     rows.sort(key=lambda row: (row["name"], row["seed"]))
     lines = ",\n".join(json.dumps(row, allow_nan=False) for row in rows)
     with atomic_path(out / f"{name}.json") as temporary:
-        temporary.write_text(f'{{"schema": "{SCHEMA}", "study": "{name}", "rows": [\n{lines}\n]}}\n',
-                             encoding="utf-8")
+        head = f'"schema": "{SCHEMA}", "study": "{name}"'
+        temporary.write_text(f'{{{head}, "rows": [\n{lines}\n]}}\n', encoding="utf-8")
 
 
 def missing_rows(name: str, seeds: int, only: str | None, out: Path) -> Todo:
@@ -106,8 +106,9 @@ def missing_rows(name: str, seeds: int, only: str | None, out: Path) -> Todo:
         before = done.get((case, seed), settings)
         for key in {**before, **settings}:
             if before.get(key) != settings.get(key):
-                raise BadInput(f"{out / name}.json holds {case}:{seed} with other settings ({key} = "
-                               f"{before.get(key)}, not {settings.get(key)}); choose another --out")
+                raise BadInput(
+                    f"{out / name}.json holds {case}:{seed} with other settings ({key} = "
+                    f"{before.get(key)}, not {settings.get(key)}); choose another --out")
     return [each for each in wanted if each[:2] not in done]
 
 

@@ -32,10 +32,11 @@ def provenance(rows: list[dict]) -> str:
     own = [row for row in rows if "copied_from" not in row]
     copied = sorted({f"`{row['copied_from']}`" for row in rows if "copied_from" in row})
     versions, machines = ({row[key] for row in rows if row[key]} for key in ("version", "machine"))
+    hours = sum(row["cpu_s"] or 0 for row in own) / 3600
     text = (f"{len(rows)} rows of {len({row['name'] for row in rows})} kinds"
-            f", {sum(row['cpu_s'] or 0 for row in own) / 3600:.1f} CPU hours; version (commit, or hash "
-            f"of the sources): {'; '.join([', '.join(sorted(versions)), *sorted(machines)])}.")
-    return text + (f" Rows with the same settings are copied from {', '.join(copied)}." if copied else "")
+            + (f", {hours:.1f} CPU hours" if hours else "") + "; version (commit, or hash of the "
+            f"sources): {'; '.join([', '.join(sorted(versions)), *sorted(machines)])}.")
+    return text + (f" Equal rows are copied from {', '.join(copied)}." if copied else "")
 
 
 def markdown(heads: list[str], rows: list[list[str]]) -> str:
@@ -58,7 +59,8 @@ def with_sd(values: list[float], digits: int = 3) -> str:
     """Return mean ± standard deviation; of one value the value."""
     if not len(values):
         return "–"
-    return f"{np.mean(values):.{digits}f}" + (f" ± {sd(values):.{digits}f}" if len(values) > 1 else "")
+    mean = f"{np.mean(values):.{digits}f}"
+    return f"{mean} ± {sd(values):.{digits}f}" if len(values) > 1 else mean
 
 
 def quantiles(errors_m: list[float | None]) -> tuple[float, float, float, float]:
@@ -97,7 +99,8 @@ def last(curves: pd.Series, column: str = "truth_ratio") -> list[float]:
 
 def worlds(rows: pd.DataFrame) -> Iterator[tuple[str, str, dict[str, pd.DataFrame]]]:
     """Yield truth, scene, and its rows by name without these two; the ray-traced truth first."""
-    truth, scene = rows["settings"].str["truth"], rows["settings"].str["scene"].str.split("/").str[-1]
+    truth = rows["settings"].str["truth"]
+    scene = rows["settings"].str["scene"].str.split("/").str[-1]
     for (_, of, where), group in rows.groupby([truth != "traced", truth, scene]):
         yield of, where, {name.removeprefix(f"{where}-").removeprefix(f"{of}-"): seeds
                           for name, seeds in group.groupby("name")}
@@ -124,10 +127,12 @@ def make_panels(count: int, columns: int, height_in: float) -> tuple[Figure, lis
 def draw_line(axes: Axes, curve: Curve, label: str, index: int) -> None:
     """Draw a mean with a band of its standard deviation; a single point gets a large marker."""
     colour, marker = COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)]
-    alone = {"markersize": 9, "markeredgecolor": "black"} if len(curve.x) == 1 else {"markersize": 4}
+    alone = {"markersize": 4}
+    if len(curve.x) == 1:
+        alone = {"markersize": 9, "markeredgecolor": "black"}
     axes.plot(curve.x, curve.mean, marker=marker, color=colour, label=label, **alone)
-    axes.fill_between(curve.x, curve.mean - curve.sd, curve.mean + curve.sd, color=colour, alpha=0.18,
-                      linewidth=0)
+    axes.fill_between(curve.x, curve.mean - curve.sd, curve.mean + curve.sd, color=colour,
+                      alpha=0.18, linewidth=0)
 
 
 def draw_bars(axes: Axes, groups: dict[str, list[list[float]]], errors: dict[str, list],

@@ -1,7 +1,7 @@
 """Speed, memory and numerical error of tracing: `tracer`.
 
-A random sample of a scene's lattice is solved for all devices, in a process of its own, and compared
-with a reference with ten times the default's rays.
+A random sample of a scene's lattice is solved for all devices, in a process of its own, and
+compared with a reference with ten times the default's rays.
 """
 
 import multiprocessing
@@ -39,8 +39,8 @@ def time_tracer(seed: int, settings: dict) -> dict:
         settings: `scene`, `receivers`, `quality` and fields of `SolverSettings`.
 
     Returns:
-        Links per second of two cores' processor time, peak memory, absolute differences [dB], and the
-        share of the links that is missed.
+        Links per second of two cores' processor time, peak memory, absolute differences [dB], and
+        the share of the links that is missed.
     """
     sample = settings["scene"], settings["receivers"], seed
     others = {name: value for name, value in settings.items()
@@ -52,8 +52,9 @@ def time_tracer(seed: int, settings: dict) -> dict:
     both = detected & np.isfinite(gain_db)
     error_db = np.abs(gain_db - reference_db)[both]
     return {"links": reference_db.size, "detected": int(detected.sum()), "links_per_s": per_s,
-            "peak_gib": peak_gib, "median_db": np.median(error_db), "p90_db": np.quantile(error_db, 0.9),
-            "rms_db": np.sqrt(np.mean(error_db**2)), "missed": 1 - both.sum() / detected.sum()}
+            "peak_gib": peak_gib, "median_db": np.median(error_db),
+            "p90_db": np.quantile(error_db, 0.9), "rms_db": np.sqrt(np.mean(error_db**2)),
+            "missed": 1 - both.sum() / detected.sum()}
 
 
 @lru_cache
@@ -69,12 +70,12 @@ def _in_a_process(settings: SolverSettings, scene: str, receivers: int, seed: in
 def _measure(settings: SolverSettings, name: str, receivers: int, seed: int) -> tuple:
     """Return gains [dB], links per second of two cores, and peak memory [GiB]."""
     scene = Scene.load(scene_folder(name))
-    positions_m = scene.lattice.positions_m
-    rows = np.random.default_rng(seed).choice(len(positions_m), receivers, replace=False)
+    rng, lattice_m = np.random.default_rng(seed), scene.lattice.positions_m
+    points_m = lattice_m[rng.choice(len(lattice_m), receivers, replace=False)]
     solver = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings)
-    solver.solve(scene.device_m[0], positions_m[rows][:settings.batch_receivers])  # compiles kernels
+    solver.solve(scene.device_m[0], points_m[:settings.batch_receivers])  # compiles the kernels
     started = sum(os.times()[:2])
-    gain_db = np.stack([np.concatenate(list(solver.gains(device_m, positions_m[rows])))
+    gain_db = np.stack([np.concatenate(list(solver.gains(device_m, points_m)))
                         for device_m in scene.device_m])
     cpu_s = sum(os.times()[:2]) - started
     # A batch that is not full costs what a full one does; speeds are of full ones.

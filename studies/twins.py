@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from marl.environment import Environment, Frame
 from marl.figures import COLOURS, MARKERS
-from marl.flights import HeuristicPolicy, Replayed, fly
+from marl.flights import Flights, HeuristicPolicy, Replayed, fly
 from marl.mission import Known, Mission
 from marl.planner import PlanPolicy, plan
 from marl.randomness import stream
@@ -16,17 +16,25 @@ from marl.reality import Reality, known_by, location_errors_m
 from marl.settings import PRESETS, LearnerSettings, RunSettings
 from marl.strategies import evaluate, make_strategy
 from marl.waypoints import PATTERN
-from radiotwin import Measurements, RadioMap, Scene, Twin, close_loop, corrected_twin, fit_twin
-from radiotwin import fly_survey as fly_measuring
+from radiotwin import (
+    Measurements,
+    RadioMap,
+    Scene,
+    Twin,
+    close_loop,
+    corrected_twin,
+    fit_twin,
+    fly_survey,
+    score_map,
+)
 from radiotwin.cli.world import read_truth
-from radiotwin.compare import score_map
 from radiotwin.progress import progress
 from studies import tables
 from studies.runner import Study
 from studies.tables import markdown, number, over_seeds, quantiles, with_sd, worlds
 
-MODELS = {"nn": "segmented_nn", "segmented": "segmented_log_distance", "log-distance": "log_distance",
-          "raytrace": "raytrace"}
+MODELS = {"nn": "segmented_nn", "segmented": "segmented_log_distance",
+          "log-distance": "log_distance", "raytrace": "raytrace"}
 """Name of a twin -> model of `fit_twin`; `corrected` and `truth` besides."""
 TWINS = {"nn": "segmented network (NN)", "segmented": "segmented log-distance",
          "log-distance": "log-distance", "raytrace": "ray-traced (paths over the map)",
@@ -39,7 +47,7 @@ REPLAYS = 10  # of a sequence of actions in a twin, whose shadowing differs from
 
 
 def quality_cases(seed: int) -> dict[str, dict]:
-    """Return each model after 1 to 10 real episodes; paths, whose fit takes minutes, after 1 and 5."""
+    """Return each model after 1 to 10 real episodes; paths, which take minutes, after 1 and 5."""
     return {f"{scene}-{model}": {
         "scene": scene, "truth": "traced", "model": model, "noise_db": 1.0,
         "survey_flights": [1, 5] if model == "raytrace" else [1, 2, 3, 5, 10]}
@@ -83,38 +91,22 @@ def train_in(seed: int, settings: dict) -> dict:
     Args:
         seed: of everything random.
         settings: `scene`, `truth`, `twin` (a key of `TWINS`), `survey_flights`, `noise_db`,
-            `episodes`, `learner` (fields of `LearnerSettings`), `planner_iterations`, `flights` of an
-            evaluation, `replayed_flights`.
+            `episodes`, `learner` (fields of `LearnerSettings`), `planner_iterations`, `flights` of
+            an evaluation, `replayed_flights`.
 
     Returns:
         Shares that policy and plan collect in the map that they were made in and in the truth;
         `curve`: checks of the policy during training; `fidelity` (see there); errors of the twin.
     """
     scene, truth = _world(settings)
-    name, flights = settings["twin"], settings["flights"]
+    name = settings["twin"]
     measured = _survey(scene, truth, settings["survey_flights"], settings["noise_db"], seed)
     twin = None if name == "truth" else _learnt(name, seed, scene, measured)
     reality = Reality(scene, truth, "matching", settings["noise_db"], seed)
-    known = Known.truth(scene) if twin is None else known_by(twin)
-    real = reality.mission(known)
-    inside = real if twin is None else reality.twin_mission(twin, known, measured)
-    run = RunSettings(algorithm="qmix", episodes=settings["episodes"], real_episodes=1, seed=seed)
+    chosen = {key: settings[key] for key in ("episodes", "flights", "planner_iterations")}
+    run = RunSettings(algorithm="qmix", real_episodes=1, seed=seed, **chosen)
     learner = LearnerSettings.model_validate(settings["learner"])
-    strategy = make_strategy(run, learner, inside, 1, "cpu")
-    result: dict[str, Any] = {}
-    try:
-        with progress(f"training, {name}", total=run.episodes) as advance:
-            checks = strategy.prepare(inside, advance)
-        planned = plan(inside, settings["planner_iterations"], seed).actions
-        for who, policy in (("trained", strategy.policy(stream(seed, "decisions", 0))),
-                            ("plan", PlanPolicy(planned))):
-            for where, mission in (("twin", inside), ("truth", real)):
-                flown = evaluate(mission, policy, flights, stream(seed, f"{where} evaluation"))
-                result[f"{who}_{where}_ratio"] = flown.ratio(mission).mean()
-    finally:
-        strategy.close()
-    result["curve"] = {"episodes": [check["episodes"] for check in checks],
-                       "ratio": [check["twin_ratio"] for check in checks]}
+    result, inside = train_and_fly(reality, twin, run, learner, measured)
     if twin is not None:
         true = reality.mission(Known.truth(scene))
         result["fidelity"] = fidelity(true, inside, settings["replayed_flights"], seed)
@@ -122,11 +114,40 @@ def train_in(seed: int, settings: dict) -> dict:
     return result
 
 
+def train_and_fly(reality: Reality, twin: Twin | None, run: RunSettings, learner: LearnerSettings,
+                  measured: Measurements | None = None) -> tuple[dict[str, Any], Mission]:
+    """Train and plan in a twin, or in the truth (None), and fly in the truth.
+
+    Returns:
+        `WHO_WHERE_ratio` for `trained`, `plan` and `twin`, `truth`; `curve`: checks during
+        training; and the mission that was trained in.
+    """
+    known = Known.truth(reality.scene) if twin is None else known_by(twin)
+    real = reality.mission(known)
+    inside = real if twin is None else reality.twin_mission(twin, known, measured)
+    strategy, result = make_strategy(run, learner, inside, 1, "cpu"), {}
+    try:
+        with progress(f"training, seed {run.seed}", total=run.episodes) as advance:
+            checks = strategy.prepare(inside, advance)
+        planned = plan(inside, run.planner_iterations, run.seed).actions
+        for who, policy in (("trained", strategy.policy(stream(run.seed, "decisions", 0))),
+                            ("plan", PlanPolicy(planned))):
+            for where, mission in (("twin", inside), ("truth", real)):
+                rng = stream(run.seed, f"{where} evaluation")
+                flown = evaluate(mission, policy, run.flights, rng)
+                result[f"{who}_{where}_ratio"] = flown.ratio(mission).mean()
+    finally:
+        strategy.close()
+    return result | {"curve": {"episodes": [check["episodes"] for check in checks],
+                               "ratio": [check["twin_ratio"] for check in checks]}}, inside
+
+
 class Mixed:
     """Greedy flights with true positions, the first without random actions, the last all random."""
 
-    def __init__(self, rng: np.random.Generator):
-        self._policies, self._rng = [HeuristicPolicy(name, rng) for name in ("greedy", "random")], rng
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._policies = [HeuristicPolicy(name, rng) for name in ("greedy", "random")]
+        self._rng = rng
 
     def start(self, mission: Mission, flights: int) -> None:
         """Begin flights."""
@@ -151,10 +172,10 @@ def fidelity(real: Mission, twin: Mission, flights: int, seed: int) -> dict[str,
         seed: of these.
 
     Returns:
-        Over the sequences: `correlation` of the collected shares, `bias` (twin - truth), `rmse`; the
-        same for the share collected from each device, with the prefix `device_`.
+        Over the sequences: `correlation` of the collected shares, `bias` (twin - truth), `rmse`;
+        the same for the share collected from each device, with the prefix `device_`.
     """
-    def by_device(flown) -> np.ndarray:
+    def by_device(flown: Flights) -> np.ndarray:
         taken, served = np.zeros(flown.frames.data_units.shape[::2]), flown.frames.assigned
         flight, slot, uav = np.nonzero(served >= 0)
         np.add.at(taken, (flight, served[flight, slot, uav]), flown.collected[flight, slot, uav])
@@ -179,9 +200,10 @@ def _world(settings: dict) -> tuple[Scene, RadioMap]:
     return scene, read_truth(scene, settings["truth"])
 
 
-def _survey(scene: Scene, truth: RadioMap, flights: int, noise_db: float, seed: int) -> Measurements:
-    return fly_measuring(scene, truth, flights=flights, pattern=PATTERN, seed=seed,
-                         noise_db=0.0 if "sigma_db" in truth.dataset else noise_db)
+def _survey(scene: Scene, truth: RadioMap, flights: int, noise_db: float,
+            seed: int) -> Measurements:
+    return fly_survey(scene, truth, flights=flights, pattern=PATTERN, seed=seed,
+                      noise_db=0.0 if "sigma_db" in truth.dataset else noise_db)
 
 
 def _learnt(name: str, seed: int, scene: Scene, measured: Measurements) -> Twin:
@@ -193,7 +215,8 @@ def _learnt(name: str, seed: int, scene: Scene, measured: Measurements) -> Twin:
 
 
 def _errors(twin: Twin, scene: Scene, truth: RadioMap) -> dict:
-    rmse_db = {row["links"]: row["rmse_db"] for row in score_map("twin", twin.radio_map(scene), truth)}
+    scores = score_map("twin", twin.radio_map(scene), truth)
+    rmse_db = {row["links"]: row["rmse_db"] for row in scores}
     return {"map_rmse_db": rmse_db["all"], "map_rmse_los_db": rmse_db["LoS"],
             "map_rmse_nlos_db": rmse_db["NLoS"],
             "location_errors_m": location_errors_m(scene, known_by(twin)).tolist()}
@@ -212,8 +235,9 @@ def quality_table(rows: pd.DataFrame) -> str:
                 rmse_db = [np.mean([curve[f"map_rmse_{links}db"][at] for curve in curves])
                            for links in ("", "los_", "nlos_")]
                 published = PUBLISHED.get((scene, flights), "") if name == "segmented_nn" else ""
-                lines.append([QUALITY[name], str(flights), " / ".join(f"{each:.1f}" for each in rmse_db),
-                              f"{median:.1f}", f"{most:.0f}", f"{worst:.0f}", f"{far:.0%}", published,
+                lines.append([QUALITY[name], str(flights),
+                              " / ".join(f"{each:.1f}" for each in rmse_db), f"{median:.1f}",
+                              f"{most:.0f}", f"{worst:.0f}", f"{far:.0%}", published,
                               str(len(curves))])
         heads = ["model", "real episodes", "map RMSE, all / LoS / NLoS [dB]",
                  "position error, median [m]", "90 %", "worst", "above 100 m",
@@ -238,13 +262,14 @@ def twin_table(rows: pd.DataFrame) -> str:
                   for key in ("correlation", "bias", "device_correlation")),
                 *(with_sd(seeds[f"{who}_{where}_ratio"])
                   for who in ("trained", "plan") for where in ("twin", "truth")), str(len(seeds))])
-        heads = ["twin", "map RMSE [dB]", "position error, median / worst [m]", "correlation", "bias",
-                 "correlation by device", "policy in the twin", "**policy in the truth**",
-                 "plan in the twin", "**plan in the truth**", "seeds"]
-        parts.append(f"**{scene}, ray-traced truth, five real flights**\n\n{markdown(heads, lines)}")
+        heads = ["twin", "map RMSE [dB]", "position error, median / worst [m]", "correlation",
+                 "bias", "correlation by device", "policy in the twin",
+                 "**policy in the truth**", "plan in the twin", "**plan in the truth**", "seeds"]
+        table = markdown(heads, lines)
+        parts.append(f"**{scene}, ray-traced truth, five real flights**\n\n{table}")
     return "\n\n".join(parts) + (
-        "\n\nCorrelation and bias (twin less truth) of the share that 20 sequences of actions, from "
-        "greedy to random, collect in both.")
+        "\n\nCorrelation and bias (twin less truth) of the share that 20 sequences of actions, "
+        "from greedy to random, collect in both.")
 
 
 def quality_figures(rows: pd.DataFrame) -> dict[str, Figure]:
@@ -258,8 +283,9 @@ def quality_figures(rows: pd.DataFrame) -> dict[str, Figure]:
             curve = over_seeds(curves, y="map_rmse_db")
             tables.draw_line(left, curve, QUALITY[name], index)
             episodes |= set(curve.x)
-            errors_m = [quantiles([error for each in curves for error in each["location_errors_m"][at]])
-                        for at in range(len(curve.x))]
+            located = [[error for each in curves for error in each["location_errors_m"][at]]
+                       for at in range(len(curve.x))]
+            errors_m = [quantiles(each) for each in located]
             right.plot(curve.x, [each[0] for each in errors_m], marker=MARKERS[index], markersize=4,
                        **style)
             right.plot(curve.x, [each[1] for each in errors_m], ":", **style)
@@ -281,7 +307,8 @@ def twin_figures(rows: pd.DataFrame) -> dict[str, Figure]:
         names = [name for name in TWINS if name in runs]
         cells = {label: [list(runs[name][f"{key}_truth_ratio"]) for name in names]
                  for key, label in (("trained", "policy (QMIX)"), ("plan", "planner"))}
-        errors = {label: [float(tables.sd(each)) for each in values] for label, values in cells.items()}
+        errors = {label: [float(tables.sd(each)) for each in values]
+                  for label, values in cells.items()}
         tables.draw_bars(axes, cells, errors, [name.replace("-", "-\n") for name in names],
                          title=f"{scene}, ray-traced truth",
                          xlabel="twin that it was trained or planned in")
@@ -289,6 +316,7 @@ def twin_figures(rows: pd.DataFrame) -> dict[str, Figure]:
 
 
 STUDIES = {
-    "quality": Study("How good is the twin after how many real episodes?", judge_twin, quality_cases,
-                     quality_table, quality_figures),
-    "twin": Study("Which twin is worth training in?", train_in, twin_cases, twin_table, twin_figures)}
+    "quality": Study("How good is the twin after how many real episodes?", judge_twin,
+                     quality_cases, quality_table, quality_figures),
+    "twin": Study("Which twin is worth training in?", train_in, twin_cases, twin_table,
+                  twin_figures)}
