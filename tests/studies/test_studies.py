@@ -8,7 +8,16 @@ import pytest
 
 from marl.mission import Known, make_mission
 from radiotwin.survey import segmented_truth
-from studies import closeloop, closeloop_internals, closeloop_real, disturbances, learning, models, speed, twins
+from studies import (
+    closeloop,
+    closeloop_internals,
+    closeloop_real,
+    disturbances,
+    learning,
+    models,
+    speed,
+    twins,
+)
 from studies.runner import make_row, read_rows
 from studies.tables import Curve, over_seeds, quantiles, read_frame, with_sd
 from tests.undeclared.cases import case
