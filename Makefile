@@ -49,7 +49,8 @@ docs: $(INSTALLED)
 	cd build/docs && OMP_NUM_THREADS=1 $(abspath $(BIN))/mkdocs build --strict -f $(CURDIR)/mkdocs.yml -d $(CURDIR)/site
 
 bench: llvm
-	$(BIN)/python -m studies speed --out build/speed --resume
+	rm -rf build/speed
+	$(BIN)/python -m studies speed --out build/speed
 
 # The second run does nothing, until what is to be installed has changed.
 $(INSTALLED): pyproject.toml constraints.txt

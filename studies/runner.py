@@ -3,6 +3,7 @@
 import json
 import multiprocessing
 import platform
+import re
 import resource
 import subprocess
 import time
@@ -143,10 +144,16 @@ def make_row(study: str, run: Callable[[int, dict], dict], name: str, seed: int,
     started, cpu_s = time.perf_counter(), _cpu_s()
     results = json.loads(pd.Series(run(seed, settings), dtype=object).to_json(double_precision=4))
     return {"study": study, "name": name, "seed": seed, "version": code_version(),
-            "machine": platform.processor() or platform.machine(),
-            "date": time.strftime("%Y-%m-%d", time.gmtime()), "cpu_s": round(_cpu_s() - cpu_s, 1),
-            "wall_s": round(time.perf_counter() - started, 1), "settings": settings,
-            "results": results}
+            "machine": machine(), "date": time.strftime("%Y-%m-%d", time.gmtime()),
+            "cpu_s": round(_cpu_s() - cpu_s, 1), "wall_s": round(time.perf_counter() - started, 1),
+            "settings": settings, "results": results}
+
+
+def machine() -> str:
+    """Return the processor's name."""
+    info = Path("/proc/cpuinfo")
+    names = re.findall(r"model name\s*: (.+)", info.read_text()) if info.is_file() else []
+    return names[0] if names else platform.processor() or platform.machine()
 
 
 @cache

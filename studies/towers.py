@@ -11,7 +11,6 @@ import shutil
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 import trimesh
 
@@ -37,7 +36,7 @@ from studies.twins import train_and_fly
 
 FOLDER = Path("runs/towers")
 SIDE_M, HEIGHT_M = 20.0, 52.0  # of a tower; below the UAVs
-DISTANCE_M = (18.0, 45.0)  # from a device to the middle of a tower
+TOWERS_M = [[496.9, 207.9], [51.0, 348.0]]  # drawn once: free ground 18 to 45 m from devices
 KINDS = ("twin", "corrected twin", "truth")
 
 
@@ -58,9 +57,7 @@ def train_with_towers(seed: int, settings: dict) -> dict:
         Shares collected in the map that was trained in and in the truth, error of that map [dB].
     """
     scene = Scene.load(scene_folder(settings["scene"]))
-    towers_m = place_towers(scene)
-    truth = trace_map(with_towers(scene, towers_m, FOLDER / "truth"), SolverSettings(),
-                      FOLDER / "truth.nc")
+    truth = trace_map(with_towers(scene, FOLDER / "truth"), SolverSettings(), FOLDER / "truth.nc")
     truth.dataset.attrs["scene_hash"] = scene.content_hash()  # nobody knows that it is another city
     kind = settings["trained_in"]
     twin = None if kind == "truth" else learn_twin(scene, truth, seed, kind)
@@ -71,34 +68,16 @@ def train_with_towers(seed: int, settings: dict) -> dict:
     scores = [] if twin is None else score_map("twin", twin.radio_map(scene), truth)
     return {"trained_ratio": result["trained_twin_ratio"],
             "truth_ratio": result["trained_truth_ratio"],
-            "map_rmse_db": scores[0]["rmse_db"] if scores else None, "towers_m": towers_m}
+            "map_rmse_db": scores[0]["rmse_db"] if scores else None, "towers_m": TOWERS_M}
 
 
-def place_towers(scene: Scene) -> list[list[float]]:
-    """Return the middles of two towers [m], each on free ground beside another device."""
-    rng, found, used = np.random.default_rng(0), [], set()
-    corner_m = 0.5 * SIDE_M * np.array(
-        [(1, 1), (1, -1), (-1, -1), (-1, 1), (0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)])
-    while len(found) < 2:
-        device = int(rng.integers(len(scene.device_m)))
-        angle, distance_m = rng.uniform(0, 2 * np.pi), rng.uniform(*DISTANCE_M)
-        direction = np.array([np.cos(angle), np.sin(angle)])
-        middle_m = scene.device_m[device, :2] + distance_m * direction
-        points_m = np.column_stack([middle_m + corner_m, np.full(len(corner_m), 1.0)])
-        apart_m = np.linalg.norm(scene.device_m[:, :2] - middle_m, axis=1)
-        if device not in used and not scene.city.inside(points_m).any() and apart_m.min() > SIDE_M:
-            found.append([round(float(value), 1) for value in middle_m])
-            used.add(device)
-    return found
-
-
-def with_towers(scene: Scene, towers_m: list[list[float]], folder: Path) -> Scene:
+def with_towers(scene: Scene, folder: Path) -> Scene:
     """Write a copy of a scene folder with towers of concrete in it, unless it is there."""
     if not (folder / "scene.toml").exists():
         shutil.copytree(scene.folder, folder, ignore=shutil.ignore_patterns("cache", "truth*.nc"),
                         dirs_exist_ok=True)
         tree = ElementTree.parse(folder / "city.xml")
-        for index, middle_m in enumerate(towers_m):
+        for index, middle_m in enumerate(TOWERS_M):
             box = trimesh.creation.box(extents=[SIDE_M, SIDE_M, HEIGHT_M])
             box.apply_translation([*middle_m, HEIGHT_M / 2])
             box.export(folder / "meshes" / f"tower_{index}.ply")

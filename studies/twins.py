@@ -279,7 +279,7 @@ def quality_figures(rows: pd.DataFrame) -> dict[str, Figure]:
     for left, right, (_, scene, runs) in zip(panels[::2], panels[1::2], found):
         episodes: set[float] = set()
         for index, name in enumerate(name for name in QUALITY if name in runs):
-            curves, style = runs[name]["curve"], {"color": COLOURS[index]}
+            curves = runs[name]["curve"]
             curve = over_seeds(curves, y="map_rmse_db")
             tables.draw_line(left, curve, QUALITY[name], index)
             episodes |= set(curve.x)
@@ -287,8 +287,8 @@ def quality_figures(rows: pd.DataFrame) -> dict[str, Figure]:
                        for at in range(len(curve.x))]
             errors_m = [quantiles(each) for each in located]
             right.plot(curve.x, [each[0] for each in errors_m], marker=MARKERS[index], markersize=4,
-                       **style)
-            right.plot(curve.x, [each[1] for each in errors_m], ":", **style)
+                       color=COLOURS[index])
+            right.plot(curve.x, [each[1] for each in errors_m], ":", color=COLOURS[index])
         left.set(ylabel="RMSE of the map [dB]", ylim=(0, None))
         right.set(ylabel="error of positions [m]: median, dotted 90 %", yscale="log")
         for axes in (left, right):

@@ -1,6 +1,6 @@
 """What the ray tracer is asked for.
 
-What the qualities cost and give, measured with `python -m studies tracer --resume` (1000 links in
+What the qualities cost and give, measured with `python -m studies tracer` (1000 links in
 a dense city, 880 of them detected; two cores; differences from a reference with a million samples):
 
 | quality | links/s | memory  | 9 of 10 links within | RMS    |

@@ -42,7 +42,8 @@ def test_algorithm_1_has_a_row_for_each_round_and_the_seed_decides(small_scene):
     curve = rows.set_index("name")["curve"]["small-segmented-fedqmix-nn"]
     assert curve["real_episodes"] == [1, 2] and 0 < curve["truth_ratio"][-1] <= 1
     del settings["small-segmented-fedqmix-nn"]
-    ratios = [rows_of(learning.learn, small_scene, settings, seed)["curve"].str["truth_ratio"].tolist() for seed in (0, 1)]
+    ratios = [rows_of(learning.learn, small_scene, settings, seed)["curve"].str["truth_ratio"].tolist()
+              for seed in (0, 1)]
     assert rows["curve"].str["truth_ratio"].tolist()[1:] == ratios[0] != ratios[1]
     table = learning.curve_table(rows)
     assert f"| model-aided FedQMIX | 2 | {curve['truth_ratio'][-1]:.3f} |" in table
