@@ -28,7 +28,7 @@ help:
 	@echo "make test-all every test: statistics over many seeds, real data where it is, long chains"
 	@echo "make check    ruff, mypy and the fast tests (under two minutes)"
 	@echo "make docs    the site, in site/; runs the examples"
-	@echo "make bench   what takes how long (the studies of docs/results.md are started one by one)"
+	@echo "make bench   what takes how long; \`python -m studies --list\` lists all studies"
 	@echo "make llvm    set up only: the package and a libLLVM for tracing"
 	@echo "make clean   remove the environment and what the tools left"
 
@@ -56,7 +56,8 @@ docs: $(INSTALLED)
 	cd build/docs && OMP_NUM_THREADS=1 $(abspath $(BIN))/mkdocs build --strict -f $(CURDIR)/mkdocs.yml -d $(CURDIR)/site
 
 bench: llvm
-	$(BIN)/python -m studies speed
+	rm -rf build/speed
+	$(BIN)/python -m studies speed --out build/speed
 
 # The second run does nothing, until what is to be installed has changed.
 $(INSTALLED): pyproject.toml constraints.txt

@@ -99,8 +99,8 @@ def split_flights(measurements: Measurements, held_out: int) -> tuple[Measuremen
         some = "1 flight" if len(flights) == 1 else f"{len(flights)} flights"
         raise BadInput(
             f"{some} in the measurements ({', '.join(flights[:4])}), {held_out} to be held out: at "
-            f"least {held_out + 1} are needed, so that models are judged on a flight that they were "
-            "not fitted to; survey more flights, or hold out fewer")
+            f"least {held_out + 1} are needed, so that models are judged on a flight that they "
+            "were not fitted to; survey more flights, or hold out fewer")
     test = measurements.table["flight"].isin(flights[-held_out:]).to_numpy()
     return measurements.select(~test), measurements.select(test)
 

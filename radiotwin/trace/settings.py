@@ -1,7 +1,7 @@
 """Settings of the ray tracer.
 
 Cost and accuracy of the qualities, measured with
-`python benchmarks/trace.py scenes/rbm --receivers 100` (1000 links in a dense city, 880 of them
+`python -m studies tracer` (1000 links in a dense city, 880 of them
 detected; two cores; differences from a reference with a million samples):
 
 | quality | links/s | memory  | 9 of 10 links within | RMS    |

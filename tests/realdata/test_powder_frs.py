@@ -5,10 +5,10 @@ import pandas as pd
 import pytest
 from scipy.stats import wilcoxon
 
-from benchmarks.real_data import floor_errors_db, permuted
+from radiotwin import close_loop, make_report
 from radiotwin.closeloop.locate import Corrected, locate, whole_area
-from radiotwin.closeloop.run import close_loop
 from radiotwin.closeloop.search import rmse_db
+from studies.closeloop_real import floor_errors_db, permuted
 
 DAYS = ("2022-04-25", "2022-07-05", "2022-07-06", "2022-07-11")  # on the fifth half of the receivers were others
 CHANGED = "ebc-nuc1-b210"  # 19 dB less after April
@@ -37,7 +37,7 @@ def test_gains_floors_and_the_step_of_one_receiver_are_named(loop):
 
 def test_floors_are_those_of_readings_without_a_transmitter(loop, folder):
     """Which the fit has never read."""
-    off_db = floor_errors_db(loop, folder("powder_frs"))
+    off_db = floor_errors_db(make_report(loop), folder("powder_frs"))
     assert np.isfinite(off_db).sum() >= 25 and np.nanmedian(np.abs(off_db)) <= 3.0
 
 

@@ -4,9 +4,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from radiotwin.closeloop.report import make_report
+from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.closeloop.result_file import make_report
 from radiotwin.closeloop.run import Loop, close_loop
-from radiotwin.closeloop.selection import Model, Search
+from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.body_shadowing import BodyShadowing
 from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.detection_limit import DetectionLimit
@@ -65,23 +66,23 @@ def loop():
     receiver_m = np.column_stack([100 + 10 * slot + 30 * flight, 60.0 * flight + 5 * slot, 50.0 + 10 * receiver])
     device_m = np.array([(0, 0, 1.5), (400, 50, 1.5), (200, 350, 1.5)])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("radiotwin.closeloop.run.CATALOGUE", (ReceiverGainOffset,))  # the others take their time
-        return close_loop(measured(device_m, receiver_m, index, -6.0), None, "log-distance", 0, lambda text: None)
+        patch.setattr("radiotwin.closeloop.run.catalogue", lambda: (ReceiverGainOffset,))  # the others take long
+        return close_loop(measured(device_m, receiver_m, index, -6.0), base="log-distance")
 
 
 def with_model(loop, model):
-    """A loop that found something else."""
-    return Loop(loop.base, loop.links, loop.folds, loop.before, Search(model), loop.dependences_before, [])
+    """Return a loop that found something else."""
+    return Loop(loop.base, loop.links, loop.folds, loop.before, SelectionResult(model), loop.dependences_before, [])
 
 
 def with_effect(model, effect, params):
-    """A model with an effect that nobody asked for."""
-    whole = model.whole.with_parts([model.whole.part(effect(), params)])
-    return Model(whole, model.folds, [whole.fit(), *model.fits[1:]], model.index)
+    """Return a model with an effect of given parameters."""
+    whole = model.whole.with_effects([model.whole.apply(effect(), effect.Params(**params))])
+    return CrossValidatedModel(whole, model.folds, [whole.fit(), *model.fits[1:]], model.index, model.twin)
 
 
 def drawn(loop, scene=None):
-    """The figure of the first effect of a loop."""
+    """Return the figure of the first effect of a loop."""
     data = collect(loop)
     return effect_figure(data.effects[0], MapBackground(data.links, scene))
 
@@ -156,8 +157,8 @@ def test_effects_of_the_map_are_drawn_on_it(small_scene, tmp_path):
                                   np.full(len(index[0]), 60.0)])
     data = measured(small_scene.device_m, receiver_m, index)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("radiotwin.closeloop.run.CATALOGUE", ())
-        loop = close_loop(data, small_scene, "log-distance", 0, lambda text: None)
+        patch.setattr("radiotwin.closeloop.run.catalogue", tuple)
+        loop = close_loop(data, small_scene, "log-distance")
     for effect, params in ((RemovedObstacle, {"building": 0, "centre_m": [0.0, 0.0, 9.0]}),
                             (WallReflection, {"strength_db": 0.0, "level_db": 0.0})):
         changed = with_model(loop, with_effect(loop.before, effect, params))

@@ -4,10 +4,15 @@
     case("missing_obstacle", 0).scene           # what a user would declare
     case("missing_obstacle", 0).answer          # what neither of them says
 
+    python -m tests.undeclared.cases missing_obstacle 0 FOLDER   # writes measurements and scene, to try them
+
 A case reads its tables and draws the rest from its seed, in a fraction of a second and without a ray tracer.
 """
 
+import shutil
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -53,16 +58,16 @@ def case(family: str, seed: int) -> Case:
     """A case by its family (`FAMILIES`, `OUTSIDE`) and seed (`SEEDS`).
 
     Raises:
-        FileNotFoundError: its tables are not stored.
+        KeyError: its tables are not stored.
         ValueError: no such family, or tables of an earlier draw.
     """
     if family not in GROUP:
         raise ValueError(f"family {family!r} does not exist; there are {', '.join(GROUP)}")
     where = world_of(family, seed)
-    plain_db, effects = tables.load(tables.world_path(where), where)
+    plain_db, effects = tables.load(tables.world_key(where), where)
     traced_db = plain_db
     if is_traced(family, seed):
-        traced_db, effects = tables.load(tables.path_of(family, seed), where)
+        traced_db, effects = tables.load(tables.case_key(family, seed), where)
     untraced_effects, arriving_db, clean_db = untraced(family, seed, traced_db)
     read_db = _read(clean_db, arriving_db, declared_scene(where.city).config.gain_limit_db,
                     rng_of(family, seed, "noise"))
@@ -76,9 +81,11 @@ def case(family: str, seed: int) -> Case:
 
 
 def stored(family: str, seed: int) -> bool:
-    """Whether the tables of a case are there."""
-    own = tables.path_of(family, seed).is_file() or not is_traced(family, seed)
-    return own and tables.world_path(world_of(family, seed)).is_file()
+    """Return whether the tables of a case are there."""
+    needed = {tables.world_key(world_of(family, seed))}
+    if is_traced(family, seed):
+        needed.add(tables.case_key(family, seed))
+    return needed <= tables.keys()
 
 
 def _read(clean_db: np.ndarray, arriving_db: np.ndarray, limit_db: float, rng: np.random.Generator) -> np.ndarray:
@@ -110,3 +117,14 @@ def _devices(where: World) -> pd.DataFrame:
     plane_m = np.where(where.is_anchor[:, None], where.device_m[:, :2], np.nan)
     return pd.DataFrame({"device": where.names, "x_m": plane_m[:, 0], "y_m": plane_m[:, 1],
                          "z_m": where.device_m[:, 2], "role": np.where(where.is_anchor, "anchor", "unknown")})
+
+
+def write(family: str, seed: int, folder: Path) -> None:
+    """Write what a user would have of a case: `measurements.csv`, `devices.csv` and the folder `scene`."""
+    one = case(family, seed)
+    one.measurements.write(folder / "measurements.csv")
+    shutil.copytree(one.scene.folder, folder / "scene", dirs_exist_ok=True)
+
+
+if __name__ == "__main__":
+    write(sys.argv[1], int(sys.argv[2]), Path(sys.argv[3]))

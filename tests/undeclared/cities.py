@@ -1,28 +1,32 @@
-"""The two declared cities: drawn once, written as scene folders, and redrawn with a survey's errors for the truth.
+"""The two declared cities: drawn once, kept as zipped scene folders, and redrawn with a survey's errors for the truth.
 
 `oldtown` has crooked lanes between boxes, L-shapes and pentagons at all angles; `grid` has straight streets between
 rows of houses and courtyards. Neither is drawn as the cities in `scenes/` are.
 """
 
+import atexit
+import zipfile
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import trimesh
 
+from radiotwin.files import atomic_path
 from radiotwin.scene import Scene
 from radiotwin.scene.config import Extent, LatticeConfig, RadioConfig, SceneConfig, write_config
 from radiotwin.scene.materials import Material, permittivity
 from radiotwin.scene.writer import CityShape, write_city
 from tests.undeclared.shapes import corners_of, fits, prism, turned
 
-FOLDER = Path(__file__).parent / "scenes"
+SCENES = Path(__file__).parent / "scenes.zip"
 SIDE_M = 500.0
 MARGIN_M = 80.0  # of ground around the extent, so that reflections near the border find it
 CITIES = ("oldtown", "grid")
-RADIO = {"oldtown": RadioConfig(frequency_hz=1.8e9, sensitivity_dbm=-108.0),
-         "grid": RadioConfig(frequency_hz=3.5e9, sensitivity_dbm=-122.0)}
+RADIO = {"oldtown": RadioConfig(frequency_hz=1.8e9, sensitivity_dbm=-112.0),
+         "grid": RadioConfig(frequency_hz=3.5e9, sensitivity_dbm=-118.0)}
 ROOM_M = 6.0  # between two buildings, so that moved walls never touch
 GROUND = "asphalt_concrete"
 
@@ -84,14 +88,26 @@ def _grid(rng: np.random.Generator) -> list[Building]:
 
 @cache
 def declared_scene(city: str) -> Scene:
-    """The scene folder that a user would have; it names no device and no UAV."""
-    return Scene.load(FOLDER / city)
+    """Load the scene that a user would have; it names no device and no UAV. Its folder goes with the process."""
+    folder = TemporaryDirectory(prefix="radiotwin-undeclared-")
+    atexit.register(folder.cleanup)
+    with zipfile.ZipFile(SCENES) as archive:
+        archive.extractall(folder.name, [name for name in archive.namelist() if name.startswith(f"{city}/")])
+    return Scene.load(Path(folder.name) / city)
 
 
-def write_declared(city: str) -> None:
-    """Write the scene folder of a city (without the preview, for its size)."""
-    folder = FOLDER / city
-    folder.mkdir(parents=True, exist_ok=True)
+def write_declared() -> None:
+    """Write `scenes.zip` (without previews, for its size)."""
+    with TemporaryDirectory() as folder, atomic_path(SCENES) as temporary:
+        for city in CITIES:
+            _write_scene(Path(folder) / city, city)
+        with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+            for path in sorted(Path(folder).rglob("*.*")):
+                archive.write(path, path.relative_to(folder))
+
+
+def _write_scene(folder: Path, city: str) -> None:
+    folder.mkdir()
     _write(folder, list(buildings(city)), {b.material: Material(b.material, itu=b.material) for b in buildings(city)},
            Material(GROUND, itu=GROUND))
     write_config(SceneConfig(

@@ -1,9 +1,9 @@
 """Trace all tables that are not there yet.
 
-    python -m tests.undeclared.make [--only NAME ...]
+    python -m tests.undeclared.make [--only NAME ...] [--again]
 
 Needs libLLVM and two to three hours on two cores. Each table is written as soon as it is traced: run it again
-after an interruption and it goes on. NAME is a family or a group of worlds; worlds come before the cases in them.
+after an interruption and it continues. NAME is a family or a group of worlds; worlds come before the cases in them.
 The scene folders are written first; they come out the same every time.
 """
 
@@ -76,25 +76,26 @@ def _city(folder: str, where: World, effects: list[dict]) -> TrueCity:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", default=[*GROUPS, *GROUP], help="families and groups of worlds")
-    only = parser.parse_args().only
-    for city in cities.CITIES:
-        if not (cities.FOLDER / city / "scene.toml").is_file():
-            cities.write_declared(city)
+    parser.add_argument("--again", action="store_true", help="trace tables that are there anew")
+    given = parser.parse_args()
+    only = given.only
+    if not cities.SCENES.is_file():
+        cities.write_declared()
     jobs = []
     for seed in SEEDS:
         jobs += [(group, seed, None) for group in GROUPS]
         jobs += [(GROUP[family], seed, family) for family in GROUP if is_traced(family, seed)]
     jobs = [job for job in jobs if (job[2] or job[0]) in only]
     for number, (group, seed, family) in enumerate(jobs, start=1):
-        make_table(group, seed, family)
+        make_table(group, seed, family, given.again)
         print(f"{number}/{len(jobs)} tables are there", flush=True)
 
 
-def make_table(group: str, seed: int, family: str | None) -> None:
-    """Trace a world, or a case in it, and write the table, unless it is there; a case's world comes first."""
+def make_table(group: str, seed: int, family: str | None, again: bool = False) -> None:
+    """Trace a world, or a case in it, and store the table, unless it is there; a case's world comes first."""
     where = world(group, seed)
-    path = tables.path_of(family, seed) if family else tables.world_path(where)
-    if path.is_file():
+    key = tables.case_key(family, seed) if family else tables.world_key(where)
+    if key in tables.keys() and not again:
         return
     if family is not None:
         make_table(group, seed, None)
@@ -103,9 +104,9 @@ def make_table(group: str, seed: int, family: str | None) -> None:
         effects, gain_db = [], trace_world(where)
     else:
         effects = traced_effects(family, seed)
-        gain_db = trace_case(where, effects, tables.load(tables.world_path(where), where)[0])
-    tables.save(path, where, gain_db, effects)
-    print(f"{path.name}: {time.monotonic() - started:.0f} s", flush=True)
+        gain_db = trace_case(where, effects, tables.load(tables.world_key(where), where)[0])
+    tables.save(key, where, gain_db, effects)
+    print(f"{key}: {time.monotonic() - started:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Traced gains on disk: 0.02 dB steps in 16 bits, a case's table as the difference from its world's."""
+"""Traced gains in one archive: steps of 0.02 dB in 16 bits, a case as the difference from its world."""
 
 import json
 from pathlib import Path
@@ -8,59 +8,71 @@ import numpy as np
 from radiotwin.files import atomic_path
 from tests.undeclared.worlds import World
 
-FOLDER = Path(__file__).parent / "tables"
+PATH = Path(__file__).parent / "traces.npz"
 STEP_DB = 0.02
 NO_PATH = -32768
 
 
-def path_of(family: str, seed: int) -> Path:
-    """File of a case's trace."""
-    return FOLDER / f"{family}-{seed}.npz"
+def world_key(world: World) -> str:
+    """Return the archive's name of a world with nothing hidden."""
+    return f"world-{world.group}-{world.seed}"  # a group may be called as a family is
 
 
-def save(path: Path, world: World, gain_db: np.ndarray, effects: list[dict]) -> None:
-    """Write a table, whole or not at all.
+def case_key(family: str, seed: int) -> str:
+    """Return the archive's name of a traced case."""
+    return f"{family}-{seed}"
+
+
+def keys() -> set[str]:
+    """Return the names of all tables in the archive."""
+    if not PATH.is_file():
+        return set()
+    with np.load(PATH, allow_pickle=False) as archive:
+        return {name.split("/")[0] for name in archive.files}
+
+
+def save(key: str, world: World, gain_db: np.ndarray, effects: list[dict]) -> None:
+    """Add a table to the archive, or replace it; the archive is rewritten as a whole or not at all.
 
     Args:
-        path: see `path_of`.
+        key: see `world_key` and `case_key`.
         world: of the table.
-        gain_db: (k, p), NaN where there is no path.
+        gain_db: `(k, p)`, NaN where there is no path.
         effects: that the trace contains.
     """
     steps = np.where(np.isnan(gain_db), NO_PATH, np.round(np.nan_to_num(gain_db) / STEP_DB)).astype(np.int16)
+    content = {}
+    if PATH.is_file():
+        with np.load(PATH, allow_pickle=False) as archive:
+            content = dict(archive.items())
     if effects:
-        steps = steps - _steps(world_path(world))  # wraps round, and back again
-    path.parent.mkdir(exist_ok=True)
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(file, steps=steps, places_m=_places_m(world), effects=np.array(json.dumps(effects)))
+        steps = steps - content[f"{world_key(world)}/steps"]  # overflows, and `load` undoes it
+    content |= {f"{key}/steps": steps, f"{key}/positions_m": _positions_m(world),
+                f"{key}/effects": np.array(json.dumps(effects))}
+    with atomic_path(PATH) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **content)
 
 
-def load(path: Path, world: World) -> tuple[np.ndarray, list[dict]]:
-    """(k, p) gain [dB], NaN where there is no path, and the effects in it.
+def load(key: str, world: World) -> tuple[np.ndarray, list[dict]]:
+    """Read a table.
+
+    Returns:
+        `(k, p)` gain [dB], NaN where there is no path, and the effects in it.
 
     Raises:
-        ValueError: the table was traced for other places than the world has now.
+        KeyError: no such table.
+        ValueError: the table was traced for other positions than the world has now.
     """
-    with np.load(path, allow_pickle=False) as table:
-        if not np.allclose(table["places_m"], _places_m(world), atol=0.02):
-            raise ValueError(f"{path.name} belongs to an earlier draw of this world; delete it and run "
-                             "`python -m tests.undeclared.make`")
-        steps, effects = table["steps"], json.loads(str(table["effects"]))
-    if effects:
-        steps = steps + _steps(world_path(world))
+    with np.load(PATH, allow_pickle=False) as archive:
+        if not np.allclose(archive[f"{key}/positions_m"], _positions_m(world), atol=0.02):
+            raise ValueError(f"{key} in {PATH.name} belongs to an earlier draw of this world; run "
+                             f"`python -m tests.undeclared.make --only {key.rsplit('-', 1)[0]} --again`")
+        steps, effects = archive[f"{key}/steps"], json.loads(str(archive[f"{key}/effects"]))
+        if effects:
+            steps = steps + archive[f"{world_key(world)}/steps"]
     return np.where(steps == NO_PATH, np.nan, steps * STEP_DB), effects
 
 
-def world_path(world: World) -> Path:
-    """File of the trace of a world with nothing hidden."""
-    return FOLDER / f"world-{world.group}-{world.seed}.npz"  # a group may be called as a family is
-
-
-def _steps(path: Path) -> np.ndarray:
-    with np.load(path, allow_pickle=False) as table:
-        return table["steps"]
-
-
-def _places_m(world: World) -> np.ndarray:
-    """Some of the places that a trace depends on: enough to notice that a world is not what it was."""
+def _positions_m(world: World) -> np.ndarray:
+    """Return some of the positions that a trace depends on: enough to notice another draw of the world."""
     return np.concatenate([world.device_m, world.points_m[::90]]).astype(np.float32)

@@ -9,7 +9,7 @@ import pytest
 from radiotwin.measurements import read_measurements
 from tests.undeclared import cases, tables
 from tests.undeclared.cases import FAMILIES, OUTSIDE, SEEDS
-from tests.undeclared.cities import CITIES, buildings, declared_scene
+from tests.undeclared.cities import CITIES, RADIO, buildings, declared_scene
 from tests.undeclared.families import world_of
 from tests.undeclared.shapes import distance_m
 from tests.undeclared.worlds import GROUPS, world
@@ -237,11 +237,12 @@ def test_the_declared_folder_is_the_generated_city(city):
     heights_m = [building.height_m for building in buildings(city)]
     middles = [building.footprint_m[:3].mean(axis=0) for building in buildings(city)]
     np.testing.assert_allclose(declared_scene(city).city.height_at(*np.array(middles).T), heights_m, atol=0.01)
+    assert declared_scene(city).config.radio == RADIO[city]
 
 
 def test_a_table_of_another_draw_is_refused():
     with pytest.raises(ValueError, match="earlier draw"):
-        tables.load(tables.world_path(world("receivers", 0)), world("receivers", 1))
+        tables.load(tables.world_key(world("receivers", 0)), world("receivers", 1))
 
 
 def test_unknown_families_are_named():

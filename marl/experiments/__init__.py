@@ -1,1 +1,0 @@
-"""The studies behind `docs/results.md`: what is run, the runs, and tables and figures made of their JSON files."""

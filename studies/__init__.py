@@ -1,0 +1,1 @@
+"""Studies and benchmarks that made `docs/results`, run by `python -m studies`."""

@@ -1,0 +1,158 @@
+"""Numbers, Markdown and panels of the studies' tables and figures."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from marl.figures import COLOURS, MARKERS
+
+RATIO = "share of all data collected in the truth"
+
+
+def scene_folder(name: str) -> Path:
+    """Return the folder of a scene: a name is of `scenes/`, all else is a path."""
+    return Path("scenes") / name if name == Path(name).name else Path(name)
+
+
+def read_frame(rows: list[dict]) -> pd.DataFrame:
+    """Return rows as a table, by name and seed, with a column for each result."""
+    keys = ("name", "seed", "settings", "cpu_s")
+    frame = pd.DataFrame([{key: row[key] for key in keys} | row["results"] for row in rows])
+    return frame.sort_values(["name", "seed"], ignore_index=True)
+
+
+def provenance(rows: list[dict]) -> str:
+    """Return how many rows there are and what made them."""
+    own = [row for row in rows if "copied_from" not in row]
+    copied = sorted({f"`{row['copied_from']}`" for row in rows if "copied_from" in row})
+    versions, machines = ({row[key] for row in rows if row[key]} for key in ("version", "machine"))
+    hours = sum(row["cpu_s"] or 0 for row in own) / 3600
+    text = (f"{len(rows)} rows of {len({row['name'] for row in rows})} kinds"
+            + (f", {hours:.1f} CPU hours" if hours else "") + "; version (commit, or hash of the "
+            f"sources): {'; '.join([', '.join(sorted(versions)), *sorted(machines)])}.")
+    return text + (f" Equal rows are copied from {', '.join(copied)}." if copied else "")
+
+
+def markdown(heads: list[str], rows: list[list[str]]) -> str:
+    """Return a table."""
+    return "\n".join(["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads),
+                      *("| " + " | ".join(row) + " |" for row in rows)])
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Return a number for a table, a dash where there is none."""
+    return "–" if value is None or value != value else f"{value:,.{digits}f}"
+
+
+def sd(values: np.ndarray | list) -> np.ndarray:
+    """Return the sample standard deviation over the first axis; 0 of one value."""
+    return np.std(values, axis=0, ddof=1 if len(values) > 1 else 0)
+
+
+def with_sd(values: list[float], digits: int = 3) -> str:
+    """Return mean ± standard deviation; of one value the value."""
+    if not len(values):
+        return "–"
+    mean = f"{np.mean(values):.{digits}f}"
+    return f"{mean} ± {sd(values):.{digits}f}" if len(values) > 1 else mean
+
+
+def quantiles(errors_m: list[float | None]) -> tuple[float, float, float, float]:
+    """Return median, 90 % quantile and maximum [m], and the share above 100 m; None is far away."""
+    errors = np.array([np.inf if error is None else error for error in errors_m], dtype=float)
+    # Nothing lies between a number and infinity.
+    method = "linear" if np.isfinite(errors).all() else "higher"
+    return (float(np.median(errors)), float(np.quantile(errors, 0.9, method=method)),
+            float(errors.max()), float(np.mean(errors > 100)))
+
+
+class Curve(NamedTuple):
+    """Mean and standard deviation over seeds at `(n,)` real episodes, or over another abscissa."""
+
+    x: np.ndarray
+    mean: np.ndarray
+    sd: np.ndarray
+
+    def needed(self, ratio: float) -> float:
+        """Return the first x at which the mean is at least `ratio`; NaN where it never is."""
+        enough = np.flatnonzero(self.mean >= ratio)
+        return float(self.x[enough[0]]) if len(enough) else np.nan
+
+
+def over_seeds(curves: pd.Series, x: str = "real_episodes", y: str = "truth_ratio") -> Curve:
+    """Return the curve of a row's seeds, as long as the shortest."""
+    length = min(len(curve[x]) for curve in curves)
+    xs, ys = (np.array([curve[key][:length] for curve in curves], dtype=float) for key in (x, y))
+    return Curve(xs.mean(axis=0), ys.mean(axis=0), sd(ys))
+
+
+def last(curves: pd.Series, column: str = "truth_ratio") -> list[float]:
+    """Return the last value of each curve."""
+    return [curve[column][-1] for curve in curves]
+
+
+def worlds(rows: pd.DataFrame) -> Iterator[tuple[str, str, dict[str, pd.DataFrame]]]:
+    """Yield truth, scene, and its rows by name without these two; the ray-traced truth first."""
+    truth = rows["settings"].str["truth"]
+    scene = rows["settings"].str["scene"].str.split("/").str[-1]
+    for (_, of, where), group in rows.groupby([truth != "traced", truth, scene]):
+        yield of, where, {name.removeprefix(f"{where}-").removeprefix(f"{of}-"): seeds
+                          for name, seeds in group.groupby("name")}
+
+
+def shown(scene: str, truth: str) -> str:
+    """Return a world's name for titles."""
+    kind = "ray-traced" if truth == "traced" else "statistical"
+    return f"{scene.replace('paper_', 'the paper’s ')}, {kind} truth"
+
+
+def make_panels(count: int, columns: int, height_in: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure of `count` panels."""
+    columns = min(columns, count)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(10.0, height_in * rows + 0.9), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(rows, columns, squeeze=False).ravel()
+    for unused in axes[count:]:
+        unused.remove()
+    return figure, list(axes[:count])
+
+
+def draw_line(axes: Axes, curve: Curve, label: str, index: int) -> None:
+    """Draw a mean with a band of its standard deviation; a single point gets a large marker."""
+    colour, marker = COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)]
+    alone = {"markersize": 4}
+    if len(curve.x) == 1:
+        alone = {"markersize": 9, "markeredgecolor": "black"}
+    axes.plot(curve.x, curve.mean, marker=marker, color=colour, label=label, **alone)
+    axes.fill_between(curve.x, curve.mean - curve.sd, curve.mean + curve.sd, color=colour,
+                      alpha=0.18, linewidth=0)
+
+
+def draw_bars(axes: Axes, groups: dict[str, list[list[float]]], errors: dict[str, list],
+              labels: list[str], **texts: str) -> None:
+    """Draw means of a group of values for each label, side by side, with error bars."""
+    width = 0.8 / len(groups)
+    for index, (name, cells) in enumerate(groups.items()):
+        axes.bar(np.arange(len(cells)) + (index - (len(groups) - 1) / 2) * width,
+                 [np.mean(cell) if len(cell) else np.nan for cell in cells], width * 0.92,
+                 yerr=errors[name], color=COLOURS[index % len(COLOURS)],
+                 error_kw={"linewidth": 1}, label=name)
+    axes.set(xticks=range(len(labels)), ylim=(0, 1.02), ylabel=RATIO, **texts)
+    axes.set_xticklabels(labels)
+    axes.grid(alpha=0.3, axis="y")
+
+
+def with_legend(figure: Figure, panels: list[Axes], columns: int) -> Figure:
+    """Return the figure with one legend for all panels below them."""
+    entries = {label: handle for axes in panels
+               for handle, label in zip(*axes.get_legend_handles_labels())}
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=columns,
+                  frameon=False)
+    return figure

@@ -1,0 +1,99 @@
+"""Speed, memory and numerical error of tracing: `tracer`.
+
+A random sample of a scene's lattice is solved for all devices, in a process of its own, and
+compared with a reference with ten times the default's rays.
+"""
+
+import multiprocessing
+import os
+import resource
+from functools import lru_cache
+
+import numpy as np
+import pandas as pd
+
+from radiotwin import Scene, SolverSettings
+from radiotwin.trace.solver import PathGains
+from studies.runner import Study
+from studies.tables import markdown, scene_folder
+
+ROWS: dict[str, dict] = {
+    "`fast` (30,000 samples)": {"quality": "fast"},
+    "`default` (100,000 samples, depth 4)": {"quality": "default"},
+    "`high` (500,000 samples)": {"quality": "high"},
+    "depth 3": {"quality": "default", "max_depth": 3},
+    "depth 5": {"quality": "default", "max_depth": 5},
+    "no diffraction": {"quality": "default", "diffraction": False}}
+
+
+def tracer_cases(seed: int) -> dict[str, dict]:
+    """Return settings of the solver."""
+    return {name: {"scene": "rbm", "receivers": 100} | settings for name, settings in ROWS.items()}
+
+
+def time_tracer(seed: int, settings: dict) -> dict:
+    """Trace a sample and compare it with the reference, over the links that receivers detect there.
+
+    Args:
+        seed: of the sample.
+        settings: `scene`, `receivers`, `quality` and fields of `SolverSettings`.
+
+    Returns:
+        Links per second of two cores' processor time, peak memory, absolute differences [dB], and
+        the share of the links that is missed.
+    """
+    sample = settings["scene"], settings["receivers"], seed
+    others = {name: value for name, value in settings.items()
+              if name not in ("scene", "receivers", "quality")}
+    solver = SolverSettings.of_quality(settings["quality"], **others)
+    reference_db = _reference(*sample)[0]
+    gain_db, per_s, peak_gib = _in_a_process(solver, *sample)
+    detected = reference_db >= Scene.load(scene_folder(settings["scene"])).config.gain_limit_db
+    both = detected & np.isfinite(gain_db)
+    error_db = np.abs(gain_db - reference_db)[both]
+    return {"links": reference_db.size, "detected": int(detected.sum()), "links_per_s": per_s,
+            "peak_gib": peak_gib, "median_db": np.median(error_db),
+            "p90_db": np.quantile(error_db, 0.9), "rms_db": np.sqrt(np.mean(error_db**2)),
+            "missed": 1 - both.sum() / detected.sum()}
+
+
+@lru_cache
+def _reference(scene: str, receivers: int, seed: int) -> tuple:
+    return _in_a_process(SolverSettings().finer(10), scene, receivers, seed)
+
+
+def _in_a_process(settings: SolverSettings, scene: str, receivers: int, seed: int) -> tuple:
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(_measure, (settings, scene, receivers, seed))
+
+
+def _measure(settings: SolverSettings, name: str, receivers: int, seed: int) -> tuple:
+    """Return gains [dB], links per second of two cores, and peak memory [GiB]."""
+    scene = Scene.load(scene_folder(name))
+    rng, lattice_m = np.random.default_rng(seed), scene.lattice.positions_m
+    points_m = lattice_m[rng.choice(len(lattice_m), receivers, replace=False)]
+    solver = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings)
+    solver.solve(scene.device_m[0], points_m[:settings.batch_receivers])  # compiles the kernels
+    started = sum(os.times()[:2])
+    gain_db = np.stack([np.concatenate(list(solver.gains(device_m, points_m)))
+                        for device_m in scene.device_m])
+    cpu_s = sum(os.times()[:2]) - started
+    # A batch that is not full costs what a full one does; speeds are of full ones.
+    solved = len(scene.device_m) * len(solver.batches(receivers)) * settings.batch_receivers
+    return gain_db, 2 * solved / cpu_s, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+
+
+def tracer_table(rows: pd.DataFrame) -> str:
+    """Return speed, memory and error by settings."""
+    by_name, lines = rows.set_index("name"), []
+    for name in (each for each in ROWS if each in by_name.index):
+        row = by_name.loc[name]
+        lines.append([name, f"{row['links_per_s']:.0f}", *(f"{row[column]:.2f}" for column in (
+            "peak_gib", "median_db", "p90_db", "rms_db")),
+            "0 %" if row["missed"] == 0 else f"{100 * row['missed']:.1f} %"])
+    return markdown(["settings", "links/s", "peak GiB", "median [dB]", "90 % [dB]", "RMS [dB]",
+                     "links lost"], lines)
+
+
+STUDIES = {"tracer": Study("What do the ray tracer's settings cost and bring?", time_tracer,
+                           tracer_cases, tracer_table, seeds=1)}
