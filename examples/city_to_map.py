@@ -1,7 +1,8 @@
 # %% [markdown]
 # # From a city to a radio map
-# A small made-up city, its ray-traced truth, and the map as files that other programs read. Your own city: see
-# `radiotwin build-scene`. Tracing needs libLLVM 17 or newer; where there is none, the statistical truth stands in.
+# A small synthetic city, its ray-traced truth, and the map as files for other programs. For a city of
+# your own see `radiotwin build-scene`. Tracing needs libLLVM 17 or newer; without it the statistical
+# truth is used.
 
 # %%
 from pathlib import Path
@@ -16,7 +17,8 @@ from radiotwin.report import write_picture
 out = Path("city_to_map")
 rt.build_preset("small", out / "scene")
 scene = rt.Scene.load(out / "scene")
-print(scene.config.name, scene.lattice.shape, "positions (z, y, x);", len(scene.config.devices), "devices")
+print(scene.config.name, scene.lattice.shape, "positions (z, y, x);",
+      len(scene.config.devices), "devices")
 
 # %% [markdown]
 # The gain at every position where a UAV can be, here for one device. NaN: not detected.
@@ -32,7 +34,8 @@ print(f"{float(gain_db.isnull().mean()):.1%} of all links are not detected")
 print(gain_db.sel(device="d3", z=55.0).sel(x=100.0, y=100.0, method="nearest").item(), "dB")
 
 # %% [markdown]
-# As NetCDF, which xarray reads with its units; as a table; as a picture; and as a page to turn and zoom.
+# As a table, as a picture, and as a page with the city in 3D. xarray reads the NetCDF file with its
+# units.
 
 # %%
 write_csv(radio_map, scene, out / "map.csv")

@@ -1,31 +1,38 @@
 # %% [markdown]
 # # Close the loop
-# One receiver reads 6 dB too much, and nobody knows. What does the model lack, and what does knowing it bring?
+# One receiver reads 6 dB too much, and neither scene nor file says so. Which effect does the model
+# lack, and how much smaller is the error with it?
 
 # %%
 import radiotwin as rt
 
 rt.build_preset("small", "close_the_loop/scene")
 scene = rt.Scene.load("close_the_loop/scene")
-honest = rt.fly_survey(scene, rt.segmented_truth(scene), flights=4, pattern="random-waypoint", seed=1, noise_db=0.0)
-table = honest.table.copy()
+correct = rt.fly_survey(scene, rt.segmented_truth(scene), flights=4, pattern="random-waypoint",
+                        seed=1, noise_db=0.0)
+table = correct.table.copy()
 table.loc[table["receiver"] == "uav1", "gain_db"] += 6.0
-measurements = rt.Measurements(table, honest.devices)
+measurements = rt.Measurements(table, correct.devices)
 
 # %% [markdown]
-# Without its 3D map the base is a log-distance law; with `scene` it is a twin, or followed paths, whichever errs less.
+# Without the 3D map the base is a log-distance law. With `scene` it is the better of a twin with a
+# segmented law and one that follows paths.
 
 # %%
 loop = rt.close_loop(measurements, base="log-distance", seed=0)
 report = rt.make_report(loop)
 print("verdict:", report["verdict"])
 for effect in report["effects"]:
-    print(effect["name"], {name: round(p["value"], 1) for name, p in effect["parameters"].items()})
+    print(effect["name"], {name: round(parameter["value"], 1)
+                           for name, parameter in effect["parameters"].items()})
 
 # %% [markdown]
-# The error before and after is of flights that took no part in fitting.
+# The error before and after is that of flights that took no part in the fit. The twin with the effect
+# can be saved and used.
 
 # %%
 error = report["error"]
 print(f"{error['before']['rmse_db']:.2f} dB before, {error['after']['rmse_db']:.2f} dB after")
-rt.corrected_twin(loop, None).save("close_the_loop/twin")
+twin = rt.corrected_twin(loop, None)
+print(twin.description)
+twin.save("close_the_loop/twin")

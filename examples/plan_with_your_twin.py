@@ -13,11 +13,13 @@ from marl.mission import Known, make_mission
 rt.build_preset("small", "plan/scene")
 scene = rt.Scene.load("plan/scene")
 truth = rt.segmented_truth(scene)
-measurements = rt.fly_survey(scene, truth, flights=2, pattern="random-waypoint", seed=0, noise_db=0.0)
+measurements = rt.fly_survey(scene, truth, flights=2, pattern="random-waypoint", seed=0,
+                             noise_db=0.0)
 twin = rt.fit_twin(measurements, scene, model="segmented_log_distance", seed=0)
 
 # %% [markdown]
-# The mission in the twin, with the devices where the twin believes they are, and the same in the truth.
+# The mission in the twin, with devices at the positions that the twin estimates, and the same in the
+# truth.
 
 # %%
 known = Known.of(twin.devices)
@@ -42,7 +44,8 @@ else:
     observations, infos = env.reset(seed=0)
     collected = 0.0
     while env.agents:
-        actions = {agent: int(infos[agent]["action_mask"].argmax()) for agent in env.agents}  # hover while it lasts
+        # The first action that is allowed: to hover, as long as the battery lasts.
+        actions = {agent: int(infos[agent]["action_mask"].argmax()) for agent in env.agents}
         observations, rewards, ended, cut, infos = env.step(actions)
         collected += sum(rewards.values())
     print(f"hovering at the start collects {collected / in_twin.data_units.sum():.0%} in the twin")

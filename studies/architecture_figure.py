@@ -1,7 +1,4 @@
-"""Draw docs/images/architecture.png: the way of a gain through the code.
-
-    python studies/architecture_figure.py [FILE]
-"""
+"""Draw docs/images/architecture.png: `python studies/architecture_figure.py [FILE]`."""
 
 import sys
 from pathlib import Path

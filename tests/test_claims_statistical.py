@@ -1,7 +1,7 @@
 """What the project says of itself in the statistical truth of the paper, on the shipped RBM scene.
 
 Rationale: with truth and noise known, the best that any channel model can reach is the noise itself, and a located
-    device has a known place.
+    device has a known position.
 Expected behaviour: from 5 random-waypoint flights, in each of 6 seeds, the channel network's error on 5 other
     flights is within 8 % of the noise (LoS √2 dB, NLoS √5 dB); over 7 unknown devices and 6 seeds the position error
     is at most 3 m in the median and 12 m for 90 %, and at most 1 device in 42 is off by more than 50 m.
@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from radiotwin.channel import make_links
-from radiotwin.channel.likelihood import mean_if_detected
+from radiotwin.inference.gaussian import mean_if_detected
+from radiotwin.links import link_geometry
 from radiotwin.scene import Scene
 from radiotwin.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
@@ -41,7 +41,7 @@ def runs():
 def test_channel_error_is_within_8_percent_of_the_noise(runs):
     scene, results = runs
     for seed, twin, test in results:
-        links = make_links(scene.device_m, test.receiver_m, test.device_index, scene.city)
+        links = link_geometry(scene.device_m, test.receiver_m, test.device_index, scene.city)
         predicted_db = mean_if_detected(*twin.channel.predict(links), scene.config.gain_limit_db)
         error_db = predicted_db - test.level_db
         # Within 8 dB of the limit only the upper part of the noise is seen: the floor is not σ there, but less.

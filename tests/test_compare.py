@@ -1,4 +1,4 @@
-"""Comparisons: the arithmetic of the tables, and that nobody is judged on what it has seen."""
+"""Comparisons: the arithmetic of the tables, and that no model is scored on links that it has seen."""
 
 import dataclasses
 
@@ -101,7 +101,7 @@ def test_twins_are_matched_by_the_names_of_their_devices(comparison, small_scene
     np.testing.assert_allclose(by_model["twin"], by_model["turned"])
 
 
-def test_power_received_is_held_against_a_map_of_gain(small_scene):
+def test_received_power_is_compared_with_a_map_of_gain(small_scene):
     """20 dBm transmitted: levels 20 dB above the gain, errors the same."""
     radio = small_scene.config.radio.model_copy(update={"tx_power_dbm": 20.0, "sensitivity_dbm": -100.0})
     loud = Scene(small_scene.folder, small_scene.config.model_copy(update={"radio": radio}))
@@ -130,7 +130,7 @@ def test_a_truth_of_another_scene_is_refused(small_scene, truth, flown):
         compare_models(*split_flights(flown, 1), small_scene, stale, seed=0)
 
 
-def test_devices_whose_position_nobody_knows_are_in_neither_class(small_scene, flown):
+def test_devices_of_unknown_position_are_in_neither_class(small_scene, flown):
     """Own data in a scene that declares no devices: anchors have LoS or not, the others count in `all` alone."""
     bare = Scene(small_scene.folder, small_scene.config.model_copy(update={"devices": []}))
     scores = compare_models(*split_flights(flown, 1), bare, None, seed=0, models=("log_distance",)).scores

@@ -1,12 +1,15 @@
-"""The documentation site builds without a single warning."""
+"""The documentation site builds without a single warning; tables of names are those of the code."""
 
 import os
 import re
 import subprocess
 import sys
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
+
+from radiotwin.closeloop.criteria import SelectionCriteria
 
 ROOT = Path(__file__).parents[1]
 
@@ -20,10 +23,18 @@ def test_the_site_builds(tmp_path):
         env=os.environ | {"EXECUTE_EXAMPLES": "false", "NO_MKDOCS_2_WARNING": "1"})
     assert result.returncode == 0, result.stderr
     reference = (tmp_path / "site" / "reference" / "index.html").read_text(encoding="utf-8")
-    for name in ("radiotwin.twin.fit_twin", "radiotwin.radiomap.RadioMap.read", "marl.parallel_env.HarvestEnv",
+    for name in ("radiotwin.twin.fit_twin", "radiotwin.twin.Twin.predict", "radiotwin.radiomap.RadioMap.read",
+                 "radiotwin.closeloop.criteria.SelectionCriteria", "marl.parallel_env.HarvestEnv",
                  "radiotwin.footprints.build.build_scene_from_map"):
         assert f'id="{name}"' in reference
     results = (tmp_path / "site" / "results" / "index.html").read_text(encoding="utf-8")
     for picture in re.findall(r'<img [^>]*src="([^"]+)"', results):
         assert (tmp_path / "site" / "results" / picture).is_file(), picture
     assert "rt.trace_map" in (tmp_path / "site" / "examples" / "city_to_map" / "index.html").read_text(encoding="utf-8")
+
+
+def test_every_criterion_is_documented_with_its_default():
+    text = (ROOT / "docs" / "close-the-loop.md").read_text(encoding="utf-8")
+    documented = {name: float(default.replace(",", "")) for name, default in
+                  re.findall(r"^\| `(\w+)` \| ([\d.,]+) \|", text, re.MULTILINE)}
+    assert documented == {each.name: pytest.approx(each.default, rel=0.01) for each in fields(SelectionCriteria)}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -93,10 +93,6 @@ class EffectModel:
             mean_db, scale_db * np.sqrt(self.dof / (self.dof - 2)),
             detection_probability(mean_db, scale_db, model.limit_db, self.dof,
                                   regression.dropout_probability))
-
-    def with_power(self, likelihood_power: float) -> EffectModel:
-        """Return the same with another power of the likelihood."""
-        return replace(self, likelihood_power=likelihood_power)
 
 
 def device_sd_db(model: FoldModel, result: FitResult) -> float:

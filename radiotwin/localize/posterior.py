@@ -46,7 +46,7 @@ class Posterior:
         return float(halves[order][np.searchsorted(within, CREDIBLE_MASS * (1 - 1e-9))])
 
     def region_share(self) -> float:
-        """Return the share of the area that the smallest region with CREDIBLE_MASS has; 0.9: flat."""
+        """Return the share of the area of the smallest region with CREDIBLE_MASS; 0.9: flat."""
         area = self.width_m**2
         order = np.argsort(-self.mass / area)
         inside = np.searchsorted(np.cumsum(self.mass[order]), CREDIBLE_MASS * (1 - 1e-9)) + 1

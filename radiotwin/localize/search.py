@@ -138,7 +138,7 @@ class Search:
             point[todo[good]], placed[todo[good]] = tried[good], True
         if not placed.any():
             raise BadInput(
-                f"no place for a device at height {self.z_m} m within x {x_min} … {x_max} and y "
+                f"no position for a device at height {self.z_m} m within x {x_min} … {x_max} and y "
                 f"{y_min} … {y_max} m: all of it is inside buildings; widen the bounds, check the "
                 "heights, or set allow_indoor")
         centre, point = centre[placed], point[placed]

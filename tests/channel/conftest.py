@@ -26,7 +26,7 @@ def paper_law(distance_m, los, elevation_rad):
     return lines[:, 0] + 10.0 * lines[:, 1] * np.log10(distance_m)
 
 
-def bent_law(distance_m, los, elevation_rad):
+def law_with_break_point(distance_m, los, elevation_rad):
     """Return free space in LoS to a break point at 200 m and the sixth power beyond (nearly two-ray); in NLoS a loss that
     falls with elevation, as over roofs [dB]."""
     decades = np.log10(distance_m / 200.0)
@@ -61,7 +61,7 @@ def world():
 @pytest.fixture(scope="session")
 def laws():
     """The laws by name."""
-    return {"paper": paper_law, "bent": bent_law, "parameters": LAW}
+    return {"paper": paper_law, "break point": law_with_break_point, "parameters": LAW}
 
 
 @pytest.fixture(scope="session")

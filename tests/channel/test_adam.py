@@ -34,6 +34,6 @@ def test_it_steps_as_torchs_own_does_also_after_a_stop():
 
 
 def test_learning_does_not_import_the_compiler():
-    words = ("import sys, torch; from radiotwin.channel.adam import Adam; "
+    code = ("import sys, torch; from radiotwin.channel.adam import Adam; "
              "Adam([torch.zeros(2)]).step([torch.ones(2)], 0.1); sys.exit('torch._dynamo' in sys.modules)")
-    assert subprocess.run([sys.executable, "-c", words], timeout=300).returncode == 0
+    assert subprocess.run([sys.executable, "-c", code], timeout=300).returncode == 0

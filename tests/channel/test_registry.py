@@ -8,7 +8,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin.channel import channel_models, channel_named, load_channel, register, registry, save_channel
+from radiotwin.channel import (
+    channel_models,
+    channel_named,
+    load_channel,
+    register,
+    registry,
+    save_channel,
+)
 from radiotwin.channel.log_distance import LogDistance
 from radiotwin.errors import BadInput
 

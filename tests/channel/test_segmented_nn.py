@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from radiotwin.channel.ensemble import forward
-from radiotwin.links.geometry import LinkGeometry
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.channel.segmented_nn import SegmentedNN
+from radiotwin.links.geometry import LinkGeometry
 
 LIMIT_DB = -120.0
 
@@ -32,10 +32,10 @@ def test_held_out_error_is_within_8_percent_of_the_noise(world, laws, seed):
         assert rmse(model, test, test.links.los == los) == pytest.approx(laws["parameters"][los][2], rel=0.08)
 
 
-def test_learns_a_bend_that_no_line_has(world, laws):
+def test_learns_a_break_point_that_no_line_has(world, laws):
     """Error against the noiseless truth: at most half of the segmented law's in both classes."""
-    train = world(20, 2000, limit_db=LIMIT_DB, law=laws["bent"])
-    test = world(21, 5000, law=laws["bent"])
+    train = world(20, 2000, limit_db=LIMIT_DB, law=laws["break point"])
+    test = world(21, 5000, law=laws["break point"])
     line = SegmentedLogDistance().fit(train.links, train.level_db, LIMIT_DB)
     model = SegmentedNN().fit(train.links, train.level_db, LIMIT_DB, seed=0)
     for los in (True, False):
@@ -73,11 +73,11 @@ def test_equal_seeds_give_equal_bits_whatever_the_threads(world):
 def test_table_is_the_mean_of_the_networks(fitted_nn):
     model, data = fitted_nn
     segment = data.links.los.astype(int)
-    place = np.column_stack([data.links.log_distance, data.links.receiver_m[:, 2] - 1.5])
+    position = np.column_stack([data.links.log_distance, data.links.receiver_m[:, 2] - 1.5])
     with torch.no_grad():
         outputs = forward(
             {k: torch.as_tensor(v) for k, v in model.weights.items()},
-            torch.as_tensor(model._inputs(place, segment), dtype=torch.float32),
+            torch.as_tensor(model._inputs(position, segment), dtype=torch.float32),
         )
     sigma_db = np.array([model.law.nlos.sd_db, model.law.los.sd_db])[segment]
     expected = np.clip(outputs.mean(0).numpy() * sigma_db, *model.residual_db[segment].T)
@@ -90,10 +90,10 @@ def test_beyond_the_data_it_falls_as_the_law_does(fitted_nn, los):
     ground_m = np.geomspace(data.links.distance_m.max() + 1.0, 20_000.0, 300)
     receiver_m = np.column_stack([ground_m, np.zeros(300), np.full(300, 60.0)])
     links = LinkGeometry(np.zeros((300, 3)), receiver_m, np.full(300, los), np.zeros(300, int))
-    bend_db = model.predict(links)[0] - model.law.predict(links)[0]
+    correction_db = model.predict(links)[0] - model.law.predict(links)[0]
     assert (np.diff(model.predict(links)[0]) < 0.0).all()
-    assert np.ptp(bend_db) < 1.0
-    assert np.ptp(bend_db[-50:]) == 0.0
+    assert np.ptp(correction_db) < 1.0
+    assert np.ptp(correction_db[-50:]) == 0.0
 
 
 def test_class_without_data_keeps_the_borrowed_line(world):

@@ -41,8 +41,8 @@ def test_recovers_the_law_with_half_of_it_not_detected_where_ignoring_that_fails
     assert 0.4 < np.mean(share) < 0.6
 
     def standard_errors(estimates):
-        spread = np.std(estimates, axis=0, ddof=1) / np.sqrt(len(estimates))
-        return np.abs(np.mean(estimates, axis=0) - TRUE) / spread
+        mean_sd = np.std(estimates, axis=0, ddof=1) / np.sqrt(len(estimates))
+        return np.abs(np.mean(estimates, axis=0) - TRUE) / mean_sd
 
     assert (standard_errors(censored) < 4.0).all()
     assert (standard_errors(ignored)[:2] > 10.0).all()

@@ -5,7 +5,12 @@ import pytest
 import torch
 from scipy.stats import norm, truncnorm
 
-from radiotwin.inference.gaussian import gaussian_nll, gaussian_nll_torch, mean_if_detected, standardised
+from radiotwin.inference.gaussian import (
+    gaussian_nll,
+    gaussian_nll_torch,
+    mean_if_detected,
+    standardised,
+)
 
 
 def test_equals_density_of_the_seen_and_probability_of_the_rest():
@@ -45,7 +50,7 @@ def test_mean_of_the_detected_is_the_truncated_normals(mean_db):
 
 
 @pytest.mark.parametrize("mean_db", [-90.0, -118.0, -120.0, -135.0])
-def test_a_link_that_was_not_detected_stands_for_the_mean_of_those_below_the_limit(mean_db):
+def test_a_link_that_was_not_detected_counts_as_the_mean_of_those_below_the_limit(mean_db):
     found = standardised(np.array([np.nan, -100.0]), np.full(2, mean_db), np.full(2, 6.0), -120.0)
     assert found[0] == pytest.approx(truncnorm.mean(-np.inf, (-120.0 - mean_db) / 6.0), abs=1e-6)
     assert found[1] == pytest.approx((-100.0 - mean_db) / 6.0)

@@ -41,7 +41,7 @@ def test_a_receiver_that_heard_once_is_not_stuck_and_equal_rows_without_a_time_a
     assert len(links) == n and links.receiver_names == ["far", "r0", "r1"] and links.notes == []
 
 
-def test_a_value_that_stands_for_not_detected_becomes_blank(open_ground):
+def test_a_value_that_means_not_detected_becomes_blank(open_ground):
     world = open_ground.fly(1)
     measurements = open_ground.measured(world)
     blank = measurements.table["gain_db"].isna()

@@ -63,7 +63,7 @@ def test_table_and_direct_agree_overhead_and_far(published_law):
 
 
 def test_no_links_have_no_means(free_space, published_law):
-    """As of a device that nobody detected: receivers at very many heights, so that there is no table."""
+    """Such as of a device that was never detected: receivers at very many heights, so that there is no table."""
     rng = np.random.default_rng(3)
     receiver_m = np.column_stack([rng.uniform(0, 400, (600, 2)), np.linspace(20, 120, 600)])
     observations = merge_repeats(receiver_m, np.zeros(600, int), np.full(600, np.nan), np.array([0]), use_missed=True)

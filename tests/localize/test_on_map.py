@@ -41,7 +41,7 @@ def test_free_space_without_map_or_anchors(free_space):
 
 
 def test_mirror_image_is_a_second_mode(free_space):
-    """Receivers on a straight line cannot tell its two sides apart: both, each with half of the posterior."""
+    """Receivers on a straight line cannot distinguish its two sides: both, each with half of the posterior."""
     rng = np.random.default_rng(1)
     line = np.column_stack([np.full(40, 200.0), np.linspace(0, 400, 40), np.full(40, 60.0)])
     estimate = one(line, free_space_levels((120, 150), line, rng, 0.5), free_space)
@@ -53,7 +53,7 @@ def test_mirror_image_is_a_second_mode(free_space):
 
 
 def test_what_was_not_detected_rules_out_a_mode(free_space):
-    """The same line, and a handful of places on the wrong side where the device should have been heard."""
+    """The same line, and a few positions on the wrong side where the device should have been heard."""
     rng = np.random.default_rng(1)
     line = np.column_stack([np.full(40, 200.0), np.linspace(0, 400, 40), np.full(40, 60.0)])
     deaf = np.column_stack([rng.uniform([260, 120], [300, 180], (8, 2)), np.full(8, 60.0)])
@@ -68,7 +68,7 @@ def test_what_was_not_detected_rules_out_a_mode(free_space):
 
 
 def test_repeats_of_independent_noise_average_but_repeats_of_model_error_do_not(free_space):
-    """25 repeats at each of 30 places: fresh noise narrows the radius about fivefold, equal levels do not."""
+    """25 repeats at each of 30 positions: fresh noise narrows the radius about fivefold, equal levels do not."""
     rng = np.random.default_rng(3)
     places = all_over(30, rng)
     once = one(places, free_space_levels((150, 220), places, rng), free_space)
@@ -90,7 +90,7 @@ def test_one_wrong_link_does_not_outvote_the_others(free_space):
     assert np.hypot(wrong.x_m - clean.x_m, wrong.y_m - clean.y_m) < clean.credible_radius_m
 
 
-def test_never_inside_a_building_unless_told(one_block, published_law):
+def test_never_inside_a_building_unless_allowed(one_block, published_law):
     """The truth is 1 m behind a wall, where the data pull."""
     rng = np.random.default_rng(5)
     receiver_m = np.column_stack([rng.uniform(0, 200, (150, 2)), np.full(150, 60.0)])
@@ -98,9 +98,9 @@ def test_never_inside_a_building_unless_told(one_block, published_law):
         level = free_space_levels((119.0, 100.0), receiver_m, rng) + 9
         kept = one(receiver_m, level, published_law, city=one_block, bounds=(0, 200, 0, 200), seed=seed)
         assert not one_block.inside(np.array([[kept.x_m, kept.y_m, kept.z_m]]))[0]
-    told = LocalizeSettings(scan_step_m=10.0, allow_indoor=True)
+    allowed = LocalizeSettings(scan_step_m=10.0, allow_indoor=True)
     indoors = (82.0, 118.0, 82.0, 118.0)
-    estimate = one(receiver_m, level, published_law, city=one_block, bounds=indoors, settings=told)
+    estimate = one(receiver_m, level, published_law, city=one_block, bounds=indoors, settings=allowed)
     assert one_block.inside(np.array([[estimate.x_m, estimate.y_m, estimate.z_m]]))[0]
     with pytest.raises(BadInput, match="all of it is inside buildings"):
         one(receiver_m, level, published_law, city=one_block, bounds=indoors)
@@ -143,7 +143,7 @@ def test_same_seed_same_estimates_whatever_the_chunks(city, flown, measured, pub
     assert run(1 << 18) == run(1 << 18) == run(1000)
 
 
-def test_a_channel_that_tells_devices_apart(free_space):
+def test_a_channel_that_differs_between_devices(free_space):
     """Device 1 is 15 dB weaker, and the gain depends on the azimuth: no table can hold that."""
 
     class Directional:
@@ -180,7 +180,7 @@ def test_never_detected_is_not_located(free_space):
 
 
 def test_one_link_is_too_little(free_space):
-    """A single level of a channel so vague that it hardly prefers any place."""
+    """A single level of a channel so vague that it hardly prefers any position."""
 
     class Vague:
         def predict(self, links):

@@ -18,7 +18,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope="session")
 def folder():
-    """Where a set lies; skips where it is not."""
+    """Return the folder of a set; skip where it is missing."""
     def of(name: str) -> Path:
         if not (DATA / name).is_dir():
             pytest.skip(f"{DATA / name} is not there: docs/real-data.md says where to get it; name its folder in "
@@ -35,7 +35,7 @@ def duke(folder) -> Measurements:
 
 @pytest.fixture(scope="session")
 def powder(folder) -> Measurements:
-    """400 of the 5,006 places of hand-held transmitters."""
+    """400 of the 5,006 positions of hand-held transmitters."""
     whole = read_measurements(folder("powder_frs") / "measurements.csv.gz")
     devices = whole.devices.sample(400, random_state=0)
     kept = whole.table["device"].isin(devices["device"])

@@ -1,4 +1,4 @@
-"""Receivers that nobody calibrated, on days that are held out: gains, floors and what changed between days."""
+"""Receivers without calibration, on days that are held out: gains, floors and what changed between days."""
 
 import numpy as np
 import pandas as pd
@@ -6,8 +6,8 @@ import pytest
 from scipy.stats import wilcoxon
 
 from radiotwin import close_loop, make_report
-from radiotwin.closeloop.locate import Corrected, locate, whole_area
-from radiotwin.closeloop.search import rmse_db
+from radiotwin.effects.effect_model import EffectModel
+from radiotwin.localize import locate, whole_area
 from studies.closeloop_real import floor_errors_db, permuted
 
 DAYS = ("2022-04-25", "2022-07-05", "2022-07-06", "2022-07-11")  # on the fifth half of the receivers were others
@@ -17,20 +17,20 @@ DEVICES_A_DAY = 60
 
 @pytest.fixture(scope="module")
 def loop(powder):
-    return close_loop(powder, None, "log-distance", 0, lambda text: None, "flight")
+    return close_loop(powder, base="log-distance", hold_out="flight")
 
 
 def day_mean_db(loop, model) -> float:
-    names = loop.records.flight_names
-    return float(np.mean([rmse_db(model, loop.records.flight == names.index(day)) for day in DAYS]))
+    names = loop.links.flight_names
+    return float(np.mean([model.rmse_db(loop.links.flight == names.index(day)) for day in DAYS]))
 
 
 def test_gains_floors_and_the_step_of_one_receiver_are_named(loop):
-    parts = loop.after.whole.parts
-    assert {"receiver_gain_offset", "noise_floor_censoring"} <= {part.effect.name for part in parts}
-    form, when_s = next(drift for part in parts if part.effect.name == "receiver_drift"
-                        for receiver, drift in part.setting["receivers"].items()
-                        if loop.records.receiver_names[int(receiver)] == CHANGED)
+    effects = loop.after.whole.effects
+    assert {"receiver_gain_offset", "noise_floor_censoring"} <= {each.effect.name for each in effects}
+    form, when_s = next(drift for each in effects if each.effect.name == "receiver_drift"
+                        for receiver, drift in each.params.receivers.items()
+                        if loop.links.receiver_names[receiver] == CHANGED)
     assert form == "step"
     assert pd.Timestamp("2022-04-26").timestamp() < when_s < pd.Timestamp("2022-07-06").timestamp()
 
@@ -46,16 +46,16 @@ def test_the_error_on_days_that_are_held_out(loop):
     assert day_mean_db(loop, loop.after) < day_mean_db(loop, loop.before) - 1.4
 
 
-def test_transmitters_of_days_that_are_held_out_are_found_better(loop):
+def test_transmitters_of_days_that_are_held_out_are_located_better(loop):
     """The same transmitters before and after, so that chance in which ones are asked for does not count."""
     def errors_m(model) -> np.ndarray:
         off_m = []
-        for number, (side, fit) in enumerate(zip(model.folds, model.fits[1:])):
-            day, corrected = loop.records.select(model.index == number), Corrected.of(side, fit)
+        for number, (fold, fit) in enumerate(zip(model.folds, model.fits[1:])):
+            day, learnt = loop.links.select(model.index == number), EffectModel.of(fold, fit)
             devices = np.random.default_rng(0).permutation(np.unique(day.device))[:DEVICES_A_DAY]
             asked = day.select(np.isin(day.device, devices))
-            off_m += [np.hypot(*(loop.records.device_m[place.device, :2] - (place.x_m, place.y_m)))
-                      for place in locate(corrected, asked, whole_area(corrected, asked))]
+            off_m += [np.hypot(*(loop.links.device_m[each.device, :2] - (each.x_m, each.y_m)))
+                      for each in locate(learnt, asked, whole_area(learnt, asked))]
         return np.array(off_m)
     before_m, after_m = errors_m(loop.before), errors_m(loop.after)
     assert np.median(after_m) < np.median(before_m)
@@ -63,5 +63,5 @@ def test_transmitters_of_days_that_are_held_out_are_found_better(loop):
 
 
 def test_of_permuted_levels_nothing_is_named(powder):
-    loop = close_loop(permuted(powder, 0), None, "log-distance", 0, lambda text: None, "flight")
-    assert not [part for part in loop.after.whole.parts if part.effect.explains]
+    loop = close_loop(permuted(powder, 0), base="log-distance", hold_out="flight")
+    assert not [each for each in loop.after.whole.effects if each.effect.is_cause]

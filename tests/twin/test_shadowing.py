@@ -7,9 +7,9 @@ import pytest
 from radiotwin.measurements import Measurements
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene.lattice import Lattice
-from radiotwin.twin.shadowing import fit_shadowing, with_shadowing
 from radiotwin.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
+from radiotwin.twin.shadowing import fit_shadowing, with_shadowing
 
 LIMIT_DB = -115.0
 

@@ -1,0 +1,67 @@
+"""`closeloop.json`: what earlier versions wrote is read as what this one writes."""
+
+import copy
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from radiotwin.closeloop.result_file import errors, make_report, upgrade_report, write_report
+from radiotwin.closeloop.run import close_loop
+from radiotwin.errors import BadInput
+
+VERSION_1 = Path(__file__).parent / "version_1" / "closeloop.json"  # of radiotwin 0.1, see tests/twin/version_1
+
+
+@pytest.fixture
+def old():
+    return json.loads(VERSION_1.read_text(encoding="utf-8"))
+
+
+def biases(value):
+    """Return all `bias_db` of a report, in order."""
+    if not isinstance(value, dict):
+        return []
+    return [each for name, part in value.items() for each in ([part] if name == "bias_db" else biases(part))]
+
+
+def test_bias_is_predicted_minus_measured():
+    found = errors(np.array([-80.0, -90.0, np.nan]), np.array([-77.0, -89.0, -100.0]))
+    assert (found["n"], found["bias_db"], found["mae_db"]) == (2, 2.0, 2.0)
+
+
+def test_a_report_of_version_0_1_is_read_with_new_names_and_the_bias_turned(old):
+    assert old["schema"] == "radiotwin.closeloop/1" and len(old["effects"]) == 3
+    before = copy.deepcopy(old)
+    new = upgrade_report(old)
+    assert old == before, "what was given is left as it is"
+    assert new["schema"] == "radiotwin.closeloop/2"
+    assert not {"remarks", "structure_before"} & set(new)
+    assert new["notes"] == old["remarks"] and new["dependences_before"] == old["structure_before"]
+    assert [each["params"] for each in new["effects"] if "params" in each] == \
+        [each["setting"] for each in old["effects"] if "setting" in each]
+    assert not any("setting" in each for each in new["effects"])
+    for part in ("error", "baselines"):
+        turned = biases(new[part])
+        assert turned == [None if each is None else -each for each in biases(old[part])]
+        assert max(abs(each) for each in turned if each is not None) > 0.01
+    for name in ("base", "verdict", "candidates", "heldout", "remaining", "radiotwin_version"):
+        assert new[name] == old[name]
+    assert upgrade_report(new) == new
+
+
+def test_it_has_what_a_new_report_has(old, open_ground, tmp_path):
+    world = open_ground.fly(21)
+    world.gain_db[world.receiver == 1] += 6.0
+    report = make_report(close_loop(open_ground.measured(world).select(world.slot % 4 == 0), base="log-distance"))
+    write_report(report, tmp_path / "closeloop.json")
+    assert upgrade_report(json.loads((tmp_path / "closeloop.json").read_text(encoding="utf-8"))) == report
+    upgraded = upgrade_report(old)
+    assert set(upgraded) == set(report) and set(upgraded["error"]) == set(report["error"])
+    assert set(upgraded["effects"][0]) == set(report["effects"][0])
+
+
+def test_other_schemas_are_refused():
+    with pytest.raises(BadInput, match="schema is 'radiotwin.closeloop/7', this version reads"):
+        upgrade_report({"schema": "radiotwin.closeloop/7"})
