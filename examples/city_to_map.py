@@ -1,8 +1,8 @@
 # %% [markdown]
 # # From a city to a radio map
-# A small synthetic city, its ray-traced truth, and the map as files for other programs. For a city of
-# your own see `radiotwin build-scene`. Tracing needs libLLVM 17 or newer; without it the statistical
-# truth is used.
+# A small synthetic city, its ray-traced truth, and the map as files for other programs. For a city
+# of your own see `radiotwin build-scene`. Tracing needs libLLVM 17 or newer; without it the
+# statistical truth is used.
 
 # %%
 from pathlib import Path

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # Find devices
-# The positions of some devices are known. The others are located from the measurements of two UAVs on
-# three flights.
+# The positions of some devices are known. The others are located from the measurements of two UAVs
+# on three flights.
 
 # %%
 import radiotwin as rt
@@ -13,8 +13,8 @@ measurements = rt.fly_survey(scene, truth, flights=3, pattern="random-waypoint",
                              noise_db=0.0)
 
 # %% [markdown]
-# The twin learns the channel from the links of the anchors and locates the unknown devices with it. It
-# is compared with a log-distance model, which uses no buildings.
+# The twin learns the channel from the links of the anchors and locates the unknown devices with it.
+# It is compared with a log-distance model, which uses no buildings.
 
 # %%
 train, test = rt.split_flights(measurements, held_out=1)

@@ -18,8 +18,8 @@ measurements = rt.fly_survey(scene, truth, flights=2, pattern="random-waypoint",
 twin = rt.fit_twin(measurements, scene, model="segmented_log_distance", seed=0)
 
 # %% [markdown]
-# The mission in the twin, with devices at the positions that the twin estimates, and the same in the
-# truth.
+# The mission in the twin, with devices at the positions that the twin estimates, and the same in
+# the truth.
 
 # %%
 known = Known.of(twin.devices)

@@ -21,9 +21,9 @@ from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
-from radiotwin.twin.shadowing import with_shadowing
 from radiotwin.survey.campaign import declared_devices, heading_deg, link_table
 from radiotwin.twin import Twin, fit_twin
+from radiotwin.twin.shadowing import with_shadowing
 
 TWINS = {"nn": "segmented_nn", "log-distance": "log_distance", "kriging": "regression_kriging",
          "raytrace": "raytrace"}

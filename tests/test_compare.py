@@ -44,7 +44,8 @@ def test_too_few_flights(flown, held_out, message):
 def test_scores_are_what_the_predictions_say(comparison):
     links = comparison.predictions
     for model in ("log_distance", "segmented_log_distance"):
-        for name, mask in (("all", slice(None)), ("LoS", links["los"] == 1), ("NLoS", links["los"] == 0)):
+        for name, mask in (("all", slice(None)), ("LoS", links["los"] == 1),  # noqa: B007 - in the query below
+                           ("NLoS", links["los"] == 0)):
             error_db = (links[model] - links["measured_db"])[mask].dropna()
             row = comparison.scores.query("model == @model and links == @name and positions == 'estimated' "
                                           "and against == 'held-out flights'").iloc[0]

@@ -1,4 +1,4 @@
-"""The examples run as they are, and say what their text says."""
+"""The examples run as they are, and print what their text says."""
 
 import re
 import runpy
@@ -39,6 +39,7 @@ def test_close_the_loop(run):
     assert "verdict: effect" in out and "receiver_gain_offset" in out
     before, after = map(float, re.search(r"([\d.]+) dB before, ([\d.]+) dB after", out).groups())
     assert after < before
+    assert out.splitlines()[-1].startswith("log_distance with ")  # the saved twin
 
 
 def test_plan_with_your_twin(run):

@@ -39,10 +39,10 @@ def close_loop(
 
     They are added to the model, and the error before and after is reported.
     """
-    from radiotwin.closeloop.corrected_twin import corrected_twin
     from radiotwin.closeloop.corrected_scene import check_corrected_target, write_corrected_scene
-    from radiotwin.closeloop.result_file import make_report, write_report
+    from radiotwin.closeloop.corrected_twin import corrected_twin
     from radiotwin.closeloop.residual_table import write_residuals
+    from radiotwin.closeloop.result_file import make_report, write_report
     from radiotwin.closeloop.run import close_loop as run
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements

@@ -1,7 +1,6 @@
 """The declared scene corrected by what the loop found: boxes, removed buildings, moved anchors."""
 
-import shutil
-import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +20,8 @@ from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import SceneConfig, write_config
 from radiotwin.scene.materials import itu_material, traceable
 from radiotwin.scene.names import unique_name
-from radiotwin.scene.ply import read_ply, write_ply
 from radiotwin.scene.preview import draw_preview
+from radiotwin.scene.reader import read_city
 from radiotwin.scene.writer import CityShape, write_city
 
 BOX_MATERIAL = "concrete"  # the likeliest of a building of unknown material
@@ -157,33 +156,18 @@ def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
 
 def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box]) -> None:
     """Write `city.xml` and `meshes/`: kept faces (f,) of the scene's map, materials, and boxes."""
-    root = ElementTree.parse(scene.xml_path).getroot()
-    taken = {element.get("id", "").lower().removeprefix("mesh-").removeprefix("mat-")
-             for element in root}
-    write_city(folder, _box_shapes(scene, boxes, taken))
-    added = ElementTree.parse(folder / "city.xml").getroot()
-    at = 0
-    for shape in root.findall("shape"):
-        name = shape.find("string[@name='filename']")
-        if name is None:
-            continue
-        source = scene.folder / name.get("value", "")
-        vertices_m, polygons = read_ply(source)
-        faces = np.concatenate(polygons)
-        mine = keep[at:at + len(faces)]
-        at += len(faces)
-        if not mine.any():
-            root.remove(shape)
-            continue
-        name.set("value", f"meshes/{source.name}")
-        if mine.all():
-            shutil.copyfile(source, folder / "meshes" / source.name)
-        else:
-            used, left = np.unique(faces[mine], return_inverse=True)
-            write_ply(folder / "meshes" / source.name, vertices_m[used], left.reshape(-1, 3))
-    root.extend(added)
-    ElementTree.indent(root)
-    ElementTree.ElementTree(root).write(folder / "city.xml", encoding="utf-8", xml_declaration=True)
+    shapes, first = [], 0
+    for shape in read_city(scene.xml_path):
+        own = keep[first:first + len(shape.mesh.faces)]
+        first += len(own)
+        if own.all():
+            shapes.append(shape)
+        elif own.any():
+            used, faces = np.unique(shape.mesh.faces[own], return_inverse=True)
+            mesh = trimesh.Trimesh(shape.mesh.vertices[used], faces.reshape(-1, 3), process=False)
+            shapes.append(replace(shape, mesh=mesh))
+    taken = {name.lower() for shape in shapes for name in (shape.name, shape.material.name)}
+    write_city(folder, [*shapes, *_box_shapes(scene, boxes, taken)])
 
 
 def _box_shapes(scene: Scene, boxes: list[Box], taken: set[str]) -> list[CityShape]:

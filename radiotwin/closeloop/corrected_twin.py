@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-
 import radiotwin
 from radiotwin.closeloop.run import Loop
 from radiotwin.effects.effect_model import EffectModel

@@ -10,7 +10,6 @@ from radiotwin.export.tables import write_csv, write_netcdf, write_numpy
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 
-
 EXPORTERS: dict[str, Callable[[RadioMap, Scene, Path], None]] = {
     ".nc": write_netcdf, ".csv": write_csv, ".npz": write_numpy, ".tif": write_geotiff,
     ".kmz": write_kmz}

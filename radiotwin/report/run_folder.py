@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pandas as pd
 
-from radiotwin.compare import Comparison
 from radiotwin.closeloop.result_file import SCHEMA, SCHEMA_1, upgrade_report
+from radiotwin.compare import Comparison
 from radiotwin.errors import BadInput
 from radiotwin.measurements import read_measurements
 from radiotwin.radiomap import RadioMap

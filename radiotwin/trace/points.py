@@ -7,10 +7,10 @@ import pandas as pd
 from scipy.constants import speed_of_light
 
 from radiotwin.antennas import Antenna
+from radiotwin.cells import read_cells
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path, require_writable
 from radiotwin.geodesy import to_local
-from radiotwin.cells import read_cells
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
 from radiotwin.tables import Origin

@@ -97,7 +97,7 @@ def test_a_learner_may_train_in_a_twin_that_follows_paths(small_scene, tmp_path)
                            "--algorithm qmix --out result", tmp_path)
     assert status == 0, err
     twin = json.loads((tmp_path / "result" / "twin" / "twin.json").read_text())
-    assert twin["effects"]["base"] == "raytrace" and len(twin["provenance"]["flights"]) == 1
+    assert twin["channel"]["model"] == "image_paths" and len(twin["provenance"]["flights"]) == 1
     assert all(0 < float(row["truth_ratio"]) <= 1 for row in metrics(tmp_path / "result" / "metrics.csv"))
 
 

@@ -9,10 +9,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.channel.log_distance import LogDistance
 from radiotwin.closeloop.corrected_twin import corrected_twin
 from radiotwin.closeloop.run import close_loop
 from radiotwin.effects.effect_model import EffectModel
+from radiotwin.errors import BadInput
 from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.measurements import Measurements
 from radiotwin.twin import Twin, TwinDevice
@@ -89,3 +91,11 @@ def test_bad_input_is_one_message(tmp_path, open_ground, role, twin, message):
                    "-o", tmp_path / "located.csv")
     assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
     assert not (tmp_path / "located.csv").exists()
+
+
+def test_only_twins_of_close_loop_whose_channel_is_a_law_locate():
+    law, paths = (Twin(channel, [], "gain_db", None) for channel in (LogDistance(), ImagePaths()))
+    with pytest.raises(BadInput, match="not made by `radiotwin close-loop`"):
+        module.check_can_locate(law, None)
+    with pytest.raises(BadInput, match="close-loop --base twin makes one"):
+        module.check_can_locate(paths, None)
