@@ -32,6 +32,7 @@ def main(
             for each in MODULES:
                 study = load_study(each)
                 say(f"{each:11} {study.question} ({len(study.cases(0))} rows, {study.seeds} seeds)")
+            say("guard       Does a change keep results? (python studies/guard.py --help)")
             return
         if not report:
             if name is None:
