@@ -25,6 +25,7 @@ def main(
 ) -> None:
     """Run a study: each row is kept as soon as it is finished."""
     from studies.runner import MODULES, load_study, missing_rows, read_rows, run_rows
+    from studies.tables import scene_folder
 
     show_warnings_plainly()
     try:
@@ -32,6 +33,7 @@ def main(
             for each in MODULES:
                 study = load_study(each)
                 say(f"{each:11} {study.question} ({len(study.cases(0))} rows, {study.seeds} seeds)")
+            say("guard       Does a change keep results? (python studies/guard.py --help)")
             return
         if not report:
             if name is None:
@@ -41,6 +43,11 @@ def main(
             if kept and not resume:
                 raise BadInput(f"{out / name}.json holds {kept} finished rows; --resume keeps "
                                "them, --out names another folder, --report runs nothing")
+            scenes = {settings["scene"] for _, _, settings in todo if "scene" in settings}
+            absent = sorted(each for each in scenes if not scene_folder(each).is_dir())
+            if absent:
+                raise BadInput(f"no scene {', '.join(absent)}: docs/results.md says where they are "
+                               "from; --only chooses rows without them")
             for row in run_rows(name, todo, out, jobs):
                 say(f"{name} {row['name']} seed {row['seed']}: {row['cpu_s']:.0f} CPU s")
         for each in [name] if name else MODULES:

@@ -15,7 +15,6 @@ from marl.mission import Known, make_mission
 from marl.settings import LEARNERS, PRESETS, RUNS, LearnerSettings, RunSettings
 from marl.threads import torch_device
 from radiotwin import Scene, segmented_truth
-from radiotwin.cli.world import read_truth
 from radiotwin.progress import progress
 from studies import tables
 from studies.runner import Study
@@ -48,8 +47,7 @@ def learn(seed: int, settings: dict) -> dict:
     run, learner = (model.model_validate({name: value for name, value in (settings | own).items()
                                           if name in model.model_fields})
                     for model in (RunSettings, LearnerSettings))
-    scene = Scene.load(run.scene)
-    truth = read_truth(scene, run.truth)
+    scene, truth = tables.load_world(settings)
     scene.check_map(truth)
     episodes = run.real_episodes * run.episodes
     with progress(f"{run.algorithm}, seed {seed}", total=episodes) as advance:

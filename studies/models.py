@@ -2,10 +2,9 @@
 
 import pandas as pd
 
-from radiotwin import Scene, compare_models, fly_survey, split_flights
-from radiotwin.cli.world import read_truth
+from radiotwin import compare_models, fly_survey, split_flights
 from studies.runner import Study
-from studies.tables import markdown, scene_folder
+from studies.tables import load_world, markdown
 
 HELD_OUT, CLASSES = "held-out flights", ("all", "LoS", "NLoS")
 
@@ -29,8 +28,8 @@ def score_models(seed: int, settings: dict) -> dict:
     Returns:
         `scores` and `locations` of `compare_models` as columns.
     """
-    scene = Scene.load(scene_folder(settings["scene"]))
-    truth, count = read_truth(scene, settings["truth"]), settings["flights"]
+    scene, truth = load_world(settings)
+    count = settings["flights"]
     flown = fly_survey(scene, truth, flights=2 * count, pattern=settings["pattern"], seed=seed,
                        noise_db=settings["noise_db"])
     comparison = compare_models(*split_flights(flown, count), scene, truth, seed=seed)

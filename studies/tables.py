@@ -11,6 +11,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from marl.figures import COLOURS, MARKERS
+from radiotwin import RadioMap, Scene
+from radiotwin.cli.world import read_truth
 
 RATIO = "share of all data collected in the truth"
 
@@ -18,6 +20,12 @@ RATIO = "share of all data collected in the truth"
 def scene_folder(name: str) -> Path:
     """Return the folder of a scene: a name is of `scenes/`, all else is a path."""
     return Path("scenes") / name if name == Path(name).name else Path(name)
+
+
+def load_world(settings: dict) -> tuple[Scene, RadioMap]:
+    """Return the scene `scene` of a row's settings, and its radio map `truth`."""
+    scene = Scene.load(scene_folder(settings["scene"]))
+    return scene, read_truth(scene, settings["truth"])
 
 
 def read_frame(rows: list[dict]) -> pd.DataFrame:

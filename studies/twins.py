@@ -27,7 +27,6 @@ from radiotwin import (
     fly_survey,
     score_map,
 )
-from radiotwin.cli.world import read_truth
 from radiotwin.progress import progress
 from studies import tables
 from studies.runner import Study
@@ -64,7 +63,7 @@ def judge_twin(seed: int, settings: dict) -> dict:
     Returns:
         `curve`: columns, a value for each number of flights: errors of map [dB] and positions [m].
     """
-    scene, truth = _world(settings)
+    scene, truth = tables.load_world(settings)
     rows = []
     with progress(settings["model"], total=len(settings["survey_flights"])) as advance:
         for flights in settings["survey_flights"]:
@@ -98,7 +97,7 @@ def train_in(seed: int, settings: dict) -> dict:
         Shares that policy and plan collect in the map that they were made in and in the truth;
         `curve`: checks of the policy during training; `fidelity` (see there); errors of the twin.
     """
-    scene, truth = _world(settings)
+    scene, truth = tables.load_world(settings)
     name = settings["twin"]
     measured = _survey(scene, truth, settings["survey_flights"], settings["noise_db"], seed)
     twin = None if name == "truth" else _learnt(name, seed, scene, measured)
@@ -193,11 +192,6 @@ def fidelity(real: Mission, twin: Mission, flights: int, seed: int) -> dict[str,
         found[f"{prefix}bias"] = float((other - one).mean())
         found[f"{prefix}rmse"] = float(np.sqrt(np.mean((other - one) ** 2)))
     return found
-
-
-def _world(settings: dict) -> tuple[Scene, RadioMap]:
-    scene = Scene.load(tables.scene_folder(settings["scene"]))
-    return scene, read_truth(scene, settings["truth"])
 
 
 def _survey(scene: Scene, truth: RadioMap, flights: int, noise_db: float,

@@ -132,6 +132,7 @@ def test_rows_of_other_settings_and_damaged_files_are_refused(run, tmp_path):
 @pytest.mark.parametrize("words, parts", [
     (["magic"], ["'magic'", "curve, federation"]),
     ([], ["--list"]),
+    (["curve", "--only", "segmented-greedy", "--out", "new"], ["no scene runs/paper_rbm, runs/paper_rdm", "--only"]),
     (["curve", "--only", "magic"], ["--only magic", "rbm-traced-fedqmix-nn"]),
     (["quality", "--report", "--out", "nothing"], ["nothing/quality.json holds no finished row"]),
     (["curve", "--seeds", "0"], ["--seeds"])])

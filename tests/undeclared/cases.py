@@ -21,7 +21,16 @@ from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 from tests.undeclared import clocks, tables
 from tests.undeclared.cities import declared_scene
-from tests.undeclared.families import FAMILIES, GROUP, OUTSIDE, SEEDS, is_traced, rng_of, untraced, world_of
+from tests.undeclared.families import (
+    FAMILIES,
+    GROUP,
+    OUTSIDE,
+    SEEDS,
+    is_traced,
+    rng_of,
+    untraced,
+    world_of,
+)
 from tests.undeclared.worlds import World
 
 __all__ = ["FAMILIES", "OUTSIDE", "SEEDS", "Case", "case", "stored"]
