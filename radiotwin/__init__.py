@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from radiotwin.closeloop.corrected_twin import corrected_twin
+    from radiotwin.closeloop.criteria import SelectionCriteria
     from radiotwin.closeloop.result_file import make_report
     from radiotwin.closeloop.run import Loop, close_loop
     from radiotwin.compare import Comparison, compare_models, score_map, split_flights
@@ -31,6 +32,7 @@ except PackageNotFoundError:  # run from a source tree that was never installed
 
 _MODULES = {
     "closeloop.corrected_twin": ["corrected_twin"],
+    "closeloop.criteria": ["SelectionCriteria"],
     "closeloop.result_file": ["make_report"],
     "closeloop.run": ["Loop", "close_loop"],
     "compare": ["Comparison", "compare_models", "score_map", "split_flights"],
@@ -49,10 +51,10 @@ _MODULE_OF = {name: module for module, names in _MODULES.items() for name in nam
 
 __all__ = [  # noqa: F822 - names that __getattr__ finds
     "BadInput", "BuildOptions", "Comparison", "Loop", "Measurements", "RadioMap", "RunFailed",
-    "Scene", "SolverSettings", "Twin", "__version__", "build_preset", "build_scene", "close_loop",
-    "compare_models", "corrected_twin", "fit_twin", "fly_survey", "make_report",
-    "read_measurements", "read_run", "score_map", "segmented_truth", "split_flights", "trace_map",
-    "write_report"]
+    "Scene", "SelectionCriteria", "SolverSettings", "Twin", "__version__", "build_preset",
+    "build_scene", "close_loop", "compare_models", "corrected_twin", "fit_twin", "fly_survey",
+    "make_report", "read_measurements", "read_run", "score_map", "segmented_truth", "split_flights",
+    "trace_map", "write_report"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""What the commands of both packages share: `--quiet`, `--json`, and the exit statuses."""
+"""Options and exit statuses that the commands of both packages share."""
 
 import functools
 import inspect

@@ -1,4 +1,4 @@
-"""What the residual depends on: one permutation test for each variable."""
+"""Dependences of the residual: one permutation test for each variable."""
 
 from dataclasses import dataclass
 

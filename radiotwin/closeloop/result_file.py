@@ -1,4 +1,4 @@
-"""What the loop found as `closeloop.json`: everything that the page and the terminal show."""
+"""The result of the loop as `closeloop.json`: all that the page and the terminal show."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ from radiotwin.scene import Scene
 
 @dataclass(eq=False)
 class Loop:
-    """What the loop found.
+    """Result of a close-loop.
 
     Attributes:
         base: name of the base.

@@ -59,7 +59,7 @@ class Candidate:
 
 @dataclass(eq=False)
 class SelectionResult:
-    """What was found, and how.
+    """Result of the forward selection.
 
     Attributes:
         model: base and kept effects.

@@ -1,4 +1,4 @@
-"""What an effect is: something physical that changes levels, proposed from residuals and fitted.
+"""Base classes of effects: causes that change levels, proposed from residuals and fitted.
 
 An effect belongs to one stage. In this order a level passes through them:
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """What an effect adds to the mean level of n links, for given parameters.
+    """Contribution of an effect to the mean level of n links, for given parameters.
 
     Attributes:
         offset_db: (n,) added as it is [dB].

@@ -21,7 +21,7 @@ MAX_Z = 4.0  # an outlier counts as this many scales
 
 @dataclass(frozen=True, eq=False)
 class EffectModel:
-    """What was learnt from training links, ready for links that were not among them.
+    """A fitted channel with effects, ready for links that were not among the training links.
 
     Attributes:
         channel: fitted.

@@ -11,7 +11,7 @@ QUANTILE_90 = 1.645  # standard deviations to each side of a normal distribution
 
 
 class EffectParams(BaseModel):
-    """What an effect is fitted by, beside the coefficients of its term.
+    """Nonlinear parameters of an effect, beside the coefficients of its term.
 
     Subclass it in each effect, as `Params`, with one field a parameter (see `quantity`). Values are
     checked when they are made and when a twin's file is read.

@@ -1,4 +1,4 @@
-"""What an effect sees of the links that it is learnt from."""
+"""Training links and their residual, as effects see them."""
 
 from dataclasses import dataclass
 from functools import cached_property

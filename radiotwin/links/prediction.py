@@ -1,4 +1,4 @@
-"""What a model expects of links."""
+"""Predicted levels of links."""
 
 from dataclasses import dataclass
 

@@ -47,7 +47,7 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
         scene: the 3D map and the radio, if there is one.
         to_locate: whether devices are to be located and nothing is to be learnt. Then unknown
             devices are kept where there is no scene, and so are few links, and receivers that heard
-            nothing: that tells a position, too.
+            nothing: that constrains a position, too.
 
     Returns:
         the links that can be used; their `notes` say what was found odd, a sentence each.

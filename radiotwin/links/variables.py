@@ -1,4 +1,4 @@
-"""What a residual may depend on."""
+"""Variables that a residual may depend on."""
 
 import numpy as np
 

@@ -51,7 +51,7 @@ class _EffectRecord(_Strict):
 
 
 class _FittedRecord(_Strict):
-    """What was fitted upon the channel."""
+    """Levels, effects and errors fitted upon the channel."""
 
     level_coefficients: Annotated[list[float], Field(min_length=2, max_length=4)]
     scale_db: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=1, max_length=2)]
@@ -65,7 +65,7 @@ class _FittedRecord(_Strict):
 
 
 class _TwinRecord(BaseModel):
-    """What is read of `twin.json`."""
+    """Content of `twin.json`."""
 
     model_config = ConfigDict(strict=True, allow_inf_nan=False)
 

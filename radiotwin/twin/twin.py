@@ -67,7 +67,7 @@ class Twin:
 
     @property
     def residual_field(self) -> ResidualField | None:
-        """What the twin interpolates of its residual; None where it does not."""
+        """Interpolation of the residual; None where the twin has none."""
         if isinstance(self.channel, RegressionKriging):
             return self.channel.field
         if self.fitted is not None and self.fitted.shadowing is not None:
