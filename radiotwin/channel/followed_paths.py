@@ -90,7 +90,8 @@ class _Followed(NamedTuple):
     arrivals: np.ndarray
 
 
-_remembered: OrderedDict[tuple[CityMap, tuple[float, float, float], float], _Followed] = OrderedDict()
+_remembered: OrderedDict[
+    tuple[CityMap, tuple[float, float, float], float], _Followed] = OrderedDict()
 
 
 def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, np.ndarray]]:

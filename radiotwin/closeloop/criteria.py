@@ -12,20 +12,20 @@ class SelectionCriteria:
     """Thresholds of selection and verdict; saved in `closeloop.json`.
 
     "Calibrated" means: chosen on the hidden and the null cases of `tests/undeclared`
-    (`python -m studies closeloop_undeclared`, `closeloop_null`), before others judged it.
+    (`python -m studies hidden`, `null`), before others judged it.
 
     Attributes:
-        min_training_gain_nats: on the links that it is fitted to, for a candidate to be fitted to the
-            folds. Saves time: one that gains less cannot gain `min_gain_nats` on held-out links.
+        min_training_gain_nats: on the links that it is fitted to, for a candidate to be fitted to
+            the folds. Saves time: one that gains less cannot gain `min_gain_nats` on held-out links.
         min_gain_nats: on held-out links. Calibrated.
-        min_gain_per_link_nats: on held-out links, unless the RMSE falls by `max_rmse_ratio`; 0.02 is
-            what an RMSE lower by 2 % gains.
+        min_gain_per_link_nats: on held-out links, unless the RMSE falls by `max_rmse_ratio`; 0.02
+            is what an RMSE lower by 2 % gains.
         max_rmse_ratio: held-out RMSE with the effect over that without.
         min_gaining_folds: share of the folds that must gain.
         max_p_value: of the cross-fit test (Wasserman et al. 2020), corrected for the number of
             candidates (Bonferroni).
-        max_sign_flip_p_value: of the sign-flip test over pieces of evidence, so that a gain does not
-            hang on a few positions.
+        max_sign_flip_p_value: of the sign-flip test over pieces of evidence, so that a gain does
+            not hang on a few positions.
         max_los_p_value: of the cross-fit test on links with line of sight, where the channel is
             surest, for effects that act there.
         indistinguishable_nats: log(100): how much likelier the data must be with one effect than

@@ -47,7 +47,7 @@ class CrossValidatedModel:
 
     @property
     def links(self) -> LinkData:
-        """n links, with the devices where the base has them."""
+        """The n links, with the devices where the base has them."""
         return self.whole.links
 
     def extended(self, models: list[FoldModel], fits: list[FitResult]) -> CrossValidatedModel:

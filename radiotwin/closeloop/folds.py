@@ -40,8 +40,8 @@ def make_folds(links: LinkData, seed: int, by: str = "auto") -> Folds:
     Args:
         links: n links.
         seed: of which go together.
-        by: one of `WAYS`; or `auto`: by flight where most links are of devices and receivers that are
-            in at least `MIN_FLIGHTS`, else by blocks on the ground.
+        by: one of `WAYS`; or `auto`: by flight where most links are of devices and receivers that
+            are in at least `MIN_FLIGHTS`, else by blocks on the ground.
 
     Raises:
         BadInput: an unknown way, or one that these data do not allow.
@@ -73,8 +73,8 @@ def make_folds(links: LinkData, seed: int, by: str = "auto") -> Folds:
 def _require_several(index: np.ndarray, by: str) -> np.ndarray:
     if len(np.unique(index)) < 2:
         declared = " declared" * (by == "device")
-        raise BadInput(f"links cannot be held out by {by}: there are fewer than two{declared}; hold "
-                       "them out by block, or leave the choice to auto")
+        raise BadInput(f"links cannot be held out by {by}: there are fewer than two{declared}; "
+                       "hold them out by block, or leave the choice to auto")
     return index
 
 

@@ -32,7 +32,9 @@ def residual_dependences(links: LinkData, residual_db: np.ndarray, scale_db: np.
 
     Args:
         links: n links.
-        residual_db, scale_db, mean_db: (n,) of held-out links [dB]; NaN where there is none.
+        residual_db: (n,) of held-out links [dB]; NaN where there is none.
+        scale_db: (n,) error scale of their prediction [dB].
+        mean_db: (n,) their prediction [dB].
         seed: of the permutations.
 
     Returns:

@@ -121,8 +121,8 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     if base not in (*BASES, "auto"):
         raise BadInput(f"base {base!r} is unknown; allowed are auto, {', '.join(BASES)}")
     if scene is None and base == "raytrace":
-        raise BadInput("base 'raytrace' follows paths over a 3D map; give --scene, or take the base "
-                       "log-distance")
+        raise BadInput("base 'raytrace' follows paths over a 3D map; give --scene, or take the "
+                       "base log-distance")
     criteria = criteria or SelectionCriteria()
     links = prepare_links(measurements, scene)
     folds = make_folds(links, seed, hold_out)
@@ -166,7 +166,10 @@ def _dependences(model: CrossValidatedModel, seed: int) -> list[ResidualDependen
 
 
 def _baselines(model: CrossValidatedModel, criteria: SelectionCriteria) -> dict[str, np.ndarray]:
-    """Return the held-out prediction (n,) of other models [dB], with devices where the base has them."""
+    """Return the held-out prediction (n,) of other models [dB].
+
+    The devices are where the base has them.
+    """
     kinds: list[type[ChannelModel]] = [LogDistance]
     if len(model.links) <= criteria.max_links_for_kriging:
         kinds.append(RegressionKriging)

@@ -1,4 +1,7 @@
-"""Forward selection: candidates are fitted on training folds, scored on held-out ones, kept one by one."""
+"""Forward selection of effects.
+
+Candidates are fitted on training folds, scored on held-out ones, and kept one by one.
+"""
 
 from __future__ import annotations
 
@@ -155,8 +158,8 @@ def _score_all(result: SelectionResult, available: list[Effect], block: np.ndarr
             score, extended = score_candidate(result.model, candidate, block, tried, step, seed,
                                               result.criteria)
         else:
-            why = (f"{better.score.name} gains more on held-out links than this on those that it is "
-                   f"fitted to ({candidate.gain:.0f} nats)")
+            why = (f"{better.score.name} gains more on held-out links than this on those that it "
+                   f"is fitted to ({candidate.gain:.0f} nats)")
             score, extended = CandidateScore(effect.name, reason=why, step=step), None
         result.scores.append(score)
         if extended is not None:
@@ -196,8 +199,8 @@ def _beyond(passed: _Passed, candidate: Candidate, model: CrossValidatedModel,
             criteria: SelectionCriteria) -> bool:
     """Return whether an effect that passed gains so much that another need not be scored.
 
-    On held-out links the other can hardly gain more than on those that it is fitted to. One of a kind
-    of which there may be several gets its chance.
+    On held-out links the other can hardly gain more than on those that it is fitted to. One of a
+    kind of which there may be several gets its chance.
     """
     lead = passed.score.nll_gain - candidate.gain
     design_effect = model.whole.view(model.fits[0]).design_effect
@@ -220,7 +223,8 @@ def _on_one_mast(model: CrossValidatedModel) -> int:
 
 
 def _several(rival: _Passed, block: np.ndarray, seed: int, min_gain: float, most: int,
-             criteria: SelectionCriteria) -> list[tuple[CandidateScore, CrossValidatedModel]] | None:
+             criteria: SelectionCriteria,
+             ) -> list[tuple[CandidateScore, CrossValidatedModel]] | None:
     """Add an effect of which a step finds one again and again, until it gains more than `min_gain`.
 
     Such as groves or towers, each seen from few devices, against an offset for each device; or
@@ -244,12 +248,13 @@ def _several(rival: _Passed, block: np.ndarray, seed: int, min_gain: float, most
 
 def _exactly(model: CrossValidatedModel) -> CrossValidatedModel:
     """Ask each model's channel for exact levels, where these explain its training links better."""
-    exact = [with_exact_levels(each, fit) for each, fit in zip(model.models, model.fits, strict=True)]
+    exact = [with_exact_levels(each, fit)
+             for each, fit in zip(model.models, model.fits, strict=True)]
     return model.extended([each for each, _ in exact], [fit for _, fit in exact])
 
 
 def add_shadowing(result: SelectionResult, seed: int) -> None:
-    """Interpolate the rest over the ground, and keep that where it predicts held-out links better."""
+    """Interpolate the rest over the ground; keep that if it predicts held-out links better."""
     model = result.model
     step = len(model.whole.effects)
     fields = [CorrelatedShadowing.fit(each, fit, seed)
@@ -269,7 +274,7 @@ def add_shadowing(result: SelectionResult, seed: int) -> None:
 
 def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
                   criteria: SelectionCriteria) -> Candidate | CandidateScore:
-    """Fit a candidate to all links; return a score with the reason where that refuses it already."""
+    """Fit a candidate to all links; return a score with the reason if that refuses it already."""
     refused = CandidateScore(effect.name, step=step)
     whole = add_effect(model.whole, effect, model.fits[0])
     if whole is None:
@@ -280,8 +285,8 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
         return replace(refused, reason=why)
     gain = model.fits[0].objective - whole[1].objective
     if gain < criteria.min_training_gain_nats:
-        return replace(refused, reason=f"gains less than {criteria.min_training_gain_nats:.0f} nats "
-                       "even on the links that it is fitted to")
+        return replace(refused, reason=f"gains less than {criteria.min_training_gain_nats:.0f} "
+                       "nats even on the links that it is fitted to")
     return Candidate(effect, *whole, gain)
 
 
@@ -342,7 +347,8 @@ def _score(model: CrossValidatedModel, extended: CrossValidatedModel, score: Can
         los_p = cross_fit_p_value(by_fold(usable & los))
     reason = ""
     if total < criteria.min_gain_nats:
-        reason = f"gains {total:.0f} nats on held-out links, {criteria.min_gain_nats:.0f} are needed"
+        reason = (f"gains {total:.0f} nats on held-out links, {criteria.min_gain_nats:.0f} are "
+                  "needed")
     elif p_value > criteria.max_p_value:
         reason = f"its gain may be chance (p = {p_value:.2g} after correction)"
     elif few_p > criteria.max_sign_flip_p_value:

@@ -50,7 +50,8 @@ class CensoredRegression:
         paths: response between law and gains; None = none.
         gain_db: (n,) gains that are given [dB].
         gain_columns: (n, p1) design of the gains that are fitted, see `design`.
-        prior_sd_db: (p0 + p1,) prior standard deviation of each coefficient around zero; inf = free.
+        prior_sd_db: (p0 + p1,) prior standard deviation of each coefficient around zero;
+            inf = free.
         group: (n,) index of the error scale.
         receiver: response to the level that arrives; None = none.
         dof: degrees of freedom of the errors.
@@ -132,9 +133,9 @@ class CensoredRegression:
     def residual_db(self, result: "FitResult") -> np.ndarray:
         """Return measured minus predicted levels (n,) [dB].
 
-        Of a blank: the least change of the mean after which it is as likely detected as not, 0 where
-        it already is less likely, times the probability that it is blank for its level and did not
-        drop out.
+        Of a blank: the least change of the mean after which it is as likely detected as not, 0
+        where it already is less likely, times the probability that it is blank for its level and
+        did not drop out.
         """
         predicted = self.predict(result)
         mean, blank = predicted.mean_db, np.isnan(self.level_db)

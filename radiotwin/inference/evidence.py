@@ -9,8 +9,8 @@ FLIPS = 4_000  # sign flips drawn: a p-value of 0.1 is known to 0.005
 def cross_fit_p_value(gains: np.ndarray) -> float:
     """Return a bound on the probability of such held-out gains if the effect is not there.
 
-    A likelihood ratio whose parameters were fitted elsewhere is at most 1 on average then, and so is
-    its mean over the folds; by Markov's inequality (Wasserman, Ramdas and Balakrishnan 2020,
+    A likelihood ratio whose parameters were fitted elsewhere is at most 1 on average then, and so
+    is its mean over the folds; by Markov's inequality (Wasserman, Ramdas and Balakrishnan 2020,
     'Universal inference', PNAS 117(29), the cross-fit test).
 
     Args:

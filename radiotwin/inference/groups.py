@@ -16,7 +16,7 @@ def deal_groups(group: np.ndarray, max_folds: int, rng: np.random.Generator) -> 
         (n,) fold.
     """
     groups, index = np.unique(group, return_inverse=True)
-    # `GroupKFold` deals the largest groups first, and takes equal ones in the order of their labels.
+    # `GroupKFold` deals the largest groups first, and equal ones in the order of their labels.
     label = rng.permutation(len(groups))[index.ravel()]
     fold = np.empty(len(label), dtype=int)
     splitter = GroupKFold(min(max_folds, len(groups)))

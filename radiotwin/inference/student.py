@@ -26,7 +26,8 @@ def censored_nll(level_db: np.ndarray, limit_db: np.ndarray, mean_db: np.ndarray
     Args:
         level_db: (n,) measured; NaN = not detected.
         limit_db: (n,) below which nothing is detected; -inf where a blank says nothing.
-        mean_db, scale_db: (n,) of the prediction [dB].
+        mean_db: (n,) of the prediction [dB].
+        scale_db: (n,) of its error [dB].
         dof: degrees of freedom of the errors.
         dropout_probability: (n,), or one for all, of a blank whatever the level.
 
@@ -53,7 +54,12 @@ def derivatives(level_db: np.ndarray, limit_db: np.ndarray, mean_db: np.ndarray,
     """Return derivatives of the log-likelihood.
 
     Args:
-        level_db, limit_db, mean_db, scale_db, dof, dropout_probability: as of `censored_nll`.
+        level_db: (n,) measured; NaN = not detected.
+        limit_db: (n,) below which nothing is detected; -inf where a blank says nothing.
+        mean_db: (n,) of the prediction [dB].
+        scale_db: (n,) of its error [dB].
+        dof: degrees of freedom of the errors.
+        dropout_probability: (n,), or one for all, of a blank whatever the level.
 
     Returns:
         (n,) slope in the mean, (n,) curvature in it, (n,) slope in the logarithm of the scale.
@@ -85,7 +91,8 @@ def mean_if_detected(mean_db: np.ndarray, scale_db: np.ndarray, limit_db: np.nda
     a = (limit - mean) / scale is f(a) / F(-a) * (dof + a²) / (dof - 1).
 
     Args:
-        mean_db, scale_db: (n,) of all links of the kind [dB].
+        mean_db: (n,) of all links of the kind [dB].
+        scale_db: (n,) of their errors [dB].
         limit_db: (n,) -inf where no limit is known.
         dof: degrees of freedom, above 1.
     """

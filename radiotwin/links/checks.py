@@ -23,9 +23,9 @@ def refuse_empty_levels(level_db: np.ndarray, column: str) -> None:
         BadInput: nothing was detected, or all levels are equal.
     """
     if not np.isfinite(level_db).any():
-        raise BadInput(f"nothing was detected: {column} is empty in all {len(level_db):,} rows, and "
-                       f"at least {MIN_LINKS // 2} links need a level. Check that column, and that "
-                       "devices were in range")
+        raise BadInput(f"nothing was detected: {column} is empty in all {len(level_db):,} rows, "
+                       f"and at least {MIN_LINKS // 2} links need a level. Check that column, and "
+                       "that devices were in range")
     if len(level_db) > MIN_LINKS_OF_RECEIVER and np.nanmin(level_db) == np.nanmax(level_db):
         raise BadInput(f"all levels are {np.nanmin(level_db):g}, so there is nothing to explain; "
                        f"check the column {column}")
@@ -40,8 +40,8 @@ def check_names(measurements: Measurements) -> list[str]:
         names = pd.Series(names, dtype=str)
         alike = names[names.str.casefold().duplicated(keep=False)]
         if len(alike):
-            notes.append(f"{what} {_shortened(alike)} differ in upper and lower case only; they are "
-                         "taken for different ones")
+            notes.append(f"{what} {_shortened(alike)} differ in upper and lower case only; they "
+                         "are taken for different ones")
     used = np.isin(np.arange(len(measurements.devices)), measurements.device_index)
     idle = measurements.devices["device"][~used]
     if len(idle):
@@ -59,8 +59,8 @@ def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
         scene: the 3D map, if there is one.
 
     Raises:
-        BadInput: all receivers and devices are within millimetres, or most receivers are outside the
-            map.
+        BadInput: all receivers and devices are within millimetres, or most receivers are outside
+            the map.
     """
     both = "receivers and devices"
     notes = {}
@@ -70,8 +70,8 @@ def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
         different = np.unique(position_m[known, :2], axis=0)
         if len(different) >= MIN_POSITIONS and np.ptp(different, axis=0).max() < CLOSE_M:
             notes[what] = (f"all {len(different):,} positions of {what} lie within "
-                           f"{np.ptp(different, axis=0).max():.2g} m: positions are to be in metres; "
-                           "degrees are not converted")
+                           f"{np.ptp(different, axis=0).max():.2g} m: positions are to be in "
+                           "metres; degrees are not converted")
     if both in notes:
         raise BadInput(notes[both])
     return [*notes.values(), *(_off_the_map(receiver_m, scene) if scene is not None else [])]
@@ -87,8 +87,9 @@ def _off_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
     if outside.mean() > MAX_OUTSIDE:
         raise BadInput(
             f"{outside.sum():,} of {len(outside):,} links have their receiver outside the 3D map, "
-            f"which goes from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) m: give "
-            "measurements and scene in one frame, in metres; feet and degrees are not converted")
+            f"which goes from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) m: "
+            "give measurements and scene in one frame, in metres; feet and degrees are not "
+            "converted")
     return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}: do measurements and "
             "scene share one frame and unit?"
             for odd, where in ((inside, "inside a building"), (outside, "outside the 3D map"))
@@ -129,11 +130,13 @@ def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
                     keep: np.ndarray) -> tuple[np.ndarray, str]:
     """Return links of devices that nobody detected although many tried, and a note on them.
 
-    A device that is off would pass for one with a huge loss. One with few links may be a position of
-    a device that moves, and then its blanks are as good as any.
+    A device that is off would pass for one with a huge loss. One with few links may be a position
+    of a device that moves, and then its blanks are as good as any.
 
     Args:
-        table, level_db, keep: as of `useless_receivers`.
+        table: n measurements.
+        level_db: (n,) [dB]; NaN = not detected.
+        keep: (n,) bool, links that count.
 
     Returns:
         mask (n,), and its reason.
@@ -142,7 +145,8 @@ def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
     links, heard = (np.bincount(end[rows], minlength=len(names))
                     for rows in (keep, keep & np.isfinite(level_db)))
     dead = (links >= MIN_LINKS) & (heard == 0)
-    return dead[end], f"device {_shortened(names[dead])} was never detected; is it on, and in range?"
+    return dead[end], (f"device {_shortened(names[dead])} was never detected; "
+                       "is it on, and in range?")
 
 
 def find_fill_value(level_db: np.ndarray) -> tuple[float | None, float]:

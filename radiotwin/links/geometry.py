@@ -1,4 +1,4 @@
-"""Geometry of links: the two ends, line of sight and, where there is one, the 3D map between them."""
+"""Geometry of links: the two ends, line of sight, and the 3D map between them if there is one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Measured links as numbers: what was read, where both ends were, and all that a residual may depend on."""
+"""Measured links as numbers.
+
+What was read, where both ends were, and all that a residual may depend on.
+"""
 
 from __future__ import annotations
 
@@ -45,8 +48,8 @@ class LinkData:
         quality: (n,) as the receiver reports it; None if it does not.
         known_los: (n,) bool, line of sight where it is known already; None: from the map.
         time_in_flight_s: (n,) since the first measurement of the track [s].
-        first_s, last_s: time of the first and the last measurement [s]; NaN without times. They, and
-            `tracks`, stay those of all the data when links are selected.
+        first_s, last_s: time of the first and the last measurement [s]; NaN without times. They,
+            and `tracks`, stay those of all the data when links are selected.
         tracks: where each receiver was in each flight; only links with a time count.
     """
 
@@ -100,7 +103,11 @@ class LinkData:
             device: (n,) index of each link's device.
             receiver_m: (n, 3) positions of the receivers [m].
             device_names: k names.
-            limit_db, frequency_hz, city, is_gain, anchors: as the attributes.
+            limit_db: level below which receivers do not detect [dB]; None where it is unknown.
+            frequency_hz: of the radio [Hz]; NaN where unknown.
+            city: 3D map; None without a scene.
+            is_gain: whether the level is a gain rather than a power.
+            anchors: indices of the devices whose positions are declared.
         """
         n = len(receiver_m)
         unset, unknown = np.full(n, -1), np.full(n, np.nan)

@@ -62,9 +62,10 @@ class Relocation:
 
     def relocate(self, links: LinkData, devices: list[TwinDevice],
                  channel: ImagePaths) -> list[TwinDevice]:
-        """Return the devices, unknown ones where paths put them if these explain their links better.
+        """Return the devices, unknown ones where paths put them.
 
-        Where more than `MAX_DEVICES` are unknown, all stay.
+        One stays if paths do not explain its links better. Where more than `MAX_DEVICES` are
+        unknown, all stay.
 
         Args:
             links: n links over a map.
@@ -166,8 +167,8 @@ class _Search:
     def from_law(self, device: TwinDevice, known: list[tuple[float, float]]) -> TwinDevice:
         """Return the device where paths put it, or where it is.
 
-        It stays if paths explain its links nowhere better than the law does there, or not as well as
-        they explain those of others.
+        It stays if paths explain its links nowhere better than the law does there, or not as well
+        as they explain those of others.
 
         Args:
             device: as the law located it.

@@ -68,7 +68,8 @@ def locate(model: EffectModel, links: LinkData, area_m: Area,
             on_progress()
             continue
         power = model.likelihood_power
-        fine_m, fine_width_m = _finer(_log_likelihood(model, own, coarse_m), power, coarse_m, width_m)
+        fine_m, fine_width_m = _finer(_log_likelihood(model, own, coarse_m), power, coarse_m,
+                                      width_m)
         yield _estimate(int(device), fine_m, _log_likelihood(model, own, fine_m), power,
                         fine_width_m, len(own), cdist(fine_m, fine_m))
         on_progress()
@@ -86,9 +87,9 @@ def calibrated_power(models: list[EffectModel], held_out: list[LinkData], area_m
     """Return the power of the likelihood with which 90 % radii hold 90 % of positions.
 
     Links of one device err alike, and what was learnt on other days is not all that holds today; so
-    the likelihood alone is too certain. Tried on devices of known position with models that have not
-    seen their links (Holmes and Walker 2017, 'Assigning a value to a power likelihood in a general
-    Bayesian model', Biometrika 104).
+    the likelihood alone is too certain. Tried on devices of known position with models that have
+    not seen their links (Holmes and Walker 2017, 'Assigning a value to a power likelihood in a
+    general Bayesian model', Biometrika 104).
 
     Args:
         models: one a fold, each learnt without it.

@@ -55,8 +55,8 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
     channel = channel_named(model)
     if channel is ImagePaths:
         if allow_indoor:
-            raise BadInput(f"model {model} follows paths outside buildings only; take another model "
-                           "where unknown devices may be indoors")
+            raise BadInput(f"model {model} follows paths outside buildings only; take another "
+                           "model where unknown devices may be indoors")
         links = prepare_links(measurements, scene)
         for note in links.notes:
             warnings.warn(note, stacklevel=2)
@@ -78,7 +78,8 @@ def fit_links(links: LinkData, scene: Scene, channel: type[ChannelModel], seed: 
         links: n links.
         scene: its map and extent.
         channel: class of the channel model.
-        seed, start: as of `fit_twin`.
+        seed: as of `fit_twin`.
+        start: as of `fit_twin`.
         settings: of the search.
 
     Raises:
@@ -193,7 +194,8 @@ def _fit_along_paths(links: LinkData, scene: Scene, seed: int, start: Twin | Non
     by_law = FoldModel.build(links, law.channel, dof, device_m=law_m)
     fit, both = by_paths.fit(), by_paths.usable & by_law.usable
     heard = np.bincount(by_paths.group[by_paths.usable & np.isfinite(links.level_db)], minlength=2)
-    loss = by_paths.regression(both).nll(fit).sum() - by_law.regression(both).nll(by_law.fit()).sum()
+    loss = by_paths.regression(both).nll(fit).sum() \
+        - by_law.regression(both).nll(by_law.fit()).sum()
     if heard[0] >= MIN_HEARD and loss > MIN_LOSS_NATS * both.sum():
         warnings.warn("paths over the 3D map explain these levels worse than a law of distance and "
                       "line of sight does: is the map that of the area, and in the same frame? "
@@ -201,10 +203,11 @@ def _fit_along_paths(links: LinkData, scene: Scene, seed: int, start: Twin | Non
     if heard.min() < MIN_HEARD <= heard.max():
         few, many = heard.argmin(), heard.argmax()
         level_db = fit.coefficients[1 - many]  # of the columns LoS comes first, of the groups NLoS
-        warnings.warn(f"only {heard[few]} links {('without', 'with')[few]} line of sight were heard: "
-                      f"their level is that of the others, {level_db:.1f} dB from what paths bring",
-                      stacklevel=4)
-        fit = replace(fit, coefficients=np.full(2, level_db), scale_db=np.full(2, fit.scale_db[many]))
+        warnings.warn(f"only {heard[few]} links {('without', 'with')[few]} line of sight were "
+                      f"heard: their level is that of the others, {level_db:.1f} dB from what "
+                      "paths bring", stacklevel=4)
+        fit = replace(fit, coefficients=np.full(2, level_db),
+                      scale_db=np.full(2, fit.scale_db[many]))
     unknown = sum(device.role == "unknown" for device in twin.devices)
     if unknown > MAX_DEVICES:
         warnings.warn(f"{unknown} devices are unknown, and paths are followed to locate "
@@ -225,13 +228,13 @@ def _fit_channel(links: LinkData, device_m: np.ndarray, channel: ChannelModel,
                  seed: int) -> ChannelModel:
     """Fit to the links of all devices whose position in `device_m` (k, 3) is known."""
     if not links.anchors:
-        raise BadInput("no anchor: every device has the role unknown, and a channel is learned from "
-                       "devices whose positions are known; give at least one device x_m, y_m and the "
-                       "role anchor in devices.csv")
+        raise BadInput("no anchor: every device has the role unknown, and a channel is learned "
+                       "from devices whose positions are known; give at least one device x_m, y_m "
+                       "and the role anchor in devices.csv")
     known = np.isfinite(device_m[:, :2]).all(axis=1)[links.device]
     if not known.any():
-        raise BadInput("no link to an anchor: none of the devices with role anchor was measured; fly "
-                       "nearer to them")
+        raise BadInput("no link to an anchor: none of the devices with role anchor was measured; "
+                       "fly nearer to them")
     geometry = link_geometry(device_m, links.receiver_m[known], links.device[known], links.city)
     check_fit_data(geometry, links.level_db[known], needs_los=channel.uses_map)
     return channel.fit(geometry, links.level_db[known], links.limit_db, seed)
@@ -269,9 +272,9 @@ def _check_positions(links: LinkData, scene: Scene) -> None:
     anchors = anchors[np.isfinite(links.device_m[anchors]).all(axis=1)]
     for index in anchors[scene.city.inside(links.device_m[anchors])]:
         x_m, y_m, z_m = links.device_m[index]
-        raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} at ({x_m:g}, "
-                       f"{y_m:g}, {z_m:g}) m is inside a building of the scene; correct its "
-                       "position, or the scene's frame")
+        raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} at "
+                       f"({x_m:g}, {y_m:g}, {z_m:g}) m is inside a building of the scene; correct "
+                       "its position, or the scene's frame")
     receiver_m, corners_m = links.receiver_m[:, :2], scene.city.vertices[:, :2]
     outside = (receiver_m < corners_m.min(axis=0)) | (receiver_m > corners_m.max(axis=0))
     for odd, where in ((scene.city.inside(links.receiver_m), "inside buildings"),
@@ -287,8 +290,8 @@ def _check_limit(links: LinkData) -> None:
     blank = np.isnan(level_db)
     if limit_db is not None and blank.mean() > MAX_BLANK and not blank.all() \
             and np.nanmin(level_db) > limit_db + LIMIT_GAP_DB:
-        warnings.warn(f"{blank.sum()} levels are blank and taken for levels below the scene's limit "
-                      f"of detection, {limit_db:.0f} dB, but the weakest measured one is "
+        warnings.warn(f"{blank.sum()} levels are blank and taken for levels below the scene's "
+                      f"limit of detection, {limit_db:.0f} dB, but the weakest measured one is "
                       f"{np.nanmin(level_db):.0f} dB: check sensitivity_dbm and tx_power_dbm in "
                       "scene.toml", stacklevel=4)
 

@@ -24,16 +24,17 @@ def check_can_locate(twin: Twin, scene: Scene | None) -> None:
         scene: the 3D map that devices are to be located with.
 
     Raises:
-        BadInput: it was not, it follows paths, or it was fitted with a map and none is given, or the
-            other way round.
+        BadInput: it was not, it follows paths, or it was fitted with a map and none is given, or
+            the other way round.
     """
     if twin.channel.follows_paths:
-        raise BadInput("the twin's base is 'raytrace', and following paths from every position where "
-                       "a device may be takes too long; `radiotwin fit --model raytrace` locates "
-                       "devices along with the twin, and close-loop --base twin makes one for locate")
+        raise BadInput("the twin's base is 'raytrace', and following paths from every position "
+                       "where a device may be takes too long; `radiotwin fit --model raytrace` "
+                       "locates devices along with the twin, and close-loop --base twin makes one "
+                       "for locate")
     if twin.fitted is None:
-        raise BadInput("the twin was not made by `radiotwin close-loop`, or by an earlier version of "
-                       "it; run that on measurements of devices whose positions are known")
+        raise BadInput("the twin was not made by `radiotwin close-loop`, or by an earlier version "
+                       "of it; run that on measurements of devices whose positions are known")
     twin.require_map(scene)
 
 
@@ -48,8 +49,8 @@ def locate_file(measurements: Measurements, twin: Twin, scene: Scene | None,
         on_progress: called after each device.
 
     Returns:
-        a row a device: `device, x_m, y_m, radius_m` (of 90 % of the probability), `links`; and notes
-        on the data.
+        a row a device: `device, x_m, y_m, radius_m` (of 90 % of the probability), `links`; and
+        notes on the data.
 
     Raises:
         BadInput: a twin that cannot locate, no unknown device, links of another quantity than the
@@ -60,11 +61,11 @@ def locate_file(measurements: Measurements, twin: Twin, scene: Scene | None,
     assert model is not None
     unknown = measurements.select(~measurements.is_anchor[measurements.device_index])
     if unknown.table.empty:
-        raise BadInput("no link is to a device of role unknown; set the role of those that are to be "
-                       "found in devices.csv")
+        raise BadInput("no link is to a device of role unknown; set the role of those that are to "
+                       "be found in devices.csv")
     if unknown.level_column != twin.level:
-        raise BadInput(f"the measurements have {unknown.level_column}, the twin is of {twin.level}; "
-                       "both need the same")
+        raise BadInput(f"the measurements have {unknown.level_column}, the twin is of "
+                       f"{twin.level}; both need the same")
     links = prepare_links(unknown, scene, to_locate=True)
     strangers = [name for name in links.receiver_names if name not in model.receivers]
     notes = list(links.notes)

@@ -90,7 +90,12 @@ def write_twin(folder: Path | str, channel: ChannelModel, devices: list[TwinDevi
 
     Args:
         folder: to write; a twin that is in it is replaced.
-        channel, devices, level, limit_db, provenance, fitted: as the attributes of `Twin`.
+        channel: fitted.
+        devices: in the order of the measurements' `devices.csv`.
+        level: `gain_db`, or `rssi_dbm` where transmit power is unknown.
+        limit_db: level below which receivers do not detect [dB]; None where it was not known.
+        provenance: measurements, scene, seed and version that made it.
+        fitted: levels, effects and errors fitted upon the channel, if there are any.
 
     Raises:
         BadInput: the folder exists and is not a twin's.
@@ -177,7 +182,8 @@ def _fitted(record: _FittedRecord, channel: ChannelModel,
     shadowing = CorrelatedShadowing.from_state(record.shadowing) if record.shadowing else None
     return EffectModel(channel, tuple(effects), np.array(record.level_coefficients),
                        np.array(record.scale_db), record.dof, np.nan_to_num(device_m),
-                       tuple(record.receivers), np.nan if record.first_s is None else record.first_s,
+                       tuple(record.receivers),
+                       np.nan if record.first_s is None else record.first_s,
                        record.device_sd_db, record.likelihood_power, shadowing)
 
 

@@ -1,4 +1,4 @@
-"""The twin: a channel, the positions of all devices, and the effects and errors fitted upon them."""
+"""The twin: a channel, the positions of all devices, and effects and errors fitted upon them."""
 
 from __future__ import annotations
 
@@ -193,9 +193,9 @@ class Twin:
         with_map = len(self.fitted.level_coefficients) > 2  # a level and a slope for each class
         if with_map and scene is None:
             raise BadInput(f"the twin was made with a 3D map (scene "
-                           f"{self.provenance.get('scene', 'unknown')}), and none is given; give it "
-                           "with --scene")
+                           f"{self.provenance.get('scene', 'unknown')}), and none is given; give "
+                           "it with --scene")
         if scene is not None and not with_map:
             raise BadInput(f"the twin was made without a 3D map, and cannot use that of "
-                           f"{scene.folder}: locate devices without --scene, or run close-loop with "
-                           "--scene first")
+                           f"{scene.folder}: locate devices without --scene, or run close-loop "
+                           "with --scene first")
