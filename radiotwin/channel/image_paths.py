@@ -28,8 +28,8 @@ class ImagePaths(ChannelModel):
     class of line of sight, are fitted with the effects.
 
     Attributes:
-        law: fitted to the same links; predicts what small changes do, quickly, and the size of the
-            errors.
+        law: fitted to the same links; predicts what small changes do, quickly, and the
+            size of the errors.
         diffuse: gain of the diffuse power at 100 m [dB], and the exponent of its fall.
     """
 

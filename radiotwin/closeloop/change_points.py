@@ -1,10 +1,10 @@
 """Steps in time between flights: a held-out flight cannot show them, positions in all flights can.
 
-Where a receiver or a device changed after its first flight, that flight held out leaves nothing that
-shows it, and the others held out are predicted well by each other. So these candidates are scored
-on blocks of ground that are held out in all flights at once, with the effects that were found
-already. Positions cannot tell a step from flights that differ anyhow, so it must also be larger than
-flights of all receivers, or all devices, differ.
+Where a receiver or a device changed after its first flight, that flight held out leaves nothing
+that shows it, and the others held out are predicted well by each other. So these candidates are
+scored on blocks of ground that are held out in all flights at once, with the effects that were
+found already. Positions cannot tell a step from flights that differ anyhow, so it must also be
+larger than flights of all receivers, or all devices, differ.
 """
 
 from __future__ import annotations

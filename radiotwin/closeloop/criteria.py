@@ -16,7 +16,8 @@ class SelectionCriteria:
 
     Attributes:
         min_training_gain_nats: on the links that it is fitted to, for a candidate to be fitted to
-            the folds. Saves time: one that gains less cannot gain `min_gain_nats` on held-out links.
+            the folds. Saves time: one that gains less cannot gain `min_gain_nats`
+            on held-out links.
         min_gain_nats: on held-out links. Calibrated.
         min_gain_per_link_nats: on held-out links, unless the RMSE falls by `max_rmse_ratio`; 0.02
             is what an RMSE lower by 2 % gains.

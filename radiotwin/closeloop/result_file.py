@@ -61,8 +61,8 @@ def scores(model: CrossValidatedModel, rows: np.ndarray | None = None) -> dict[s
     """Return held-out errors of the links of a mask (n,), or of all.
 
     Returns:
-        as of `errors`, and `nll`, the mean negative log-likelihood of detected and blank links
-        [nats].
+        as of `errors`, and `nll`, the mean negative log-likelihood of detected and
+        blank links [nats].
     """
     level_db, mean_db, nll = model.links.level_db, model.held_out_mean_db, model.held_out_nll
     rows = np.ones(len(level_db), dtype=bool) if rows is None else rows

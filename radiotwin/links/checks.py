@@ -88,8 +88,8 @@ def _off_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
         raise BadInput(
             f"{outside.sum():,} of {len(outside):,} links have their receiver outside the 3D map, "
             f"which goes from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) m: "
-            "give measurements and scene in one frame, in metres; feet and degrees are not "
-            "converted")
+            "give measurements and scene in one frame, in metres; "
+            "feet and degrees are not converted")
     return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}: do measurements and "
             "scene share one frame and unit?"
             for odd, where in ((inside, "inside a building"), (outside, "outside the 3D map"))

@@ -64,8 +64,8 @@ class Relocation:
                  channel: ImagePaths) -> list[TwinDevice]:
         """Return the devices, unknown ones where paths put them.
 
-        One stays if paths do not explain its links better. Where more than `MAX_DEVICES` are
-        unknown, all stay.
+        A device stays unless paths explain its links better than the law. Where more than
+        `MAX_DEVICES` are unknown, all stay.
 
         Args:
             links: n links over a map.
