@@ -94,7 +94,7 @@ def test_every_part_has_its_place():
     assert {part_of(module) for module in in_package("radiotwin")} - {""} == set(DEPTH)
 
 
-@pytest.mark.parametrize("part", DEPTH)
+@pytest.mark.parametrize("part", sorted(DEPTH))
 def test_a_part_imports_only_what_is_below_it(part):
     upwards = {f"{module} imports {name}" for module in in_package("radiotwin") if part_of(module) == part
                for name in IMPORTS[module] if target(name) and part_of(target(name)) not in ("", part)
