@@ -22,11 +22,13 @@ def effect(monkeypatch):
 
 
 def made(loss_db):
-    """Measurements of 2 receivers and 4 devices in 1200 s: a log-distance law, noise of 2 dB, and rain."""
+    """Measurements of 2 receivers and 4 devices in 1200 s: a log-distance law, noise, and rain."""
     rng = np.random.default_rng(0)
     device_m = np.column_stack([rng.uniform(0, 400, (4, 2)), np.full(4, 1.5)])
-    slot, receiver, device = (axis.ravel() for axis in np.meshgrid(np.arange(300), [0, 1], [0, 1, 2, 3]))
-    receiver_m = np.column_stack([rng.uniform(0, 400, (300, 2, 2)).reshape(600, 2), np.full(600, 50.0)])
+    axes = np.meshgrid(np.arange(300), [0, 1], [0, 1, 2, 3])
+    slot, receiver, device = (axis.ravel() for axis in axes)
+    ground_m = rng.uniform(0, 400, (300, 2, 2)).reshape(600, 2)
+    receiver_m = np.column_stack([ground_m, np.full(600, 50.0)])
     position_m, time_s = receiver_m[2 * slot + receiver], 4.0 * slot
     gain_db = -35 - 26 * np.log10(np.linalg.norm(position_m - device_m[device], axis=1))
     gain_db += rng.normal(0, 2, len(gain_db)) - loss_db * ((time_s >= START_S) & (time_s <= END_S))
