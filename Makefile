@@ -8,6 +8,8 @@
 VENV ?= .venv
 PIP_ARGS ?=
 TESTS ?=
+FAST_TESTS := $(addprefix tests/,antennas channel effects export footprints importing inference links paths \
+	report scene survey trace test_layout.py)
 
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
@@ -46,8 +48,7 @@ test-all: $(INSTALLED)
 check: $(INSTALLED)
 	$(BIN)/ruff check
 	$(BIN)/mypy
-	$(PYTEST) --ignore=tests/cli --ignore=tests/marl --ignore=tests/trace --ignore=tests/closeloop \
-		-m "not slow and not llvm" $(FAST_TESTS)
+	$(PYTEST) -m "not slow and not llvm" $(FAST_TESTS)
 
 # In a folder of its own, where the examples leave what they make.
 docs: $(INSTALLED)

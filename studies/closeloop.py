@@ -9,24 +9,31 @@ import copy
 import warnings
 from collections import Counter
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import trimesh
 
 from radiotwin import Measurements, Scene, close_loop, make_report
+from radiotwin.closeloop.bases import make_bases
+from radiotwin.closeloop.cross_validation import cross_validate, training_parts
+from radiotwin.closeloop.folds import make_folds
+from radiotwin.effects.fold_model import FoldModel
+from radiotwin.links import prepare_links
 from radiotwin.scene.citymap import CityMap
-from studies.closeloop_internals import base_rmse_db, draw_from_base
 from studies.runner import Study
 from studies.tables import markdown
 from tests.undeclared.cases import FAMILIES, OUTSIDE, SEEDS, Case, case, stored
 from tests.undeclared.families import world_of
+from tests.undeclared.shapes import prism
 
 UNITS = {"db": "dB", "m": "m", "deg": "°", "s": "s"}
 GEOMETRY = ("missing_obstacle", "removed_obstacle")
 ALL = (*FAMILIES, *OUTSIDE)
 BY_TWIN = {f"nothing-twin-{by}": {"family": "nothing", "base": "twin", "hold_out": by}
            for by in ("flight", "device")}
+STEP_DB, DOF = 0.25, 5.0  # of the levels and errors that `draw_from_base` makes
 
 
 def hidden_cases(seed: int) -> dict[str, dict]:
@@ -77,35 +84,30 @@ def _oracle_rmse_db(hidden: Case, base: str, hold_out: str) -> float:
             where = world_of(hidden.family, hidden.seed)
             points_m = np.repeat(where.points_m, len(where.names), axis=0)
             table[[f"receiver_{axis}_m" for axis in "xyz"]] = points_m
-    return base_rmse_db(Measurements(table, measurements.devices), scene, base, hold_out)
+    links = prepare_links(Measurements(table, measurements.devices), scene)
+    folds = make_folds(links, 0, hold_out)
+    parts = training_parts(links, folds)
+    return cross_validate(links, make_bases(scene, 0)[base], folds, parts).rmse_db()
 
 
 def with_true_city(scene: Scene, effect: dict) -> Scene:
     """Return the scene with its missing towers, or without the building that is gone."""
-    mesh = trimesh.Trimesh(scene.city.vertices, scene.city.faces, process=False)
+    mesh: Any = trimesh.Trimesh(scene.city.vertices, scene.city.faces, process=False)
     if effect["name"] == "removed_obstacle":
         corners_m = np.array(effect["corners_m"])
         low, high = corners_m.min(axis=0) - 1.5, corners_m.max(axis=0) + 1.5
         middle = mesh.triangles_center[:, :2]
         mesh = mesh.submesh([~((middle > low) & (middle < high)).all(axis=1)], append=True)
     for tower in effect.get("obstacles", []):
-        corners_m = np.array(tower["corners_m"])
-        fan = [(0, i, i + 1) for i in range(1, len(corners_m) - 1)]
-        prism = trimesh.creation.extrude_triangulation(corners_m, fan, tower["height_m"])
-        prism.fix_normals()
-        mesh = trimesh.util.concatenate([mesh, prism])
+        tower_mesh = prism(np.array(tower["corners_m"]), tower["height_m"])
+        mesh = trimesh.util.concatenate([mesh, tower_mesh])
     other = copy.copy(scene)
     other.__dict__["city"] = CityMap(mesh.vertices, mesh.faces)
     return other
 
 
 def recovered(hidden: dict, effects: list[dict]) -> dict:
-    """Return errors of the parameters of a hidden effect; empty where it was not named.
-
-    Args:
-        hidden: with its true parameters.
-        effects: of `closeloop.json`.
-    """
+    """Return errors of the parameters of a hidden effect; empty where no effect has its name."""
     name, end = hidden["name"], f"[{hidden.get('receiver', hidden.get('device'))}]"
     mine = [each["parameters"] for each in effects if each["name"] == name]
     values = {key: parameter["value"] for key, parameter in mine[0].items()} if mine else {}
@@ -120,11 +122,11 @@ def recovered(hidden: dict, effects: list[dict]) -> dict:
     if name == "receiver_clock_offset" and values:
         return {"clock_error_s": here.get("positions_late_by_s", np.nan) - hidden["late_s"]}
     if name == "missing_obstacle" and mine:
-        pairs = [(np.hypot(box["x_m"]["value"] - tower["centre_m"][0],
-                           box["y_m"]["value"] - tower["centre_m"][1]),
-                  box["height_m"], tower["height_m"])
-                 for box in mine for tower in hidden["obstacles"]]
-        centre_m, height, true_m = min(pairs, key=lambda pair: pair[0])
+        centre_m, height, true_m = min((
+            (np.hypot(box["x_m"]["value"] - tower["centre_m"][0],
+                      box["y_m"]["value"] - tower["centre_m"][1]),
+             box["height_m"], tower["height_m"]) for box in mine for tower in hidden["obstacles"]),
+            key=lambda pair: pair[0])
         return {"centre_error_m": centre_m, "height_error_m": height["value"] - true_m,
                 "height_in_interval": height["low"] <= true_m <= height["high"],
                 "boxes": len(mine), "towers": len(hidden["obstacles"])}
@@ -135,11 +137,11 @@ def recovered(hidden: dict, effects: list[dict]) -> dict:
     if name == "device_position_error" and values:
         found_m = here.get("x_m", np.nan), here.get("y_m", np.nan)
         return {"position_error_m": np.hypot(*np.subtract(found_m, hidden["true_m"][:2]))}
-    if name == "antenna_pattern" and "receiver" in hidden and "tilt_deg" in here:
-        return {"tilt_error_deg": here["tilt_deg"] - hidden["tilt_deg"]}
-    if name == "antenna_pattern" and "device" in hidden and "azimuth_deg" in here:
-        off_deg = here["azimuth_deg"] - hidden["azimuth_deg"]
-        return {"azimuth_error_deg": (off_deg + 180) % 360 - 180}
+    if name == "antenna_pattern":
+        for kind, key in (("receiver", "tilt"), ("device", "azimuth")):
+            if kind in hidden and f"{key}_deg" in here:
+                off_deg = here[f"{key}_deg"] - hidden[f"{key}_deg"]
+                return {f"{key}_error_deg": (off_deg + 180) % 360 - 180}
     return {}
 
 
@@ -153,20 +155,21 @@ def hidden_table(rows: pd.DataFrame) -> str:
     heads = ["hidden", "named first", "also named", "errors of what was recovered", "before [dB]",
              "after", "oracle", "log-distance", "kriging"]
     by_family = [_family_line(name, cases[cases["name"] == name]) for name in families]
-    parts = [f"**Hidden effects in traced cities** ({len(cases)} cases; RMSE of held-out links)\n\n"
-             + markdown(heads, by_family)]
-    heads = ["hidden", "seed", *heads[1:3], "recovered", *heads[4:7]]
+    found = markdown(heads, by_family, "Hidden effects in traced cities",
+                     f" ({len(cases)} cases; RMSE of held-out links)")
     ordered = sorted(cases.itertuples(), key=lambda row: (row.seed, families.index(row.name)))
-    parts.append("**Case by case**\n\n" + markdown(heads, [_case_line(row) for row in ordered]))
-    heads = ["city", "held out by", "named", "before", "after", ""]
+    heads = ["hidden", "seed", *heads[1:3], "recovered", *heads[4:7]]
+    one_by_one = markdown(heads, [_case_line(row) for row in ordered], "Case by case")
     lines = [[("first city", "second city")[row.seed], row.settings["hold_out"],
               counted(name for name in row.named
                       if name not in ("correlated_shadowing", "unexplained_trend")),
               *(f"{row.nlos_rmse_db[when]:.2f}" for when in ("before", "after")),
               f"{100 * (row.nlos_rmse_db['after'] / row.nlos_rmse_db['before'] - 1):.0f} %"]
              for name in BY_TWIN for row in twins[twins["name"] == name].itertuples()]
-    return "\n\n".join([*parts, "**Nothing is hidden, base `twin`**: RMSE of links without line of "
-                        f"sight [dB]\n\n{markdown(heads, lines)}"])
+    of_twin = markdown(["city", "held out by", "named", "before", "after", ""], lines,
+                       "Nothing is hidden, base `twin`",
+                       ": RMSE of links without line of sight [dB]")
+    return "\n\n".join([found, one_by_one, of_twin])
 
 
 def _family_line(family: str, cases: pd.DataFrame) -> list[str]:
@@ -181,14 +184,14 @@ def _family_line(family: str, cases: pd.DataFrame) -> list[str]:
     errors: dict[str, list[str]] = {}
     for name, value in _errors(cases["recovered"]):
         errors.setdefault(name, []).append(f"{value:+.1f}")
-    rmse_db = (cases[when].str["rmse_db"] for when in ("before", "after"))
-    scores = [*rmse_db, cases["oracle_rmse_db"],
-              *(cases["baselines"].str[key] for key in ("log_distance", "regression_kriging"))]
     texts = [f"{name.rsplit('_error_', 1)[0]} {', '.join(values)} {UNITS[name.split('_')[-1]]}"
              for name, values in errors.items()]
-    also = ", ".join(f"`{name}` {count}" for name, count in others.most_common())
-    return [f"`{family}`", right, also, "; ".join(texts),
-            *(f"{each.mean():.2f}" for each in scores)]
+    scores = [*(cases[when].str["rmse_db"] for when in ("before", "after")),
+              cases["oracle_rmse_db"],
+              *(cases["baselines"].str[key] for key in ("log_distance", "regression_kriging"))]
+    return [f"`{family}`", right,
+            ", ".join(f"`{name}` {count}" for name, count in others.most_common()),
+            "; ".join(texts), *(f"{each.mean():.2f}" for each in scores)]
 
 
 def _errors(recovered_lists: Iterable[list[dict]]) -> list[tuple[str, float]]:
@@ -196,7 +199,7 @@ def _errors(recovered_lists: Iterable[list[dict]]) -> list[tuple[str, float]]:
             for name, value in found.items() if "_error_" in name and value is not None]
 
 
-def _case_line(row: tuple) -> list[str]:
+def _case_line(row: Any) -> list[str]:
     hidden = {effect["name"] for effect in row.hidden}
     first = "–" if hidden else "no effect ✓"
     if row.named:
@@ -229,6 +232,27 @@ def find_nothing(seed: int, settings: dict) -> dict:
     gains = [(round(each["heldout_nll_gain"], 1), each["name"]) for each in report["candidates"]
              if each["heldout_nll_gain"] is not None]
     return summary(report) | {"best": sorted(gains, reverse=True)[:3]}
+
+
+def draw_from_base(world: int, base: str, seed: int) -> Measurements:
+    """Return the case `nothing`, `world`, with levels drawn from a base that was fitted to it.
+
+    Errors are Student's t with the fitted scale; levels are in the receivers' steps, and blank
+    below the limit.
+    """
+    hidden = case("nothing", world)
+    links = prepare_links(hidden.measurements, hidden.scene)
+    kind = make_bases(hidden.scene, 0)[base]
+    twin = kind.fit(links)
+    model = FoldModel.build(links, twin.channel, DOF, device_m=kind.device_m(twin))
+    fit = model.fit()
+    errors = np.random.default_rng(seed).standard_t(DOF, len(links))
+    level_db = model.predict(fit).mean_db + fit.scale_db[model.group] * errors
+    level_db = np.round(level_db / STEP_DB) * STEP_DB
+    table = hidden.measurements.table.copy()
+    table["gain_db"] = np.where(level_db >= model.limit_db, level_db, np.nan)
+    # A device that the base could not locate has no links in its world.
+    return Measurements(table[model.usable].reset_index(drop=True), hidden.measurements.devices)
 
 
 def null_table(rows: pd.DataFrame) -> str:

@@ -7,20 +7,25 @@ docs/real-data.md says where they come from. Five to fifteen minutes a row.
 
 import os
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from radiotwin import BadInput, Measurements, close_loop, make_report, read_measurements
+from radiotwin import BadInput, Loop, Measurements, close_loop, make_report, read_measurements
+from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.effects.effect_model import EffectModel
+from radiotwin.effects.sector_antenna import SectorAntenna
+from radiotwin.localize import calibrated_power, locate, whole_area
 from studies.closeloop import counted, summary
-from studies.closeloop_internals import locate_held_out, named_rmse_db, turned_rmse_db
 from studies.runner import Study
 from studies.tables import markdown, number
 
 DATA = Path(os.environ.get("RADIOTWIN_DATA", Path(__file__).parents[2] / "shared" / "data"))
 AZIMUTHS_DEG = {"A": 212, "B": 212, "C": 30, "D": 30, "E": 216, "F": 216}  # published; from north
 WHEN = ("before", "after")
+DEVICES_A_FOLD = 150  # that are located
 
 
 def real_cases(seed: int) -> dict[str, dict]:
@@ -46,7 +51,7 @@ def find_in_real(seed: int, settings: dict) -> dict:
     error = report["error"]
     result = summary(report) | {
         "heldout": report["heldout"], "before_db": error["before"]["rmse_db"],
-        "named_db": named_rmse_db(loop), "after_db": error["after"]["rmse_db"],
+        "named_db": explained(loop).rmse_db(), "after_db": error["after"]["rmse_db"],
         "baselines_db": {name: scores["rmse_db"] for name, scores in report["baselines"].items()},
         "effects": [{"name": effect["name"], "parameters": effect["parameters"],
                      "heldout_nll_gain": effect["evidence"]["heldout_nll_gain"]}
@@ -61,8 +66,7 @@ def find_in_real(seed: int, settings: dict) -> dict:
                                  for day, scores in error["by_flight"].items()},
                    "floors": len(off_db), "floors_compared": int(np.isfinite(off_db).sum()),
                    "floor_median_abs_error_db": float(np.nanmedian(np.abs(off_db))),
-                   "located": {when: _located(locate_held_out(loop, when == "after"))
-                               for when in WHEN}}
+                   "located": {when: locate_held_out(loop, getattr(loop, when)) for when in WHEN}}
     return result
 
 
@@ -73,6 +77,54 @@ def permuted(measurements: Measurements, seed: int) -> Measurements:
     table[column] = table.groupby("device")[column].transform(
         lambda levels: rng.permutation(levels.to_numpy()))
     return Measurements(table, measurements.devices)
+
+
+def explained(loop: Loop) -> CrossValidatedModel:
+    """Return the model with the named effects, without interpolation of the rest."""
+    return loop.selection.explained or loop.after
+
+
+def turned_rmse_db(loop: Loop) -> float:
+    """Return its held-out error with all sector antennas turned by 180°, the rest refitted [dB]."""
+    turned = []
+    for model in explained(loop).models:
+        effects = []
+        for each in model.effects:
+            if isinstance(each.effect, SectorAntenna):
+                devices = {device: pattern.model_copy(
+                    update={"azimuth_deg": pattern.azimuth_deg + 180.0})
+                    for device, pattern in each.params.devices.items()}
+                each = model.apply(each.effect, each.params.model_copy(
+                    update={"devices": devices}))
+            effects.append(each)
+        turned.append(model.with_effects(effects))
+    return explained(loop).extended(turned, [model.fit() for model in turned]).rmse_db()
+
+
+def locate_held_out(loop: Loop, model: CrossValidatedModel) -> dict[str, dict]:
+    """Locate devices of each fold by what was learnt from the others, with calibrated 90 % radii.
+
+    Returns:
+        By flight (a fold each), of at most 150 devices, and of all.
+    """
+    models = [EffectModel.of(fold, fit) for fold, fit in zip(model.folds, model.fits[1:])]
+    folds = [loop.links.select(model.index == index) for index in range(len(models))]
+    area_m, rng, rows = whole_area(models[0], loop.links), np.random.default_rng(0), []
+    for index, (learnt, fold) in enumerate(zip(models, folds)):
+        others, elsewhere = ([*each[:index], *each[index + 1:]] for each in (models, folds))
+        power = calibrated_power(others, elsewhere, area_m, 0)  # type: ignore[arg-type]
+        chosen = rng.permutation(np.unique(fold.device))[:DEVICES_A_FOLD]
+        asked = fold.select(np.isin(fold.device, chosen))
+        for found in locate(replace(learnt, likelihood_power=power), asked, area_m):
+            away_m = loop.links.device_m[found.device, :2] - (found.x_m, found.y_m)
+            rows.append((fold.flight_names[fold.flight[0]], np.hypot(*away_m), found.radius_m))
+    located = pd.DataFrame(rows, columns=["flight", "error_m", "radius_m"])
+    by_day = {day: own for day, own in located.groupby("flight", sort=False)} | {"all": located}
+    return {day: {"devices": len(own), "median_m": round(own["error_m"].median()),
+                  "ninety_m": round(own["error_m"].quantile(0.9)),
+                  "median_radius_m": round(own["radius_m"].median()),
+                  "within_radius": (own["error_m"] <= own["radius_m"]).mean()}
+            for day, own in by_day.items()}
 
 
 def _parameters(report: dict, effect: str, prefix: str) -> dict[str, float]:
@@ -96,39 +148,27 @@ def floor_errors_db(report: dict, folder: Path) -> np.ndarray:
     return np.array([value - noise_db.get(name, np.nan) for name, value in floors_db.items()])
 
 
-def _located(found: pd.DataFrame) -> dict:
-    by_day = {day: rows for day, rows in found.groupby("flight", sort=False)} | {"all": found}
-    return {day: {"devices": len(rows), "median_m": round(rows["error_m"].median()),
-                  "ninety_m": round(rows["error_m"].quantile(0.9)),
-                  "median_radius_m": round(rows["radius_m"].median()),
-                  "within_radius": (rows["error_m"] <= rows["radius_m"]).mean()}
-            for day, rows in by_day.items()}
-
-
-def _text(found: dict) -> str:
-    return f"{found['median_m']}, {100 * found['within_radius']:.0f} %"
-
-
 def real_table(rows: pd.DataFrame) -> str:
     """Return errors, and days and how well transmitters are located of `powder_frs`."""
-    by_name, lines = rows.set_index("name"), []
-    for name in (each for each in real_cases(0) if each in by_name.index):
-        row = by_name.loc[name]
-        lines.append([f"`{name}`", row["heldout"]["by"], *(number(value, 2) for value in (
-            row["before_db"], row["named_db"], row["after_db"],
-            row["baselines_db"].get("regression_kriging"))), counted(row["named"])])
-    parts = ["**Real measurements**\n\n" + markdown(
+    by_name = rows.set_index("name")
+    parts = [markdown(
         ["set", "held out by", "log-distance [dB]", "named effects", "with interpolation",
-         "kriging", "named"], lines)]
+         "kriging", "named"],
+        [[f"`{name}`", row["heldout"]["by"], *(number(value, 2) for value in (
+            row["before_db"], row["named_db"], row["after_db"],
+            row["baselines_db"].get("regression_kriging"))), counted(row["named"])]
+         for name, row in by_name.reindex(real_cases(0)).dropna(how="all").iterrows()],
+        "Real measurements")]
     if "powder_frs" in by_name.index:
         days, found = (by_name.loc["powder_frs", key] for key in ("by_day_db", "located"))
-        parts.append("**`powder_frs`**: RMSE by day, before → after [dB]\n\n" + markdown(
+        parts.append(markdown(
             sorted(days), [[" → ".join(f"{days[day][when]:.1f}" for when in WHEN)
-                            for day in sorted(days)]]))
-        parts.append("**`powder_frs`**: median distance [m], and share within the 90 % radius\n\n"
-                     + markdown(["day", "log-distance law", "corrected"], [
-                         [day, *(_text(found[when][day]) for when in WHEN)]
-                         for day in found["before"]]))
+                            for day in sorted(days)]],
+            "`powder_frs`", ": RMSE by day, before → after [dB]"))
+        parts.append(markdown(["day", "log-distance law", "corrected"], [
+            [day, *(f"{each['median_m']}, {100 * each['within_radius']:.0f} %"
+                    for each in (found[when][day] for when in WHEN))] for day in found["before"]],
+            "`powder_frs`", ": median distance [m], and share within the 90 % radius"))
     return "\n\n".join(parts)
 
 

@@ -15,28 +15,29 @@ import torch
 from matplotlib.figure import Figure
 
 from marl.disturbances import Disturbance, DisturbedEnvironment
-from marl.flights import AgentPolicy, HeuristicPolicy, Policy, fly
-from marl.learner import Learner
+from marl.flights import Policy, fly
+from marl.heuristics import HeuristicPolicy
 from marl.mission import Known, Mission, make_mission
 from marl.planner import PlanPolicy, plan
+from marl.qmix import QNetworks
 from marl.randomness import stream
 from marl.replanning import ReplanPolicy
-from marl.settings import PRESETS, LearnerSettings
-from marl.trainer import Trainer
+from marl.settings import LearnerSettings
+from marl.training import AgentPolicy, Trainer
 from radiotwin import Scene, segmented_truth
 from radiotwin.progress import progress
 from studies import tables
 from studies.runner import Study
+from studies.twins import LONG
 
 OFF_M = (20.0, 40.0)  # of a device from where it is thought to be
 SILENT_DB = -1000.0  # SNR between UAVs without a link
 BLOCK = 100  # episodes in one map
-DISTURBANCES = {"nominal": Disturbance(), "volumes": Disturbance(volume_spread=1.0),
-                "positions": Disturbance(), "loss": Disturbance(loss=1.0),
-                "everything": Disturbance(1.0, 1.0)}
-SCENARIOS = {"nominal": "as thought", "volumes": "data 0–2 × nominal",
-             "positions": "devices 20–40 m off", "loss": "a UAV is lost",
-             "everything": "all three"}
+SCENARIOS = {"nominal": ("as thought", Disturbance()),
+             "volumes": ("data 0–2 × nominal", Disturbance(volume_spread=1.0)),
+             "positions": ("devices 20–40 m off", Disturbance()),
+             "loss": ("a UAV is lost", Disturbance(loss=1.0)),
+             "everything": ("all three", Disturbance(1.0, 1.0))}
 METHODS = {"plan": "open-loop plan", "replan": "re-planning, link",
            "replan-no-link": "re-planning, no link", "policy": "policy, link",
            "policy-no-link": "policy, no link", "taught": "policy taught by the plan, link",
@@ -45,10 +46,9 @@ METHODS = {"plan": "open-loop plan", "replan": "re-planning, link",
 
 def pays_cases(seed: int) -> dict[str, dict]:
     """Return every method in every scenario."""
-    learner = PRESETS["fast"].model_copy(update={"epsilon_slots": 87_500}).model_dump(mode="json")
-    trained, planner = {"episodes": 4000, "learner": learner}, {"planner_iterations": 60_000}
+    planner = {"planner_iterations": 60_000}
     needs: dict[str, dict[str, Any]] = {
-        "plan": planner, "policy": trained, "taught": trained | planner, "greedy": {},
+        "plan": planner, "policy": LONG, "taught": LONG | planner, "greedy": {},
         "replan": planner | {"replan_every": 10, "replan_iterations": 1500}}
     return {f"{scene}-{scenario}-{method}": {
         "truth": "segmented", "scene": scene, "scenario": scenario, "flights": 64, "truths": 8,
@@ -58,13 +58,7 @@ def pays_cases(seed: int) -> dict[str, dict]:
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Missions that may turn out to be the real one, and what happens in them.
-
-    Attributes:
-        believed: the mission as it is thought to be before take-off.
-        real: those that it may be.
-        disturbance: what happens.
-    """
+    """A mission as it is thought to be, those that it may be, and what happens in them."""
 
     believed: Mission
     real: list[Mission]
@@ -79,12 +73,7 @@ class World:
 
 
 def fly_disturbed(seed: int, settings: dict) -> dict:
-    """Prepare a method and fly it in one scenario.
-
-    Args:
-        seed: of everything random.
-        settings: `scene`, `scenario`, `method`, `flights`, `truths` (draws of the devices'
-            positions), and what the method needs: see `pays_cases`.
+    """Prepare a method and fly it in one scenario, with settings as in `pays_cases`.
 
     Returns:
         `curve`: of a policy, its checks during training; `ratios`: of every flight.
@@ -92,25 +81,26 @@ def fly_disturbed(seed: int, settings: dict) -> dict:
     method = settings["method"].removesuffix("-no-link")
     linked, flights = method == settings["method"], settings["flights"]
     scene = Scene.load(tables.scene_folder(settings["scene"]))
-    drawn = scene, settings["scenario"], linked, settings["truths"]
-    world, learned = (make_world(*drawn, stream(seed, purpose, 1))
+    world, learned = (make_world(scene, settings["scenario"], linked, settings["truths"],
+                                 stream(seed, purpose, 1))
                       for purpose in ("truth evaluation", "learning"))
     curve: dict[str, list] = {}
     policy: Policy
-    actions = None
-    if method in ("plan", "taught"):
-        actions = plan(world.believed, settings["planner_iterations"], seed).actions
-    if method == "plan":
-        policy = PlanPolicy(actions)
-    elif method == "replan":
+    if method == "replan":
         policy = ReplanPolicy(world.believed, linked, settings["replan_every"],
                               settings["replan_iterations"], settings["planner_iterations"], seed,
                               stream(seed, "planning", 1))
     elif method == "greedy":
         policy = HeuristicPolicy(method, stream(seed, "decisions"))
     else:
-        learner = LearnerSettings.model_validate(settings["learner"])
-        policy, curve = train(learned, settings["episodes"], learner, flights, seed, actions)
+        actions = None
+        if method != "policy":
+            actions = plan(world.believed, settings["planner_iterations"], seed).actions
+        if method == "plan" and actions is not None:
+            policy = PlanPolicy(actions)
+        else:
+            policy, curve = train(learned, settings["episodes"], LearnerSettings.model_validate(
+                settings["learner"]), flights, seed, actions)
     ratios = world.fly(policy, flights, stream(seed, "truth evaluation"))
     return {"curve": curve, "truth_ratio": ratios.mean(), "truth_ratio_std": ratios.std(),
             "ratios": ratios.tolist()}
@@ -118,14 +108,9 @@ def fly_disturbed(seed: int, settings: dict) -> dict:
 
 def make_world(scene: Scene, scenario: str, linked: bool, truths: int,
                rng: np.random.Generator) -> World:
-    """Return the missions of a scenario.
+    """Return the missions of a scenario, with or without a link between UAVs.
 
-    Args:
-        scene: the city, in the statistical truth.
-        scenario: a key of `DISTURBANCES`.
-        linked: whether UAVs see each other.
-        truths: draws of the devices' positions, where these are not what is thought.
-        rng: of these.
+    `truths` is how often positions are drawn, where these are not what is thought.
     """
     known = Known.truth(scene)
 
@@ -137,7 +122,7 @@ def make_world(scene: Scene, scenario: str, linked: bool, truths: int,
     real = [believed]
     if scenario in ("positions", "everything"):
         real = [mission(displaced(scene, rng)) for _ in range(truths)]
-    return World(believed, real, DISTURBANCES[scenario])
+    return World(believed, real, SCENARIOS[scenario][1])
 
 
 def displaced(scene: Scene, rng: np.random.Generator) -> Scene:
@@ -168,61 +153,53 @@ def train(world: World, episodes: int, settings: LearnerSettings, flights: int, 
           teacher: np.ndarray | None = None) -> tuple[AgentPolicy, dict[str, list]]:
     """Train QMIX over the missions of a world, one after the other, a block each.
 
-    Args:
-        world: what is trained in, and checked in.
-        episodes: of training.
-        settings: of the learner.
-        flights: of a check.
-        seed: of everything random.
-        teacher: `(slots, uavs)` actions of a plan that some flights follow (`Trainer.enter`).
+    Some flights follow the actions `(slots, uavs)` of a `teacher` (`Trainer.enter`).
 
     Returns:
-        The policy that collected most at the checks after the blocks, and these.
+        The policy that collected most at the checks of so many flights after the blocks; these.
     """
-    trainer = DisturbedTrainer(settings, world.believed, episodes, seed)
-    trainer.disturbance = world.disturbance
-    best, highest = Learner(settings, world.believed, seed).agent, -1.0
-    curve: dict[str, list] = {"episodes": [], "ratio": [], "train_ratio": []}
+    trainer = DisturbedTrainer(QNetworks, settings, world.believed, episodes, seed)
+    trainer.disturbance, agent = world.disturbance, trainer.networks.agent
+    best = QNetworks(settings, world.believed, seed).agent
+    checks: list[dict[str, float]] = []
     with progress("training", total=episodes) as advance:
         while trainer.episodes < episodes:
-            trainer.enter(world.real[len(curve["ratio"]) % len(world.real)], teacher)
-            block = min(BLOCK, episodes - trainer.episodes)
-            record = trainer.train(block)
-            policy = AgentPolicy(trainer.learner.agent)
-            ratio = float(world.fly(policy, flights, stream(seed, "choice")).mean())
-            if ratio > highest:
-                highest = ratio
+            trainer.enter(world.real[len(checks) % len(world.real)], teacher)
+            record = trainer.train(min(BLOCK, episodes - trainer.episodes))
+            ratio = float(world.fly(AgentPolicy(agent), flights, stream(seed, "choice")).mean())
+            if ratio > max((check["ratio"] for check in checks), default=-1.0):
                 with torch.no_grad():
-                    best.load_state_dict(trainer.learner.agent.state_dict())
-            for name, value in (("episodes", trainer.episodes), ("ratio", ratio),
-                                ("train_ratio", record["train_ratio"])):
-                curve[name].append(value)
-            advance(block)
-    return AgentPolicy(best), curve
+                    best.load_state_dict(agent.state_dict())
+            checks.append({"episodes": trainer.episodes, "ratio": ratio,
+                           "train_ratio": record["train_ratio"]})
+            advance(BLOCK)
+    return AgentPolicy(best), pd.DataFrame(checks).to_dict("list")
 
 
-def _scenarios(runs: dict[str, pd.DataFrame]) -> dict[str, dict[str, np.ndarray]]:
-    """Return label of a scenario -> label of a method -> share of the data of all flights."""
-    names = [name for name in METHODS if any(run.endswith(f"-{name}") for run in runs)]
-    return {label: {METHODS[name]: np.concatenate([*runs[f"{scenario}-{name}"]["ratios"]])
-                    if f"{scenario}-{name}" in runs else np.array([]) for name in names}
-            for scenario, label in SCENARIOS.items()
-            if any(run.startswith(scenario) for run in runs)}
+def _ratios(runs: dict[str, pd.DataFrame]) -> pd.DataFrame:
+    """Return shares of the data of all flights: scenarios by methods that have been flown."""
+    cells = {METHODS[method]: {label: np.concatenate([*runs[f"{scenario}-{method}"]["ratios"]])
+                               for scenario, (label, _) in SCENARIOS.items()
+                               if f"{scenario}-{method}" in runs} for method in METHODS}
+    order = [label for label, _ in SCENARIOS.values()]
+    frame = pd.DataFrame({name: cell for name, cell in cells.items() if cell}, dtype=object)
+    return frame.reindex([label for label in order if label in frame.index]).map(
+        lambda cell: cell if isinstance(cell, np.ndarray) else np.array([]))
 
 
 def pays_table(rows: pd.DataFrame) -> str:
     """Return scenarios against methods."""
     parts = []
-    for _, scene, runs in tables.worlds(rows):
-        lines, cells = [], {}
-        for label, cells in _scenarios(runs).items():
-            means = [cell.mean() if len(cell) else -1 for cell in cells.values()]
-            texts = [tables.with_sd(cell) for cell in cells.values()]
-            texts[int(np.argmax(means))] = f"**{texts[int(np.argmax(means))]}**"
+    for title, _, runs in tables.worlds(rows):
+        ratios, lines = _ratios(runs), []
+        for label, cells in ratios.iterrows():
+            texts = [tables.with_sd(cell) for cell in cells]
+            best = int(np.argmax([cell.mean() if len(cell) else -1 for cell in cells]))
+            texts[best] = f"**{texts[best]}**"
             lines.append([label, *texts])
         seeds = ", ".join(map(str, sorted({len(group) for group in runs.values()})))
-        parts.append(f"**{scene}, statistical truth** (64 flights a seed; seeds: {seeds})\n\n"
-                     + tables.markdown(["", *cells], lines))
+        parts.append(tables.markdown(["", *ratios], lines, title,
+                                     f" (64 flights a seed; seeds: {seeds})"))
     return "\n\n".join(parts) + "\n\nMean ± standard deviation over flights."
 
 
@@ -230,14 +207,11 @@ def pays_figures(rows: pd.DataFrame) -> dict[str, Figure]:
     """Draw scenarios, a bar for each method; lines are the standard error of the mean."""
     found = list(tables.worlds(rows))
     figure, panels = tables.make_panels(len(found), 1, 3.8)
-    for axes, (_, scene, runs) in zip(panels, found):
-        scenarios = _scenarios(runs)
-        cells = {name: [each[name] for each in scenarios.values()]
-                 for name in next(iter(scenarios.values()))}
-        errors = {name: [each.std() / np.sqrt(len(each)) if len(each) else 0 for each in values]
-                  for name, values in cells.items()}
-        tables.draw_bars(axes, cells, errors, list(scenarios), title=f"{scene}, statistical truth",
-                         xlabel="what is not as it was thought")
+    for axes, (title, _, runs) in zip(panels, found):
+        ratios = _ratios(runs)
+        errors = ratios.map(lambda cell: cell.std() / np.sqrt(len(cell)) if len(cell) else 0)
+        tables.draw_bars(axes, ratios.to_dict("list"), errors.to_dict("list"), list(ratios.index),
+                         title=title, xlabel="what is not as it was thought")
     return {"pays": tables.with_legend(figure, panels, 3)}
 
 

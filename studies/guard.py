@@ -19,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pandas as pd
@@ -78,16 +79,13 @@ def steps(inputs: Path) -> dict[str, Callable[[Path, Path], dict]]:
     """Every step by name: (source tree, scratch folder) -> results."""
     write_inputs(inputs)
     rbm = inputs / "rbm"
-    found: dict[str, Callable[[Path, Path], dict]] = {}
-    for case in CASES:
-        found[f"close-loop {case}"] = lambda tree, scratch, case=case: close_loop(
-            tree, scratch, inputs / case.replace(":", "-"))
-    for model in MODELS:
-        found[f"fit {model}"] = lambda tree, scratch, model=model: fit(tree, scratch, rbm, model)
-    found["compare"] = lambda tree, scratch: compare(tree, scratch, rbm)
-    found["marl"] = lambda tree, scratch: marl(tree, scratch, rbm / "scene")
+    found: dict[str, Callable[[Path, Path], dict]] = {
+        f"close-loop {case}": partial(close_loop, inputs=inputs / case.replace(":", "-"))
+        for case in CASES}
+    found |= {f"fit {model}": partial(fit, inputs=rbm, model=model) for model in MODELS}
+    found |= {"compare": partial(compare, inputs=rbm), "marl": partial(marl, scene=rbm / "scene")}
     if (inputs / "powder").is_dir():
-        found["locate powder"] = lambda tree, scratch: locate(tree, scratch, inputs / "powder")
+        found["locate powder"] = partial(locate, inputs=inputs / "powder")
     return found
 
 
@@ -145,7 +143,8 @@ def call(tree: Path, scratch: Path, *words: object, module: str = "radiotwin.cli
                          f"{done.stdout}{done.stderr}")
 
 
-def close_loop(tree: Path, scratch: Path, inputs: Path, *options: object) -> dict:
+def close_loop(tree: Path, scratch: Path, inputs: Path,
+               options: tuple[object, ...] = ()) -> dict:
     """Verdict, names and errors of one loop."""
     options = options or ("--scene", inputs / "scene")
     call(tree, scratch, "close-loop", inputs / "measurements.csv", *options, "-o", "loop")
@@ -190,7 +189,7 @@ def compare(tree: Path, scratch: Path, inputs: Path) -> dict:
 
 def locate(tree: Path, scratch: Path, inputs: Path) -> dict:
     """Names on the known days of the real set, and places of the last day's transmitters."""
-    found = close_loop(tree, scratch, inputs / "known", "--base", "log-distance")
+    found = close_loop(tree, scratch, inputs / "known", ("--base", "log-distance"))
     call(tree, scratch, "locate", inputs / "unknown" / "measurements.csv", "--twin", "loop/twin",
          "-o", "located.csv")
     places = pd.read_csv(scratch / "located.csv").set_index("device")

@@ -6,19 +6,21 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from pydantic import BaseModel
 
-from marl.algorithm import run_algorithm
+from marl.algorithm1 import run_algorithm
 from marl.environment import Frame
 from marl.figures import LEVEL_STYLES, choose_flight, trajectories_figure
 from marl.flights import Flights
 from marl.mission import Known, make_mission
-from marl.settings import LEARNERS, PRESETS, RUNS, LearnerSettings, RunSettings
+from marl.registry import learner_class
+from marl.settings import PRESETS, RUNS, LearnerSettings, RunSettings
 from marl.threads import torch_device
 from radiotwin import Scene, segmented_truth
 from radiotwin.progress import progress
 from studies import tables
-from studies.runner import Study
-from studies.tables import RATIO, Curve, last, markdown, number, over_seeds, shown, with_sd, worlds
+from studies.runner import RECORDS, Study, read_rows
+from studies.tables import RATIO, Curve, last, markdown, number, over_seeds, with_sd, worlds
 
 CITIES = ("rbm", "rdm")
 PAPER_MAPS = ("runs/paper_rbm", "runs/paper_rdm")  # made by studies.paper_maps
@@ -32,25 +34,24 @@ LEVELS = ("greedy", "random")  # need no real episode
 ENOUGH = 0.95  # of what both learners reach at least
 
 
-def learn(seed: int, settings: dict) -> dict:
-    """Run Algorithm 1.
+def _own(model: type[BaseModel], values: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in values.items() if name in model.model_fields}
 
-    Args:
-        seed: of everything random.
-        settings: fields of `RunSettings` and `LearnerSettings`.
+
+def learn(seed: int, settings: dict) -> dict:
+    """Run Algorithm 1 with fields of `RunSettings` and `LearnerSettings`.
 
     Returns:
         `curve`: columns, a value for each round; for the picture of FedQMIX, seed 0, `known_m`:
         positions that the UAVs know at the end, and `flight`: the median one at the end.
     """
-    own = {"scene": tables.scene_folder(settings["scene"]), "seed": seed}
-    run, learner = (model.model_validate({name: value for name, value in (settings | own).items()
-                                          if name in model.model_fields})
-                    for model in (RunSettings, LearnerSettings))
+    values = settings | {"scene": tables.scene_folder(settings["scene"]), "seed": seed}
+    run = RunSettings(**_own(RunSettings, values))
+    learner = LearnerSettings(**_own(LearnerSettings, values))
     scene, truth = tables.load_world(settings)
     scene.check_map(truth)
-    episodes = run.real_episodes * run.episodes
-    with progress(f"{run.algorithm}, seed {seed}", total=episodes) as advance:
+    total = run.real_episodes * run.episodes
+    with progress(f"{run.algorithm}, seed {seed}", total=total) as advance:
         outcome = run_algorithm(run, learner, scene, truth, None, False, lambda rows, blocks: None,
                                 advance, torch_device(run.device))
     result: dict[str, Any] = {"curve": pd.DataFrame(outcome.rows).to_dict("list")}
@@ -68,15 +69,15 @@ def learn(seed: int, settings: dict) -> dict:
 def case(scene: str, truth: str, algorithm: str, twin: str = "nn", **changes: Any) -> dict:
     """Return the settings of a row: those of a preset (`fast`), and what is changed in them."""
     preset = changes.get("preset", "fast")
-    run, learner = ({name: value for name, value in changes.items() if name in model.model_fields}
-                    for model in (RunSettings, LearnerSettings))
-    settings = RunSettings(truth=truth, twin=twin, algorithm=algorithm, **RUNS[preset] | run)
-    learning = PRESETS[preset].model_copy(update={"mix": algorithm != "iql"} | learner)
-    return settings.model_dump(mode="json", exclude={"seed", "compare"}) | {"scene": scene} | (
-        learning.model_dump(mode="json") if algorithm in LEARNERS else {})
+    fixed = {"truth": truth, "twin": twin, "algorithm": algorithm}
+    run = RunSettings(**fixed | RUNS[preset] | _own(RunSettings, changes))
+    settings = run.model_dump(mode="json", exclude={"seed", "compare"}) | {"scene": scene}
+    learner = PRESETS[preset].model_copy(update=_own(LearnerSettings, changes))
+    return settings | (learner.model_dump() if learner_class(algorithm).learns else {})
 
 
-def named_cases(scenes: tuple[str, ...], truth: str, kinds: dict[str, dict]) -> dict[str, dict]:
+def named_cases(scenes: tuple[str, ...], truth: str, kinds: dict[str, dict[str, Any]]
+                ) -> dict[str, dict]:
     """Return rows of all scenes, kinds being `case`'s other arguments by name."""
     return {f"{Path(scene).name}-{truth}-{name}": case(scene, truth, **changes)
             for scene in scenes for name, changes in kinds.items()}
@@ -114,64 +115,39 @@ def federation_cases(seed: int) -> dict[str, dict]:
 
 
 def tuning_cases(seed: int) -> dict[str, dict]:
-    """Return one change at a time; the rows `earlier` are changes of what the preset was before."""
-    slot, policy, again = {"twin_shadowing": "slot"}, {"measure": "policy"}, {"fly_again": True}
+    """Return one change at a time; the rows `earlier` are changes of what the preset was before.
+
+    The record has rows of options, too, that did not pay and that version 0.1 had.
+    """
+    slot, policy = {"twin_shadowing": "slot"}, {"measure": "policy"}
     earlier = policy | slot | {"first_flight": "random"}
-    kinds = {"as-it-is": {}, "shadowing-slot": slot, "measure-policy": policy,
-             "measure-policy-fly-again": policy | again, "shadowing-slot-fly-again": slot | again,
-             "measure-policy-shadowing-slot-fly-again": policy | slot | again, "earlier": earlier,
-             "earlier-excursions-1": earlier | {"excursion_slots": 1.0},
-             "earlier-fly-again": earlier | again,
-             "earlier-restart-0.3": earlier | {"restart_epsilon": 0.3},
-             "earlier-measure-planner": earlier | {"measure": "planner"}}
+    kinds: dict[str, dict] = {
+        "as-it-is": {}, "shadowing-slot": slot, "measure-policy": policy, "earlier": earlier,
+        "earlier-excursions-1": earlier | {"excursion_slots": 1.0}}
     return named_cases(CITIES, "traced", {name: {"algorithm": "qmix"} | changes
                                           for name, changes in kinds.items()})
 
 
-BEFORE = {"first_flight": "random", "measure": "policy", "twin_shadowing": "slot",
-          "excursion_slots": 1.0}
-"""The defaults when the study `options` was made."""
-
-
 def options_cases(seed: int) -> dict[str, dict]:
-    """Return the learner's options, on top of the defaults of then."""
-    qmix, plan = {"algorithm": "qmix"}, {"algorithm": "planner"}
-    fixed = {"twin": "truth", "real_episodes": 1}
-    aloof, greedy = {"algorithm": "random"} | fixed, {"algorithm": "greedy"} | fixed
-    paper = {"twin": "truth", "preset": "paper", "real_episodes": 2}
-    few, many, in_truth = {"planner_iterations": 20_000}, {"flights": 200}, {"twin": "truth"}
-    traced = {"random": aloof, "greedy": greedy, "planner_nn": plan,
-              "planner_log-distance": plan | {"twin": "log-distance"}, "qmix_nn": qmix,
-              "qmix_truth": qmix | in_truth, "qmix_log-distance": qmix | {"twin": "log-distance"}}
-    segmented = {"random": aloof | many,
-                 "random_maxrate": aloof | many | {"assignment": "max-rate"},
-                 "greedy": greedy | many, "planner": plan | fixed | many | few,
-                 "paper_iql": {"algorithm": "iql"} | paper, "paper_qmix": qmix | paper,
-                 "qmix_truth": qmix | in_truth, "qmix": qmix,
-                 "fedqmix": {"algorithm": "fedqmix"},
-                 "qmix_2real": qmix | {"real_episodes": 2, "episodes": 4000},
-                 "qmix_guided": qmix | {"guide": "planner"} | few}
-    return {name: settings for scenes, truth, kinds in ((PAPER_MAPS, "segmented", segmented),
-                                                       (CITIES, "traced", traced))
-            for name, settings in named_cases(scenes, truth, {
-                kind: BEFORE | changes for kind, changes in kinds.items()}).items()}
+    """Return the rows of the record: the learner's options, on top of the defaults of then."""
+    return {row["name"]: row["settings"] for row in read_rows("options", RECORDS)}
 
 
 def curve_table(rows: pd.DataFrame) -> str:
     """Return what is collected at the end, and the real episodes that the same ratio takes."""
     parts = []
-    for truth, scene, runs in worlds(rows):
+    for title, _, runs in worlds(rows):
         curves = {name: over_seeds(runs[name]["curve"]) for name in LABELS if name in runs}
         target, lines = common_ratio(curves), []
         for name, curve in curves.items():
-            seeds, level = runs[name], name in LEVELS
-            lines.append([LABELS[name], "" if level else number(curve.x[-1], 0),
-                          with_sd(last(seeds["curve"])),
-                          "" if level else number(curve.needed(target), 0), str(len(seeds)),
-                          number(seeds["cpu_s"].mean(), 0)])
-        table = markdown(["", "real episodes", "collected at the end",
-                          f"real episodes to {target:.3f}", "seeds", "CPU s each"], lines)
-        parts.append(f"**{shown(scene, truth)}**\n\n{table}{factors(curves, target)}")
+            episodes = [curve.x[-1], curve.needed(target)]
+            episodes = ["" if name in LEVELS else number(each, 0) for each in episodes]
+            lines.append([LABELS[name], episodes[0], with_sd(last(runs[name]["curve"])),
+                          episodes[1], str(len(runs[name])),
+                          number(runs[name]["cpu_s"].mean(), 0)])
+        heads = ["", "real episodes", "collected at the end", f"real episodes to {target:.3f}",
+                 "seeds", "CPU s each"]
+        parts.append(markdown(heads, lines, title) + factors(curves, target))
     return "\n\n".join(parts) + (
         '\n\n±: standard deviation over seeds. "Real episodes to": the first round whose mean over '
         f"seeds is as high; the ratio is {ENOUGH:.0%} of what both model-aided FedQMIX and QMIX on "
@@ -188,22 +164,20 @@ def common_ratio(curves: dict[str, Curve]) -> float:
 def factors(curves: dict[str, Curve], target: float) -> str:
     """Return how many times as many real episodes QMIX needs without a twin."""
     real = curves["qmix-truth"].needed(target) if "qmix-truth" in curves else np.nan
-    texts = []
-    for name in ("fedqmix-nn", "qmix-nn", "qmix-log-distance", "fedqmix-raytrace", "planner-nn",
-                 "planner-raytrace"):
-        if name in curves and real == real:
-            needed = curves[name].needed(target)
-            texts.append(f"{LABELS[name]} {needed:.0f} (a factor of {real / needed:,.0f})"
-                         if needed == needed else
-                         f"{LABELS[name]} does not reach it in {curves[name].x[-1]:.0f}")
+    needed = {name: curve.needed(target) for name, curve in curves.items()
+              if not name.endswith("-truth") and name not in LEVELS}
+    texts = [f"{LABELS[name]} {count:.0f} (a factor of {real / count:,.0f})" if count == count else
+             f"{LABELS[name]} does not reach it in {curves[name].x[-1]:.0f}"
+             for name, count in needed.items()]
     return (f"\n\nQMIX without a twin takes {real:,.0f} or fewer for {target:.3f}; "
-            f"{'; '.join(texts)}.") if texts else ""
+            f"{'; '.join(texts)}.") if texts and real == real else ""
 
 
 def federation_table(rows: pd.DataFrame) -> str:
     """Return FedQMIX and QMIX by simulated episodes."""
+    heads = ["", "episodes of a replica", "simulated in all", "CPU s", "collected", "seeds"]
     parts = []
-    for _, scene, runs in worlds(rows):
+    for title, _, runs in worlds(rows):
         lines = {}
         for name, seeds in runs.items():
             settings = seeds["settings"].iloc[0]
@@ -211,9 +185,8 @@ def federation_table(rows: pd.DataFrame) -> str:
             lines[simulated, name] = [
                 name, f"{settings['episodes'] * settings['real_episodes']:,}", f"{simulated:,}",
                 number(seeds["cpu_s"].mean(), 0), with_sd(last(seeds["curve"])), str(len(seeds))]
-        heads = ["", "episodes of a replica", "simulated in all", "CPU s", "collected", "seeds"]
-        table = markdown(heads, [lines[key] for key in sorted(lines)])
-        parts.append(f"**{scene}, statistical truth, 10 real episodes**\n\n{table}")
+        parts.append(markdown(heads, [lines[key] for key in sorted(lines)],
+                              f"{title}, 10 real episodes"))
     return "\n\n".join(parts) + (
         "\n\nEqual for a replica: `fedqmix-3x800` and `qmix-800` (equal time where there are three "
         "cores). Equal in all: `fedqmix-3x267` and `qmix-800`, `fedqmix-3x800` and `qmix-2400` "
@@ -221,64 +194,64 @@ def federation_table(rows: pd.DataFrame) -> str:
         "`weights`: moments and target networks are not averaged.")
 
 
-def options(settings: dict, without: tuple[str, ...] = ("scene", "truth", "algorithm"),
-            changed: dict[str, Any] = {}) -> str:  # noqa: B006 - not written to
+def options(settings: dict, hidden: tuple[str, ...] = ("scene", "truth", "algorithm"),
+            **changed: Any) -> str:
     """Return what differs from the defaults (some `changed`), as options of `marl.fedqmix`."""
     defaults = RunSettings().model_dump(mode="json") | LearnerSettings().model_dump() | changed
     given = [f"--{name.replace('_', '-')} {str(value).lower()}" for name, value in settings.items()
-             if name not in without and value != defaults[name]]
+             if name not in hidden and value != defaults.get(name)]
     return f"`{' '.join(given)}`" if given else "as it is"
 
 
 def tuning_table(rows: pd.DataFrame) -> str:
     """Return one change at a time."""
     heads = ["options", "collected", "in the twin", "worst position error at the end [m]", "seeds"]
-    return "\n\n".join(f"**{shown(scene, truth)}, model-aided QMIX**\n\n" + markdown(heads, [
-        [options(seeds["settings"].iloc[0]), with_sd(last(seeds["curve"])),
-         with_sd(last(seeds["curve"], "twin_ratio")),
-         number(np.mean(last(seeds["curve"], "location_error_worst_m")), 0), str(len(seeds))]
-        for seeds in runs.values()]) for truth, scene, runs in worlds(rows))
+    return "\n\n".join(markdown(heads, [
+        [options(seeds["settings"].iloc[0]),
+         *(with_sd(last(seeds["curve"], column)) for column in ("truth_ratio", "twin_ratio")),
+         f"{np.mean(last(seeds['curve'], 'location_error_worst_m')):,.0f}", str(len(seeds))]
+        for seeds in runs.values()], f"{title}, model-aided QMIX")
+        for title, _, runs in worlds(rows))
 
 
 def options_table(rows: pd.DataFrame) -> str:
     """Return what each option collects in both cities, options as `marl.fedqmix` has them."""
-    cells: dict[str, dict[str, dict[str, str]]] = {"segmented": {}, "traced": {}}
-    for truth, scene, runs in worlds(rows):
+    before = {"first_flight": "random", "measure": "policy", "twin_shadowing": "slot",
+              "excursion_slots": 1.0, "algorithm": ""}
+    titles = {"segmented": "The paper's maps, statistical truth", "traced": "Ray-traced truth"}
+    cells: dict[str, dict[str, dict[str, str]]] = {truth: {} for truth in titles}
+    for _, scene, runs in worlds(rows):
         for seeds in runs.values():
             settings = seeds["settings"].iloc[0]
             own = LearnerSettings.model_fields if settings["preset"] == "paper" else ()
-            hide = ("scene", "truth", "flights", *own)  # the preset says what the learner's are
-            text = options(settings, hide, BEFORE | {"algorithm": ""})
-            cells[truth].setdefault(text, {})[scene[-3:]] = f"{np.mean(last(seeds['curve'])):.3f}"
-    titles = {"segmented": "The paper's maps, statistical truth", "traced": "Ray-traced truth"}
-    return "\n\n".join(f"**{title}**\n\n" + markdown(["options", "RBM", "RDM"], [
+            hidden = ("scene", "truth", "flights", *own)  # the preset says what the learner's are
+            row = cells[settings["truth"]].setdefault(options(settings, hidden, **before), {})
+            row[scene[-3:]] = f"{np.mean(last(seeds['curve'])):.3f}"
+    return "\n\n".join(markdown(["options", "RBM", "RDM"], [
         [text, *(ratio.get(scene, "") for scene in CITIES)]
-        for text, ratio in cells[truth].items()]) for truth, title in titles.items())
+        for text, ratio in cells[truth].items()], title) for truth, title in titles.items())
 
 
 def curve_figures(rows: pd.DataFrame) -> dict[str, Figure]:
     """Draw collected data against real episodes, a panel a world; and the flights of FedQMIX."""
     found = list(worlds(rows))
     figure, panels = tables.make_panels(len(found), 2, 4.1)
-    for axes, (truth, scene, runs) in zip(panels, found):
+    for axes, (title, _, runs) in zip(panels, found):
         for index, name in enumerate(name for name in LABELS if name not in LEVELS):
             if name in runs:
                 tables.draw_line(axes, over_seeds(runs[name]["curve"]), LABELS[name], index)
         for style, name in zip(LEVEL_STYLES, LEVELS):
             if name in runs:
-                axes.axhline(np.mean(last(runs[name]["curve"])), color="black", linestyle=style,
-                             linewidth=1.1, label=LABELS[name])
-        axes.set(xscale="log", ylim=(0, 1.02), xlabel="real episodes", ylabel=RATIO,
-                 title=shown(scene, truth))
-        axes.grid(alpha=0.3)
+                axes.axhline(float(np.mean(last(runs[name]["curve"]))), color="black",
+                             linestyle=style, linewidth=1.1, label=LABELS[name])
+        axes.set(xscale="log", ylim=(0, 1.02), xlabel="real episodes", ylabel=RATIO, title=title)
     flown = rows[rows["name"].str.endswith("-traced-fedqmix-nn") & (rows["seed"] == 0)]
     return {"curve": tables.with_legend(figure, panels, 3)} | {
         f"trajectories-{row.settings['scene']}": _draw_flight(row) for row in flown.itertuples()}
 
 
 def _draw_flight(row: Any) -> Figure:
-    scene = Scene.load(tables.scene_folder(row.settings["scene"]))
-    known = Known({name: tuple(position_m) for name, position_m in row.known_m.items()})
+    scene, known = Scene.load(tables.scene_folder(row.settings["scene"])), Known(row.known_m)
     mission = make_mission(scene, segmented_truth(scene), known)
     flown = {name: np.array(values)[None] for name, values in row.flight.items()}
     slots, devices = flown["cell"].shape[1], mission.devices
@@ -296,14 +269,13 @@ def federation_figures(rows: pd.DataFrame) -> dict[str, Figure]:
     """Draw collected data over the episodes of a replica, and over all."""
     found = list(worlds(rows))
     figure, panels = tables.make_panels(2 * len(found), 2, 4.1)
-    for row, (truth, scene, runs) in enumerate(found):
+    for row, (title, _, runs) in enumerate(found):
         for axes, of in zip(panels[2 * row:], ("a replica", "all replicas")):
             for index, (name, seeds) in enumerate(runs.items()):
                 curve = over_seeds(seeds["curve"], x="simulated_episodes")
                 share = 3 if name.startswith("fedqmix") and of == "a replica" else 1
                 tables.draw_line(axes, curve._replace(x=curve.x / share), name, index)
-            axes.set(xlabel=f"simulated episodes of {of}", ylabel=RATIO, title=shown(scene, truth))
-            axes.grid(alpha=0.3)
+            axes.set(xlabel=f"simulated episodes of {of}", ylabel=RATIO, title=title)
     return {"federation": tables.with_legend(figure, panels, 3)}
 
 

@@ -18,12 +18,7 @@ def models_cases(seed: int) -> dict[str, dict]:
 
 
 def score_models(seed: int, settings: dict) -> dict:
-    """Fit all channel models to some flights, and judge them on others and on the whole map.
-
-    Args:
-        seed: of flights, noise and fits.
-        settings: `scene`, `truth`, `flights` (to learn from, and as many to judge on), `pattern`,
-            `noise_db`.
+    """Fit all channel models to `flights`, and judge them on as many others and on the map.
 
     Returns:
         `scores` and `locations` of `compare_models` as columns.
@@ -62,7 +57,7 @@ def models_table(rows: pd.DataFrame) -> str:
         heads = ["model", *where, "position error, median [m]", "90 %", "worst",
                  "within 90 % radius"]
         city, kind = name.split("-")[0].upper(), "Ray-traced" if len(where) > 1 else "Statistical"
-        parts.append(f"**{kind} truth, {city}** ({len(seeds)} seeds)\n\n{markdown(heads, lines)}")
+        parts.append(markdown(heads, lines, f"{kind} truth, {city}", f" ({len(seeds)} seeds)"))
         if len(where) > 1:
             wide = mean.unstack()
             share = 1 - wide["segmented_nn"] / wide["log_distance"]
@@ -70,8 +65,8 @@ def models_table(rows: pd.DataFrame) -> str:
                                   for against in (HELD_OUT, "whole map") for links in CLASSES[:2])])
     heads = ["city", "held-out flights, all links", "LoS links", "whole map, all links",
              "LoS links"]
-    return "\n\n".join([*parts, "**RMSE of `segmented_nn` below that of `log_distance`**\n\n"
-                        + markdown(heads, below)])
+    title = "RMSE of `segmented_nn` below that of `log_distance`"
+    return "\n\n".join([*parts, markdown(heads, below, title)])
 
 
 STUDIES = {"models": Study("How good are the channel models?", score_models, models_cases,

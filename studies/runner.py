@@ -21,12 +21,13 @@ import radiotwin
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 
-SCHEMA = "radiotwin.study/1"
+SCHEMA, RECORDS = "radiotwin.study/1", Path(__file__).parents[1] / "docs" / "results"
 MODULES = {"models": "models", "curve": "learning", "federation": "learning", "tuning": "learning",
            "options": "learning", "twin": "twins", "quality": "twins", "pays": "disturbances",
-           "hidden": "closeloop", "null": "closeloop", "towers": "towers",
+           "hidden": "closeloop", "null": "closeloop", "towers": "twins",
            "real": "closeloop_real", "tracer": "tracer", "speed": "speed"}
 """Name of a study -> its module in this package."""
+Run = Callable[[int, dict], dict]
 Todo = list[tuple[str, int, dict]]
 
 
@@ -36,8 +37,7 @@ class Study:
 
     Attributes:
         question: one line.
-        run: `(seed, settings) -> results`, a function of a module; results are numbers, texts, and
-            lists and dicts of them.
+        run: `(seed, settings) -> results`: numbers, texts, and lists and dicts of them.
         cases: seed -> name -> settings, one row each; the most important ones first.
         table: finished rows, a column for each result -> Markdown.
         figures: finished rows -> file name without suffix -> figure.
@@ -45,7 +45,7 @@ class Study:
     """
 
     question: str
-    run: Callable[[int, dict], dict]
+    run: Run
     cases: Callable[[int], dict[str, dict]]
     table: Callable[[pd.DataFrame], str]
     figures: Callable[[pd.DataFrame], dict[str, Figure]] = lambda rows: {}
@@ -84,16 +84,10 @@ def write_rows(name: str, rows: list[dict], out: Path) -> None:
 
 
 def missing_rows(name: str, seeds: int, only: str | None, out: Path) -> Todo:
-    """Return (name, seed, settings) of the rows that a study lacks.
+    """Return (name, seed, settings) of the rows that a study lacks, of so many seeds from 0.
 
-    Args:
-        name: of the study.
-        seeds: how many, from 0.
-        only: parts of names, or NAME:SEED, with commas; None for all rows.
-        out: folder of the records.
-
-    Raises:
-        BadInput: nothing has such a name, or a finished row has other settings.
+    `only` has parts of names, or NAME:SEED, with commas; None stands for all rows. Raises BadInput
+    where nothing has such a name, or a finished row has other settings.
     """
     wanted = [(case, seed, settings) for seed in range(seeds)
               for case, settings in load_study(name).cases(seed).items()
@@ -116,26 +110,20 @@ def missing_rows(name: str, seeds: int, only: str | None, out: Path) -> Todo:
 def run_rows(name: str, todo: Todo, out: Path, jobs: int) -> Iterator[dict]:
     """Run rows in `jobs` processes (1: this one); yield each as soon as the file holds it."""
     rows, run = read_rows(name, out), load_study(name).run
-    for row in _finished(name, run, todo, jobs):
-        rows.append(row)
-        write_rows(name, rows, out)
-        yield row
-
-
-def _finished(name: str, run: Callable, todo: Todo, jobs: int) -> Iterator[dict]:
-    if jobs == 1:
-        yield from (make_row(name, run, *each) for each in todo)
-        return
-    pool = ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn"))
+    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"))
     try:
-        for done in as_completed([pool.submit(make_row, name, run, *each) for each in todo]):
-            yield done.result()
+        finished = (make_row(name, run, *each) for each in todo) if jobs == 1 else (
+            done.result() for done in as_completed(
+                [pool.submit(make_row, name, run, *each) for each in todo]))
+        for row in finished:
+            rows.append(row)
+            write_rows(name, rows, out)
+            yield row
     finally:
         pool.shutdown(cancel_futures=True)
 
 
-def make_row(study: str, run: Callable[[int, dict], dict], name: str, seed: int,
-             settings: dict) -> dict:
+def make_row(study: str, run: Run, name: str, seed: int, settings: dict) -> dict:
     """Run a row with one thread and return its record; numbers have four decimals."""
     from marl.threads import keep_memory, limit_threads  # torch: not for --help
 

@@ -1,6 +1,6 @@
 """Numbers, Markdown and panels of the studies' tables and figures."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from marl.figures import COLOURS, MARKERS
 from radiotwin import RadioMap, Scene
-from radiotwin.cli.world import read_truth
+from radiotwin.survey import read_truth
 
 RATIO = "share of all data collected in the truth"
 
@@ -41,16 +41,17 @@ def provenance(rows: list[dict]) -> str:
     copied = sorted({f"`{row['copied_from']}`" for row in rows if "copied_from" in row})
     versions, machines = ({row[key] for row in rows if row[key]} for key in ("version", "machine"))
     hours = sum(row["cpu_s"] or 0 for row in own) / 3600
-    text = (f"{len(rows)} rows of {len({row['name'] for row in rows})} kinds"
+    return (f"{len(rows)} rows of {len({row['name'] for row in rows})} kinds"
             + (f", {hours:.1f} CPU hours" if hours else "") + "; version (commit, or hash of the "
-            f"sources): {'; '.join([', '.join(sorted(versions)), *sorted(machines)])}.")
-    return text + (f" Equal rows are copied from {', '.join(copied)}." if copied else "")
+            f"sources): {'; '.join([', '.join(sorted(versions)), *sorted(machines)])}."
+            + (f" Equal rows are copied from {', '.join(copied)}." if copied else ""))
 
 
-def markdown(heads: list[str], rows: list[list[str]]) -> str:
-    """Return a table."""
-    return "\n".join(["| " + " | ".join(heads) + " |", "|" + "---|" * len(heads),
-                      *("| " + " | ".join(row) + " |" for row in rows)])
+def markdown(heads: Sequence[str], rows: list[list[str]], title: str = "", note: str = "") -> str:
+    """Return a table below its title."""
+    return "\n".join([f"**{title}**{note}\n"] * bool(title) + [
+        "| " + " | ".join(heads) + " |", "|" + "---|" * len(heads),
+        *("| " + " | ".join(row) + " |" for row in rows)])
 
 
 def number(value: float | None, digits: int = 3) -> str:
@@ -58,12 +59,12 @@ def number(value: float | None, digits: int = 3) -> str:
     return "–" if value is None or value != value else f"{value:,.{digits}f}"
 
 
-def sd(values: np.ndarray | list) -> np.ndarray:
+def sd(values: Sequence[float] | np.ndarray) -> np.ndarray:
     """Return the sample standard deviation over the first axis; 0 of one value."""
-    return np.std(values, axis=0, ddof=1 if len(values) > 1 else 0)
+    return np.std(values, axis=0, ddof=min(len(values) - 1, 1))
 
 
-def with_sd(values: list[float], digits: int = 3) -> str:
+def with_sd(values: Sequence[float] | np.ndarray, digits: int = 3) -> str:
     """Return mean ± standard deviation; of one value the value."""
     if not len(values):
         return "–"
@@ -73,11 +74,10 @@ def with_sd(values: list[float], digits: int = 3) -> str:
 
 def quantiles(errors_m: list[float | None]) -> tuple[float, float, float, float]:
     """Return median, 90 % quantile and maximum [m], and the share above 100 m; None is far away."""
-    errors = np.array([np.inf if error is None else error for error in errors_m], dtype=float)
-    # Nothing lies between a number and infinity.
-    method = "linear" if np.isfinite(errors).all() else "higher"
-    return (float(np.median(errors)), float(np.quantile(errors, 0.9, method=method)),
-            float(errors.max()), float(np.mean(errors > 100)))
+    errors = np.array([np.inf if error is None else error for error in errors_m])
+    most = pd.Series(errors).quantile(  # nothing lies between a number and infinity
+        0.9, interpolation="linear" if np.isfinite(errors).all() else "higher")
+    return float(np.median(errors)), most, float(errors.max()), float(np.mean(errors > 100))
 
 
 class Curve(NamedTuple):
@@ -106,18 +106,14 @@ def last(curves: pd.Series, column: str = "truth_ratio") -> list[float]:
 
 
 def worlds(rows: pd.DataFrame) -> Iterator[tuple[str, str, dict[str, pd.DataFrame]]]:
-    """Yield truth, scene, and its rows by name without these two; the ray-traced truth first."""
+    """Yield title, scene, and its rows by name without the world; ray-traced truths first."""
     truth = rows["settings"].str["truth"]
     scene = rows["settings"].str["scene"].str.split("/").str[-1]
     for (_, of, where), group in rows.groupby([truth != "traced", truth, scene]):
-        yield of, where, {name.removeprefix(f"{where}-").removeprefix(f"{of}-"): seeds
-                          for name, seeds in group.groupby("name")}
-
-
-def shown(scene: str, truth: str) -> str:
-    """Return a world's name for titles."""
-    kind = "ray-traced" if truth == "traced" else "statistical"
-    return f"{scene.replace('paper_', 'the paper’s ')}, {kind} truth"
+        kind = "ray-traced" if of == "traced" else "statistical"
+        yield f"{where.replace('paper_', 'the paper’s ')}, {kind} truth", where, {
+            name.removeprefix(f"{where}-").removeprefix(f"{of}-"): seeds
+            for name, seeds in group.groupby("name")}
 
 
 def make_panels(count: int, columns: int, height_in: float) -> tuple[Figure, list[Axes]]:
@@ -134,17 +130,16 @@ def make_panels(count: int, columns: int, height_in: float) -> tuple[Figure, lis
 
 def draw_line(axes: Axes, curve: Curve, label: str, index: int) -> None:
     """Draw a mean with a band of its standard deviation; a single point gets a large marker."""
-    colour, marker = COLOURS[index % len(COLOURS)], MARKERS[index % len(MARKERS)]
-    alone = {"markersize": 4}
-    if len(curve.x) == 1:
-        alone = {"markersize": 9, "markeredgecolor": "black"}
-    axes.plot(curve.x, curve.mean, marker=marker, color=colour, label=label, **alone)
+    colour, alone = COLOURS[index % len(COLOURS)], len(curve.x) == 1
+    axes.plot(curve.x, curve.mean, marker=MARKERS[index % len(MARKERS)], color=colour, label=label,
+              markersize=9 if alone else 4, markeredgecolor="black" if alone else colour)
     axes.fill_between(curve.x, curve.mean - curve.sd, curve.mean + curve.sd, color=colour,
                       alpha=0.18, linewidth=0)
+    axes.grid(True, alpha=0.3)
 
 
-def draw_bars(axes: Axes, groups: dict[str, list[list[float]]], errors: dict[str, list],
-              labels: list[str], **texts: str) -> None:
+def draw_bars(axes: Axes, groups: dict[str, list], errors: dict[str, list], labels: Sequence[str],
+              **texts: str) -> None:
     """Draw means of a group of values for each label, side by side, with error bars."""
     width = 0.8 / len(groups)
     for index, (name, cells) in enumerate(groups.items()):

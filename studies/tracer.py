@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import resource
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -34,19 +35,15 @@ def tracer_cases(seed: int) -> dict[str, dict]:
 def time_tracer(seed: int, settings: dict) -> dict:
     """Trace a sample and compare it with the reference, over the links that receivers detect there.
 
-    Args:
-        seed: of the sample.
-        settings: `scene`, `receivers`, `quality` and fields of `SolverSettings`.
-
     Returns:
         Links per second of two cores' processor time, peak memory, absolute differences [dB], and
         the share of the links that is missed.
     """
+    fixed = ("scene", "receivers", "quality")
+    solver = SolverSettings.of_quality(settings["quality"], **{
+        name: value for name, value in settings.items() if name not in fixed})
     sample = settings["scene"], settings["receivers"], seed
-    others = {name: value for name, value in settings.items()
-              if name not in ("scene", "receivers", "quality")}
-    solver = SolverSettings.of_quality(settings["quality"], **others)
-    reference_db = _reference(*sample)[0]
+    reference_db = _in_a_process(SolverSettings().finer(10), *sample)[0]
     gain_db, per_s, peak_gib = _in_a_process(solver, *sample)
     detected = reference_db >= Scene.load(scene_folder(settings["scene"])).config.gain_limit_db
     both = detected & np.isfinite(gain_db)
@@ -57,17 +54,13 @@ def time_tracer(seed: int, settings: dict) -> dict:
             "missed": 1 - both.sum() / detected.sum()}
 
 
-@lru_cache
-def _reference(scene: str, receivers: int, seed: int) -> tuple:
-    return _in_a_process(SolverSettings().finer(10), scene, receivers, seed)
-
-
-def _in_a_process(settings: SolverSettings, scene: str, receivers: int, seed: int) -> tuple:
+@lru_cache  # of the reference
+def _in_a_process(*arguments: Any) -> tuple:
     with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(_measure, (settings, scene, receivers, seed))
+        return pool.apply(trace_sample, arguments)
 
 
-def _measure(settings: SolverSettings, name: str, receivers: int, seed: int) -> tuple:
+def trace_sample(settings: SolverSettings, name: str, receivers: int, seed: int) -> tuple:
     """Return gains [dB], links per second of two cores, and peak memory [GiB]."""
     scene = Scene.load(scene_folder(name))
     rng, lattice_m = np.random.default_rng(seed), scene.lattice.positions_m
@@ -75,8 +68,7 @@ def _measure(settings: SolverSettings, name: str, receivers: int, seed: int) -> 
     solver = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings)
     solver.solve(scene.device_m[0], points_m[:settings.batch_receivers])  # compiles the kernels
     started = sum(os.times()[:2])
-    gain_db = np.stack([np.concatenate(list(solver.gains(device_m, points_m)))
-                        for device_m in scene.device_m])
+    gain_db = np.stack([solver.gains(device_m, points_m) for device_m in scene.device_m])
     cpu_s = sum(os.times()[:2]) - started
     # A batch that is not full costs what a full one does; speeds are of full ones.
     solved = len(scene.device_m) * len(solver.batches(receivers)) * settings.batch_receivers
@@ -85,14 +77,13 @@ def _measure(settings: SolverSettings, name: str, receivers: int, seed: int) -> 
 
 def tracer_table(rows: pd.DataFrame) -> str:
     """Return speed, memory and error by settings."""
-    by_name, lines = rows.set_index("name"), []
-    for name in (each for each in ROWS if each in by_name.index):
-        row = by_name.loc[name]
-        lines.append([name, f"{row['links_per_s']:.0f}", *(f"{row[column]:.2f}" for column in (
-            "peak_gib", "median_db", "p90_db", "rms_db")),
-            "0 %" if row["missed"] == 0 else f"{100 * row['missed']:.1f} %"])
-    return markdown(["settings", "links/s", "peak GiB", "median [dB]", "90 % [dB]", "RMS [dB]",
-                     "links lost"], lines)
+    by_name = rows.set_index("name")
+    heads = ["settings", "links/s", "peak GiB", "median [dB]", "90 % [dB]", "RMS [dB]",
+             "links lost"]
+    return markdown(heads, [[name, f"{row['links_per_s']:.0f}", *(
+        f"{row[column]:.2f}" for column in ("peak_gib", "median_db", "p90_db", "rms_db")),
+        "0 %" if row["missed"] == 0 else f"{100 * row['missed']:.1f} %"]
+        for name, row in ((each, by_name.loc[each]) for each in ROWS if each in by_name.index)])
 
 
 STUDIES = {"tracer": Study("What do the ray tracer's settings cost and bring?", time_tracer,

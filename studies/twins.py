@@ -1,31 +1,37 @@
-"""How good a twin is, and how good it is to train in: `quality`, `twin`."""
+"""How good a twin is, and how good it is to train in: `quality`, `twin`, `towers`."""
 
+import shutil
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+import trimesh
 from matplotlib.figure import Figure
 
+from marl.algorithm1 import Reality, location_errors_m
 from marl.environment import Environment, Frame
 from marl.figures import COLOURS, MARKERS
-from marl.flights import Flights, HeuristicPolicy, Replayed, fly
+from marl.flights import Flights, Replayed, evaluate, fly
+from marl.heuristics import PATTERN, HeuristicPolicy
+from marl.learner import make_learner
 from marl.mission import Known, Mission
 from marl.planner import PlanPolicy, plan
 from marl.randomness import stream
-from marl.reality import Reality, known_by, location_errors_m
 from marl.settings import PRESETS, LearnerSettings, RunSettings
-from marl.strategies import evaluate, make_strategy
-from marl.waypoints import PATTERN
 from radiotwin import (
     Measurements,
     RadioMap,
     Scene,
+    SolverSettings,
     Twin,
     close_loop,
     corrected_twin,
     fit_twin,
     fly_survey,
     score_map,
+    trace_map,
 )
 from radiotwin.progress import progress
 from studies import tables
@@ -43,6 +49,13 @@ QUALITY = {"segmented_nn": "NN", "log_distance": "log-distance", "regression_kri
 PUBLISHED = {("rbm", 5): "15 m; 10 % above 100 m", ("rbm", 1): "22 m; 38 % above 100 m"}
 """Median position error of the published code, by scene and real episodes."""
 REPLAYS = 10  # of a sequence of actions in a twin, whose shadowing differs from time to time
+LONG = {"episodes": 4000, "learner": PRESETS["fast"].model_copy(
+    update={"epsilon_slots": 87_500}).model_dump(mode="json")}
+"""Settings of a policy that is trained in one map."""
+TOWERS = Path("runs/towers")  # keeps the traced map, which takes a quarter of an hour
+SIDE_M, HEIGHT_M = 20.0, 52.0  # of a tower; below the UAVs
+TOWERS_M = [[496.9, 207.9], [51.0, 348.0]]  # drawn once: free ground 18 to 45 m from devices
+TRAINED_IN = {"twin": "nn", "corrected twin": "corrected", "truth": "truth"}
 
 
 def quality_cases(seed: int) -> dict[str, dict]:
@@ -54,15 +67,7 @@ def quality_cases(seed: int) -> dict[str, dict]:
 
 
 def judge_twin(seed: int, settings: dict) -> dict:
-    """Learn a twin from more and more real flights, and compare it with the truth.
-
-    Args:
-        seed: of flights, noise and fit.
-        settings: `scene`, `truth`, `model` of `fit_twin`, `survey_flights` (a list), `noise_db`.
-
-    Returns:
-        `curve`: columns, a value for each number of flights: errors of map [dB] and positions [m].
-    """
+    """Learn a twin from more and more real flights, and compare it with the truth."""
     scene, truth = tables.load_world(settings)
     rows = []
     with progress(settings["model"], total=len(settings["survey_flights"])) as advance:
@@ -77,33 +82,25 @@ def judge_twin(seed: int, settings: dict) -> dict:
 
 def twin_cases(seed: int) -> dict[str, dict]:
     """Return the same five real flights, six twins and one learner."""
-    learner = PRESETS["fast"].model_copy(update={"epsilon_slots": 87_500}).model_dump(mode="json")
-    return {f"{scene}-{name}": {
+    return {f"{scene}-{name}": LONG | {
         "scene": scene, "truth": "traced", "twin": name, "survey_flights": 5, "noise_db": 1.0,
-        "episodes": 4000, "learner": learner, "planner_iterations": 60_000, "flights": 64,
-        "replayed_flights": 20} for scene in ("rbm", "rdm") for name in TWINS}
+        "planner_iterations": 60_000, "flights": 64, "replayed_flights": 20}
+        for scene in ("rbm", "rdm") for name in TWINS}
 
 
 def train_in(seed: int, settings: dict) -> dict:
     """Learn a twin from real flights, train and plan in it, fly in the truth.
-
-    Args:
-        seed: of everything random.
-        settings: `scene`, `truth`, `twin` (a key of `TWINS`), `survey_flights`, `noise_db`,
-            `episodes`, `learner` (fields of `LearnerSettings`), `planner_iterations`, `flights` of
-            an evaluation, `replayed_flights`.
 
     Returns:
         Shares that policy and plan collect in the map that they were made in and in the truth;
         `curve`: checks of the policy during training; `fidelity` (see there); errors of the twin.
     """
     scene, truth = tables.load_world(settings)
-    name = settings["twin"]
     measured = _survey(scene, truth, settings["survey_flights"], settings["noise_db"], seed)
-    twin = None if name == "truth" else _learnt(name, seed, scene, measured)
+    twin = _learnt(settings["twin"], seed, scene, measured)
     reality = Reality(scene, truth, "matching", settings["noise_db"], seed)
-    chosen = {key: settings[key] for key in ("episodes", "flights", "planner_iterations")}
-    run = RunSettings(algorithm="qmix", real_episodes=1, seed=seed, **chosen)
+    run = RunSettings(algorithm="qmix", real_episodes=1, seed=seed, **{
+        key: settings[key] for key in ("episodes", "flights", "planner_iterations")})
     learner = LearnerSettings.model_validate(settings["learner"])
     result, inside = train_and_fly(reality, twin, run, learner, measured)
     if twin is not None:
@@ -121,22 +118,22 @@ def train_and_fly(reality: Reality, twin: Twin | None, run: RunSettings, learner
         `WHO_WHERE_ratio` for `trained`, `plan` and `twin`, `truth`; `curve`: checks during
         training; and the mission that was trained in.
     """
-    known = Known.truth(reality.scene) if twin is None else known_by(twin)
+    known = Known.truth(reality.scene) if twin is None else Known.of(twin.devices)
     real = reality.mission(known)
     inside = real if twin is None else reality.twin_mission(twin, known, measured)
-    strategy, result = make_strategy(run, learner, inside, 1, "cpu"), {}
+    trained, result = make_learner(run, learner, inside, 1), {}
     try:
         with progress(f"training, seed {run.seed}", total=run.episodes) as advance:
-            checks = strategy.prepare(inside, advance)
+            checks = trained.prepare(inside, advance)
         planned = plan(inside, run.planner_iterations, run.seed).actions
-        for who, policy in (("trained", strategy.policy(stream(run.seed, "decisions", 0))),
+        for who, policy in (("trained", trained.policy(stream(run.seed, "decisions", 0))),
                             ("plan", PlanPolicy(planned))):
             for where, mission in (("twin", inside), ("truth", real)):
-                rng = stream(run.seed, f"{where} evaluation")
-                flown = evaluate(mission, policy, run.flights, rng)
+                flown = evaluate(mission, policy, run.flights,
+                                 stream(run.seed, f"{where} evaluation"))
                 result[f"{who}_{where}_ratio"] = flown.ratio(mission).mean()
     finally:
-        strategy.close()
+        trained.close()
     return result | {"curve": {"episodes": [check["episodes"] for check in checks],
                                "ratio": [check["twin_ratio"] for check in checks]}}, inside
 
@@ -145,7 +142,7 @@ class Mixed:
     """Greedy flights with true positions, the first without random actions, the last all random."""
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self._policies = [HeuristicPolicy(name, rng) for name in ("greedy", "random")]
+        self._policies = [HeuristicPolicy(name, rng) for name in ("random", "greedy")]
         self._rng = rng
 
     def start(self, mission: Mission, flights: int) -> None:
@@ -157,22 +154,15 @@ class Mixed:
     def act(self, frame: Frame) -> np.ndarray:
         """Return the actions of a slot."""
         explores = self._rng.random(frame.battery.shape) < self._share
-        random, greedy = (policy.act(frame) for policy in self._policies[::-1])
-        return np.where(explores, random, greedy)
+        return np.where(explores, *(policy.act(frame) for policy in self._policies))
 
 
 def fidelity(real: Mission, twin: Mission, flights: int, seed: int) -> dict[str, float]:
-    """Compare what the same actions collect in a twin and in the truth.
-
-    Args:
-        real: the mission in the truth.
-        twin: the mission in the twin.
-        flights: sequences of actions, from greedy to random.
-        seed: of these.
+    """Compare what the same `flights` sequences of actions collect in a twin and in the truth.
 
     Returns:
-        Over the sequences: `correlation` of the collected shares, `bias` (twin - truth), `rmse`;
-        the same for the share collected from each device, with the prefix `device_`.
+        Over the sequences, from greedy to random: `correlation` of the collected shares, `bias`
+        (twin - truth), `rmse`; the same for the share from each device, with `device_` before.
     """
     def by_device(flown: Flights) -> np.ndarray:
         taken, served = np.zeros(flown.frames.data_units.shape[::2]), flown.frames.assigned
@@ -180,8 +170,8 @@ def fidelity(real: Mission, twin: Mission, flights: int, seed: int) -> dict[str,
         np.add.at(taken, (flight, served[flight, slot, uav]), flown.collected[flight, slot, uav])
         return taken / flown.frames.data_units[:, 0]
 
-    mixed = Mixed(stream(seed, "decisions", 1))
-    flown = fly(Environment(real, flights, stream(seed, "real flight")), mixed)
+    flown = fly(Environment(real, flights, stream(seed, "real flight")),
+                Mixed(stream(seed, "decisions", 1)))
     here = np.mean([by_device(fly(
         Environment(twin, flights, stream(seed, "twin evaluation", index)), Replayed(flown.action)))
         for index in range(REPLAYS)], axis=0)
@@ -194,18 +184,60 @@ def fidelity(real: Mission, twin: Mission, flights: int, seed: int) -> dict[str,
     return found
 
 
+def towers_cases(seed: int) -> dict[str, dict]:
+    """Return what FedQMIX trains in."""
+    return {name: {"scene": "rbm", "algorithm": "fedqmix", "episodes": 3000, "trained_in": name}
+            for name in TRAINED_IN}
+
+
+def train_with_towers(seed: int, settings: dict) -> dict:
+    """Train in a twin of a city with two towers that no map shows, and fly in the truth."""
+    scene = Scene.load(tables.scene_folder(settings["scene"]))
+    truth = trace_map(with_towers(scene, TOWERS / "truth"), SolverSettings(), TOWERS / "truth.nc")
+    truth.dataset.attrs["scene_hash"] = scene.content_hash()  # nobody knows that it is another city
+    measured = _survey(scene, truth, 5, 1.0, seed)
+    twin = _learnt(TRAINED_IN[settings["trained_in"]], seed, scene, measured)
+    run = RunSettings(algorithm=settings["algorithm"], episodes=settings["episodes"], seed=seed,
+                      real_episodes=1, flights=16)
+    reality = Reality(scene, truth, run.assignment, 0.0, seed)
+    result = train_and_fly(reality, twin, run, PRESETS["fast"])[0]
+    errors = {} if twin is None else _errors(twin, scene, truth)
+    return {"trained_ratio": result["trained_twin_ratio"],
+            "truth_ratio": result["trained_truth_ratio"],
+            "map_rmse_db": errors.get("map_rmse_db"), "towers_m": TOWERS_M}
+
+
+def with_towers(scene: Scene, folder: Path) -> Scene:
+    """Write a copy of a scene folder with towers of concrete in it, unless it is there."""
+    if not (folder / "scene.toml").exists():
+        shutil.copytree(scene.folder, folder, ignore=shutil.ignore_patterns("cache", "truth*.nc"),
+                        dirs_exist_ok=True)
+        tree = ElementTree.parse(folder / "city.xml")
+        for index, middle_m in enumerate(TOWERS_M):
+            box = trimesh.creation.box(extents=[SIDE_M, SIDE_M, HEIGHT_M])
+            box.apply_translation([*middle_m, HEIGHT_M / 2])
+            box.export(folder / "meshes" / f"tower_{index}.ply")
+            tree.getroot().append(ElementTree.fromstring(
+                f'<shape type="ply" id="mesh-tower_{index}"><string name="filename" '
+                f'value="meshes/tower_{index}.ply"/><boolean name="face_normals" value="true"/>'
+                '<ref id="mat-concrete" name="bsdf"/></shape>'))
+        tree.write(folder / "city.xml", encoding="utf-8", xml_declaration=True)
+    return Scene.load(folder)
+
+
 def _survey(scene: Scene, truth: RadioMap, flights: int, noise_db: float,
             seed: int) -> Measurements:
     return fly_survey(scene, truth, flights=flights, pattern=PATTERN, seed=seed,
                       noise_db=0.0 if "sigma_db" in truth.dataset else noise_db)
 
 
-def _learnt(name: str, seed: int, scene: Scene, measured: Measurements) -> Twin:
+def _learnt(name: str, seed: int, scene: Scene, measured: Measurements) -> Twin | None:
+    """Return a twin of `TWINS`; None: the truth."""
     if name != "corrected":
-        return fit_twin(measured, scene, model=MODELS[name], seed=seed)
+        return fit_twin(measured, scene, model=MODELS[name], seed=seed) if name in MODELS else None
     with progress("closing the loop", total=None) as advance:
-        loop = close_loop(measured, scene, "auto", seed, lambda text: advance(1, text))
-    return corrected_twin(loop, scene)
+        return corrected_twin(
+            close_loop(measured, scene, "auto", seed, lambda text: advance(1, text)), scene)
 
 
 def _errors(twin: Twin, scene: Scene, truth: RadioMap) -> dict:
@@ -213,83 +245,91 @@ def _errors(twin: Twin, scene: Scene, truth: RadioMap) -> dict:
     rmse_db = {row["links"]: row["rmse_db"] for row in scores}
     return {"map_rmse_db": rmse_db["all"], "map_rmse_los_db": rmse_db["LoS"],
             "map_rmse_nlos_db": rmse_db["NLoS"],
-            "location_errors_m": location_errors_m(scene, known_by(twin)).tolist()}
+            "location_errors_m": location_errors_m(scene, Known.of(twin.devices)).tolist()}
+
+
+def _located(curves: pd.Series) -> list[tuple[float, float, float, float]]:
+    """Return `quantiles` of the position errors of all seeds, by number of flights."""
+    each = [curve["location_errors_m"] for curve in curves]
+    return [quantiles(sum(errors_m, [])) for errors_m in zip(*each)]
 
 
 def quality_table(rows: pd.DataFrame) -> str:
     """Return errors of map and positions by real episodes."""
-    parts = []
-    for _, scene, runs in worlds(rows):
+    parts, names = [], [f"map_rmse_{links}db" for links in ("", "los_", "nlos_")]
+    heads = ["model", "real episodes", "map RMSE, all / LoS / NLoS [dB]",
+             "position error, median [m]", "90 %", "worst", "above 100 m",
+             "published code, its map and truth", "seeds"]
+    for title, scene, runs in worlds(rows):
         lines = []
         for name in (each for each in QUALITY if each in runs):
-            curves = list(runs[name]["curve"])
-            for at, flights in enumerate(curves[0]["real_episodes"]):
-                errors_m = [error for curve in curves for error in curve["location_errors_m"][at]]
-                median, most, worst, far = quantiles(errors_m)
-                rmse_db = [np.mean([curve[f"map_rmse_{links}db"][at] for curve in curves])
-                           for links in ("", "los_", "nlos_")]
+            curves = runs[name]["curve"]
+            rmse_db = np.array([over_seeds(curves, y=each).mean for each in names]).T
+            for flights, of_map_db, (median, most, worst, far) in zip(
+                    curves.iloc[0]["real_episodes"], rmse_db, _located(curves)):
                 published = PUBLISHED.get((scene, flights), "") if name == "segmented_nn" else ""
                 lines.append([QUALITY[name], str(flights),
-                              " / ".join(f"{each:.1f}" for each in rmse_db), f"{median:.1f}",
+                              " / ".join(f"{each:.1f}" for each in of_map_db), f"{median:.1f}",
                               f"{most:.0f}", f"{worst:.0f}", f"{far:.0%}", published,
                               str(len(curves))])
-        heads = ["model", "real episodes", "map RMSE, all / LoS / NLoS [dB]",
-                 "position error, median [m]", "90 %", "worst", "above 100 m",
-                 "published code, its map and truth", "seeds"]
-        parts.append(f"**{scene}, ray-traced truth**\n\n{markdown(heads, lines)}")
+        parts.append(markdown(heads, lines, title))
     return "\n\n".join(parts)
 
 
 def twin_table(rows: pd.DataFrame) -> str:
     """Return what training and planning in each twin is worth."""
     parts = []
-    for _, scene, runs in worlds(rows):
+    heads = ["twin", "map RMSE [dB]", "position error, median / worst [m]", "correlation", "bias",
+             "correlation by device", "policy in the twin", "**policy in the truth**",
+             "plan in the twin", "**plan in the truth**", "seeds"]
+    for title, _, runs in worlds(rows):
         lines = []
-        for name in (each for each in TWINS if each in runs):
-            seeds = runs[name]
-            found = list(seeds["fidelity"].dropna())
-            errors_m = [error for each in seeds["location_errors_m"].dropna() for error in each]
+        for name, seeds in ((name, runs[name]) for name in TWINS if name in runs):
+            errors_m: list = sum(seeds["location_errors_m"].dropna(), [])
             lines.append([
                 TWINS[name], number(seeds["map_rmse_db"].mean(), 1),
                 "{:.1f} / {:.0f}".format(*quantiles(errors_m)[::2]) if errors_m else "–",
-                *(with_sd([each[key] for each in found], 2)
+                *(with_sd(seeds["fidelity"].dropna().str[key], 2)
                   for key in ("correlation", "bias", "device_correlation")),
                 *(with_sd(seeds[f"{who}_{where}_ratio"])
                   for who in ("trained", "plan") for where in ("twin", "truth")), str(len(seeds))])
-        heads = ["twin", "map RMSE [dB]", "position error, median / worst [m]", "correlation",
-                 "bias", "correlation by device", "policy in the twin",
-                 "**policy in the truth**", "plan in the twin", "**plan in the truth**", "seeds"]
-        table = markdown(heads, lines)
-        parts.append(f"**{scene}, ray-traced truth, five real flights**\n\n{table}")
+        parts.append(markdown(heads, lines, f"{title}, five real flights"))
     return "\n\n".join(parts) + (
         "\n\nCorrelation and bias (twin less truth) of the share that 20 sequences of actions, "
         "from greedy to random, collect in both.")
+
+
+def towers_table(rows: pd.DataFrame) -> str:
+    """Return what is collected in the truth, by seed."""
+    wide, kinds = rows.pivot(index="seed", columns="name"), list(TRAINED_IN)
+    ratio, error_db = wide["truth_ratio"][kinds], wide["map_rmse_db"]
+    lines = [[str(seed), *map("{:.3f}".format, each),
+              "{:.1f} → {:.1f}".format(*error_db.loc[seed, kinds[:2]])]
+             for seed, each in ratio.iterrows()]
+    table = markdown(["seed", *kinds, "error of the map, twin → corrected [dB]"], lines)
+    return f"{table}\n\nMean: {', '.join(map('{:.3f}'.format, ratio.mean()))}."
 
 
 def quality_figures(rows: pd.DataFrame) -> dict[str, Figure]:
     """Draw errors of the map and of positions against real episodes."""
     found = list(worlds(rows))
     figure, panels = tables.make_panels(2 * len(found), 2, 3.8)
-    for left, right, (_, scene, runs) in zip(panels[::2], panels[1::2], found):
+    for left, right, (title, _, runs) in zip(panels[::2], panels[1::2], found):
         episodes: set[float] = set()
         for index, name in enumerate(name for name in QUALITY if name in runs):
-            curves = runs[name]["curve"]
-            curve = over_seeds(curves, y="map_rmse_db")
+            curve = over_seeds(runs[name]["curve"], y="map_rmse_db")
             tables.draw_line(left, curve, QUALITY[name], index)
             episodes |= set(curve.x)
-            located = [[error for each in curves for error in each["location_errors_m"][at]]
-                       for at in range(len(curve.x))]
-            errors_m = [quantiles(each) for each in located]
-            right.plot(curve.x, [each[0] for each in errors_m], marker=MARKERS[index], markersize=4,
-                       color=COLOURS[index])
-            right.plot(curve.x, [each[1] for each in errors_m], ":", color=COLOURS[index])
+            median, most, *_ = zip(*_located(runs[name]["curve"]))
+            right.plot(curve.x, median, marker=MARKERS[index], markersize=4, color=COLOURS[index])
+            right.plot(curve.x, most, ":", color=COLOURS[index])
         left.set(ylabel="RMSE of the map [dB]", ylim=(0, None))
         right.set(ylabel="error of positions [m]: median, dotted 90 %", yscale="log")
         for axes in (left, right):
-            axes.set(xlabel="real episodes", xscale="log", title=f"{scene}, ray-traced truth")
+            axes.set(xlabel="real episodes", xscale="log", title=title)
             axes.set_xticks(sorted(episodes), [f"{x:.0f}" for x in sorted(episodes)], minor=False)
             axes.set_xticks([], minor=True)
-            axes.grid(alpha=0.3)
+            axes.grid(True, alpha=0.3)
     return {"quality": tables.with_legend(figure, panels, 3)}
 
 
@@ -297,15 +337,13 @@ def twin_figures(rows: pd.DataFrame) -> dict[str, Figure]:
     """Draw what policy and plan collect in the truth, by the twin that they were made in."""
     found = list(worlds(rows))
     figure, panels = tables.make_panels(len(found), 2, 4.1)
-    for axes, (_, scene, runs) in zip(panels, found):
+    for axes, (title, _, runs) in zip(panels, found):
         names = [name for name in TWINS if name in runs]
-        cells = {label: [list(runs[name][f"{key}_truth_ratio"]) for name in names]
+        cells = {label: [runs[name][f"{key}_truth_ratio"] for name in names]
                  for key, label in (("trained", "policy (QMIX)"), ("plan", "planner"))}
-        errors = {label: [float(tables.sd(each)) for each in values]
-                  for label, values in cells.items()}
+        errors = {label: [tables.sd(each) for each in values] for label, values in cells.items()}
         tables.draw_bars(axes, cells, errors, [name.replace("-", "-\n") for name in names],
-                         title=f"{scene}, ray-traced truth",
-                         xlabel="twin that it was trained or planned in")
+                         title=title, xlabel="twin that it was trained or planned in")
     return {"twin": tables.with_legend(figure, panels, 2)}
 
 
@@ -313,4 +351,6 @@ STUDIES = {
     "quality": Study("How good is the twin after how many real episodes?", judge_twin,
                      quality_cases, quality_table, quality_figures),
     "twin": Study("Which twin is worth training in?", train_in, twin_cases, twin_table,
-                  twin_figures)}
+                  twin_figures),
+    "towers": Study("What do two towers that no map shows cost a learner?", train_with_towers,
+                    towers_cases, towers_table)}

@@ -19,6 +19,8 @@ from radiotwin.scene import Scene
 from radiotwin.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
 
+pytestmark = pytest.mark.slow
+
 RBM = Path(__file__).parents[1] / "scenes" / "rbm"
 SEEDS = range(6)
 FLIGHTS = 5

@@ -18,6 +18,8 @@ from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.survey import fly_survey
 
+pytestmark = pytest.mark.slow
+
 SCENES = Path(__file__).parents[1] / "scenes"
 CITIES = ("rbm", "rdm")
 SEEDS = range(2)

@@ -100,7 +100,7 @@ def test_a_twin_by_paths_is_made_and_used_as_any_other(chain, run):
         result = run(arguments, cwd=chain)
         assert result.returncode == 0 and says in result.stdout + result.stderr, result.stderr
     with xr.open_dataset(chain / "by-paths.nc", engine="h5netcdf") as dataset:
-        assert dataset.attrs["source"] == "twin:raytrace"
+        assert dataset.attrs["source"] == "twin:image_paths"
     twin = json.loads((chain / "by-paths" / "twin.json").read_text())
     found = next(device for device in twin["devices"] if device["device"] == "d2")
     assert np.hypot(found["x_m"] - 80, found["y_m"] - 200) < 10

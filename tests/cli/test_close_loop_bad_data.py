@@ -65,8 +65,8 @@ def went_on(folder, done, *parts):
     names = sorted(path.name for path in (folder / "result").iterdir())
     assert set(WHOLE) <= set(names) and not any(name.startswith(".") for name in names)
     report = json.loads((folder / "result" / "closeloop.json").read_text())
-    assert all(f"note: {remark}" in out for remark in report["remarks"])
-    notes = report["remarks"] + [f"{candidate['name']} {candidate['reason']}" for candidate in report["candidates"]]
+    assert all(f"note: {remark}" in out for remark in report["notes"])
+    notes = report["notes"] + [f"{candidate['name']} {candidate['reason']}" for candidate in report["candidates"]]
     for part in parts:
         assert any(part in each for each in notes), (part, notes)
     return report
@@ -165,7 +165,7 @@ THIN = {
     "receivers that stand still": (each(put("receiver_x_m", 10), put("receiver_y_m", 20)), []),
     "a receiver at a device": (each(put("receiver_x_m", 7.0), put("receiver_y_m", 7.0), put("receiver_z_m", 1.5),
                                     put("x_m", 7.0, table=1), put("y_m", 7.0, table=1)), []),
-    "receivers in degrees": (scaled(1e-5, 11.5, 48.0), ["places of receivers lie within 0.00", "degrees"]),
+    "receivers in degrees": (scaled(1e-5, 11.5, 48.0), ["positions of receivers lie within 0.00", "degrees"]),
     "all in a far frame": (scaled(1.0, 690e3, 5334e3, devices_too=True), []),
     "rows twice": (lambda links, devices: (pd.concat([links, links]), devices), ["384 of 768 links", "twice"]),
     "names that differ in case only": (shouted, ["receivers R0, r0, R1, r1 differ in upper and lower case only"]),

@@ -13,6 +13,8 @@ from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.links import link_geometry
 from radiotwin.localize import localize
 
+pytestmark = pytest.mark.slow
+
 BOUNDS = (0.0, 600.0, 0.0, 800.0)
 UNKNOWN = [[20, 200], [60, 760], [120, 600], [200, 80], [320, 760], [460, 720], [460, 200]]
 ANCHORS = [[60, 320], [320, 120], [580, 520]]

@@ -3,8 +3,9 @@
 import pytest
 
 from radiotwin import close_loop, make_report
-from studies.closeloop_internals import turned_rmse_db
-from studies.closeloop_real import AZIMUTHS_DEG, azimuth_errors_deg, permuted
+from studies.closeloop_real import AZIMUTHS_DEG, azimuth_errors_deg, permuted, turned_rmse_db
+
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")

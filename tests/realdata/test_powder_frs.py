@@ -10,6 +10,8 @@ from radiotwin.effects.effect_model import EffectModel
 from radiotwin.localize import locate, whole_area
 from studies.closeloop_real import floor_errors_db, permuted
 
+pytestmark = pytest.mark.slow
+
 DAYS = ("2022-04-25", "2022-07-05", "2022-07-06", "2022-07-11")  # on the fifth half of the receivers were others
 CHANGED = "ebc-nuc1-b210"  # 19 dB less after April
 DEVICES_A_DAY = 60

@@ -9,7 +9,7 @@ from radiotwin.report.labels import join_names, parameter_label, variable_label
 
 SCORES = {"n": 900, "bias_db": 0.04, "std_db": 3.0, "correlation": 0.9, "rmse_db": 3.0, "mae_db": 2.2, "nll": 2.5}
 NOTHING = {"n": 0} | dict.fromkeys(["bias_db", "std_db", "correlation", "rmse_db", "mae_db", "nll"])
-DRIFT = {"name": "receiver_drift", "variant": "", "rank": 1, "setting": {}, "confused_with": ["interference"],
+DRIFT = {"name": "receiver_drift", "variant": "", "rank": 1, "params": {}, "confused_with": ["interference"],
          "indistinguishable_from": ["receiver_gain_offset"],
          "parameters": {"step_db[r<0>]": {"value": -6.0, "low": -6.5, "high": -5.5, "unit": "dB"},
                         "step_time_s[r<0>]": {"value": 500.0, "low": None, "high": None, "unit": "s"}},
@@ -22,7 +22,7 @@ def report(verdict="effect", **changes):
     after = SCORES | {"rmse_db": 2.0, "std_db": 2.0} if found else SCORES
     drivers = [{"variable": "time_in_flight_s", "p_value": 0.0004, "effect_db": 1.5}]
     return {
-        "schema": "radiotwin.closeloop/1", "radiotwin_version": "0", "base": "twin", "verdict": verdict,
+        "schema": "radiotwin.closeloop/2", "radiotwin_version": "0", "base": "twin", "verdict": verdict,
         "effects": [DRIFT] if found else [],
         "candidates": [{"name": "receiver_drift", "step": 1, "heldout_rmse_db": 2.0, "heldout_nll_gain": 210.0,
                         "p_value": 1e-9, "kept": found, "reason": "" if found else "gains nothing"},
@@ -34,9 +34,9 @@ def report(verdict="effect", **changes):
                                 "d1": {"before": NOTHING, "after": NOTHING}}},
         "baselines": {"log_distance": SCORES | {"rmse_db": 7.0},
                       "regression_kriging": {"rmse_db": 5.5, "median_db": 1}},
-        "structure_before": drivers,
+        "dependences_before": drivers,
         "remaining": {"structured": verdict == "unexplained", "drivers": drivers if verdict == "unexplained" else []},
-        "remarks": ["receiver <i> has 3 only"]} | changes
+        "notes": ["receiver <i> has 3 only"]} | changes
 
 
 def page(content, folder):
@@ -69,7 +69,7 @@ def test_names_from_the_data_are_no_markup(tmp_path):
 def test_the_figures_that_planners_judge_by_stand_in_one_table_with_the_other_models(tmp_path):
     text = page(report(), tmp_path)
     table = text[text.index("Error before and after"):text.index("by device, receiver and flight")]
-    for words in ("mean residual [dB]", "standard deviation [dB]", "correlation", "log-distance law", "7.00",
+    for words in ("bias [dB]", "standard deviation [dB]", "correlation", "log-distance law", "7.00",
                   "regression kriging", "5.50", "median db"):
         assert words in table
 
@@ -83,7 +83,7 @@ def test_what_an_effect_may_be_taken_for_is_said(tmp_path):
 
 
 def test_numbers_that_are_not_known_are_dashes(tmp_path):
-    unknown = report("none", baselines={"log_distance": NOTHING}, structure_before=[])
+    unknown = report("none", baselines={"log_distance": NOTHING}, dependences_before=[])
     unknown["error"] |= {"before": NOTHING, "after": NOTHING}
     assert "(– dB RMSE)" in closeloop_summary(unknown)
     assert "None" not in page(unknown, tmp_path) and "nan" not in page(unknown, tmp_path)

@@ -10,7 +10,6 @@ from marl.mission import Known, make_mission
 from radiotwin.survey import segmented_truth
 from studies import (
     closeloop,
-    closeloop_internals,
     closeloop_real,
     disturbances,
     learning,
@@ -33,6 +32,7 @@ def rows_of(run, scene, all_settings, seed=0):
                        for name, settings in all_settings.items()])
 
 
+@pytest.mark.slow
 def test_algorithm_1_has_a_row_for_each_round_and_the_seed_decides(small_scene):
     settings = {f"small-segmented-{name}": {key: QUICK.get(key, value) for key, value in learning.case(
         "rbm", "segmented", **changes).items()} for name, changes in {
@@ -127,8 +127,8 @@ def test_speeds_are_measured(small_scene, part, monkeypatch):
 
 
 def test_the_tuning_table_says_what_differs_from_the_defaults_as_options():
-    settings = learning.case("rdm", "traced", "qmix", measure="policy", td_lambda=0.6, fly_again=True)
-    assert learning.options(settings) == "`--measure policy --td-lambda 0.6 --fly-again true`"
+    settings = learning.case("rdm", "traced", "qmix", measure="policy", td_lambda=0.6) | {"fly_again": True}
+    assert learning.options(settings) == "`--measure policy --td-lambda 0.6 --fly-again true`"  # of version 0.1
     assert learning.options(learning.case("rdm", "traced", "qmix")) == "as it is"
 
 
@@ -173,11 +173,11 @@ def test_the_oracle_has_the_true_city(family):
 
 
 def test_levels_that_are_drawn_from_a_base_have_its_links():
-    drawn = closeloop_internals.draw_from_base(0, "twin", 0)
+    drawn = closeloop.draw_from_base(0, "twin", 0)
     measurements = case("nothing", 0).measurements
     level_db = drawn.level_db[np.isfinite(drawn.level_db)]
     assert 0.8 * len(measurements.table) < len(drawn.table) <= len(measurements.table)
-    assert np.all(level_db % closeloop_internals.STEP_DB == 0)
+    assert np.all(level_db % closeloop.STEP_DB == 0)
 
 
 def test_permuted_levels_stay_with_their_device():

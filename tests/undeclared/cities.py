@@ -6,6 +6,7 @@ rows of houses and courtyards. Neither is drawn as the cities in `scenes/` are.
 
 import atexit
 import zipfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -47,7 +48,8 @@ def buildings(city: str) -> tuple[Building, ...]:
 
 
 def _oldtown(rng: np.random.Generator) -> list[Building]:
-    footprints, found = [], []
+    footprints: list[np.ndarray] = []
+    found = []
     for _ in range(2500):
         centre = rng.uniform(0, SIDE_M, 2)
         turn = np.radians(17 + 28 * np.sin(2 * np.pi * (centre[0] / 430 + centre[1] / 610)) + rng.normal(0, 8))
@@ -116,7 +118,7 @@ def _write_scene(folder: Path, city: str) -> None:
     ), folder / "scene.toml")
 
 
-def write_truth(folder: Path, city: str, seed: int, *, without: int | None = None, more: list[Building] = ()) -> Path:
+def write_truth(folder: Path, city: str, seed: int, *, without: int | None = None, more: Sequence[Building] = ()) -> Path:
     """Write the city as it is, which no survey knows: walls elsewhere, other materials, some roughness.
 
     Args:

@@ -92,7 +92,7 @@ def untraced(family: str, seed: int, clean_db: np.ndarray) -> tuple[list[dict], 
             second = family != "pairs" and seed in STEP_SEEDS
             draw = {"receiver_drift": faults.step if second else faults.warm_up,
                     "device_drift": faults.device_change if second else faults.battery}
-            found.append(draw.get(name, getattr(faults, name, None))(where, rng, clean_db))
+            found.append((draw.get(name) or getattr(faults, name))(where, rng, clean_db))
             clean_db = faults.reading_db(found[-1], where, clean_db)
         if name in BEFORE_RECEIVERS:
             arriving_db = clean_db

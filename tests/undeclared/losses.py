@@ -15,7 +15,8 @@ def foliage(world: World, rng: np.random.Generator) -> dict:
 
     `trees` are (x, y, radius, height) [m]: their crowns are spheroids from above the stem to the top.
     """
-    groves, used = [], []
+    groves: list[dict] = []
+    used: list[np.ndarray] = []
     while len(groves) < 2:
         device = int(rng.integers(len(world.device_m)))
         away_m, turn = rng.uniform(10, 30), rng.uniform(0, 2 * np.pi)
@@ -34,7 +35,8 @@ def foliage(world: World, rng: np.random.Generator) -> dict:
             "first_db_per_m": round(float(rng.uniform(0.7, 1.3)), 2)}
 
 
-def _trees(city: str, centre, widths, height_m: float, lean: float, rng: np.random.Generator) -> np.ndarray:
+def _trees(city: str, centre: np.ndarray, widths: np.ndarray, height_m: float, lean: float,
+           rng: np.random.Generator) -> np.ndarray:
     """(t, 4) trees on a jittered lattice within an ellipse, where there is no building."""
     half = widths.max() / 2
     steps = np.arange(-half, half, TREE_SPACING_M)

@@ -79,4 +79,4 @@ def prism(corners_m: np.ndarray, height_m: float) -> trimesh.Trimesh:
     nxt = (np.arange(k) + 1) % k
     walls = [face for i, j in enumerate(nxt) for face in ((i, j, k + j), (i, k + j, k + i))]
     roof = [(k, k + i, k + i + 1) for i in range(1, k - 1)]
-    return trimesh.Trimesh(vertices, walls + roof, process=False)
+    return trimesh.Trimesh(vertices, np.array(walls + roof), process=False)

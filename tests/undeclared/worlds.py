@@ -77,7 +77,7 @@ def free(city: str, point_m: np.ndarray, room_m: float) -> bool:
 
 
 def _devices(city: str, rng: np.random.Generator) -> list[tuple[float, float, float]]:
-    found = []
+    found: list[tuple[float, float, float]] = []
     while len(found) < DEVICES:
         point = rng.uniform(0, SIDE_M, 2).round(1)
         if all(np.hypot(*(point - other[:2])) >= APART_M for other in found) and free(city, point, TO_WALL_M):
@@ -87,11 +87,12 @@ def _devices(city: str, rng: np.random.Generator) -> list[tuple[float, float, fl
 
 def _towers(city: str, device_m: np.ndarray, rng: np.random.Generator) -> tuple[Building, ...]:
     """One or two, near a device each: there they stand between it and a good part of the sky."""
-    number, found = int(rng.integers(1, 3)), []
+    number = int(rng.integers(1, 3))
+    found: list[Building] = []
     standing = [b.footprint_m for b in buildings(city)]
     while len(found) < number:
         centre = rng.uniform(40, SIDE_M - 40, 2)
-        box = corners_of("box", *rng.uniform(15, 28, 2), rng)
+        box = corners_of("box", rng.uniform(15, 28), rng.uniform(15, 28), rng)
         corners = (turned(box, rng.uniform(0, np.pi)) + centre).round(2)
         height_m = round(float(rng.uniform(60, 100)), 1)
         away = distance_m(device_m[:, :2], corners)
