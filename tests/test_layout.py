@@ -28,7 +28,7 @@ LAYERS = (
     {"scene"},
     {"antennas", "measurements", "command", "doctor"},
     {"geodesy", "llvm", "safe_xml", "cells", "console", "progress", "published"},
-    {"files", "tables"},
+    {"files", "plugins", "tables"},
     {"errors"},
 )
 DEPTH = {part: depth for depth, row in enumerate(LAYERS) for part in row}

@@ -4,9 +4,6 @@ A package adds models under the entry-point group `radiotwin.channels`; a script
 `register`.
 """
 
-import warnings
-from importlib.metadata import entry_points
-
 from radiotwin.channel.base import ChannelModel
 from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.channel.log_distance import LogDistance
@@ -14,6 +11,7 @@ from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.channel.segmented_nn import SegmentedNN
 from radiotwin.errors import BadInput
+from radiotwin.plugins import load_plugins
 
 ENTRY_POINTS = "radiotwin.channels"  # group of the packages' entry points
 BUILT_IN: tuple[type[ChannelModel], ...] = (
@@ -50,12 +48,7 @@ def channel_models() -> dict[str, type[ChannelModel]]:
 
     Warns where a package's model cannot be loaded, and goes on without it.
     """
-    for point in entry_points(group=ENTRY_POINTS):
-        try:
-            register(point.load())
-        except Exception as error:  # noqa: BLE001  # whatever a stranger's package raises
-            warnings.warn(f"the channel model {point.name!r} of the package {point.value!r} cannot "
-                          f"be used ({type(error).__name__}: {error})", stacklevel=2)
+    load_plugins(ENTRY_POINTS, register, "channel model")
     return {each.name: each for each in BUILT_IN} | _registered
 
 

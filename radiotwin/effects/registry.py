@@ -4,9 +4,6 @@ A package adds effects under the entry-point group `radiotwin.effects`; a script
 `register`. Candidates compete by what held-out links say, so the order means nothing.
 """
 
-import warnings
-from importlib.metadata import entry_points
-
 from radiotwin.effects.base import Effect
 from radiotwin.effects.body_shadowing import BodyShadowing
 from radiotwin.effects.clock_offset import ReceiverClockOffset
@@ -27,6 +24,7 @@ from radiotwin.effects.removed_obstacle import RemovedObstacle
 from radiotwin.effects.sector_antenna import SectorAntenna
 from radiotwin.effects.tilted_dipole import TiltedDipole
 from radiotwin.errors import BadInput
+from radiotwin.plugins import load_plugins
 
 ENTRY_POINTS = "radiotwin.effects"
 BUILT_IN: tuple[type[Effect], ...] = (
@@ -62,12 +60,7 @@ def catalogue() -> tuple[type[Effect], ...]:
 
     Warns where a package's effect cannot be loaded, and goes on without it.
     """
-    for point in entry_points(group=ENTRY_POINTS):
-        try:
-            register(point.load())
-        except Exception as error:  # noqa: BLE001  # whatever a stranger's package raises
-            warnings.warn(f"the effect {point.name!r} of the package {point.value!r} cannot be "
-                          f"used ({type(error).__name__}: {error})", stacklevel=2)
+    load_plugins(ENTRY_POINTS, register, "effect")
     return (*BUILT_IN, *_registered)
 
 

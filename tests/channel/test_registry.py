@@ -35,7 +35,7 @@ def installed(monkeypatch):
             return [EntryPoint(name, model, group) if isinstance(model, str)
                     else SimpleNamespace(name=name, value=f"package:{name}", load=lambda model=model: model)
                     for name, model in points.items()]
-        monkeypatch.setattr(registry, "entry_points", entry_points)
+        monkeypatch.setattr("radiotwin.plugins.entry_points", entry_points)
     monkeypatch.setattr(registry, "_registered", {})
     install()
     return install

@@ -1,0 +1,24 @@
+"""Classes that installed packages add under an entry-point group."""
+
+import warnings
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from typing import Any
+
+
+def load_plugins(group: str, register: Callable[[Any], Any], what: str) -> None:
+    """Register every class that a package adds to a group.
+
+    Warns where one cannot be loaded or registered, and goes on without it.
+
+    Args:
+        group: such as `radiotwin.effects`.
+        register: is called with each class; may refuse it with an exception.
+        what: they are, for the warning, such as `effect`.
+    """
+    for point in entry_points(group=group):
+        try:
+            register(point.load())
+        except Exception as error:  # noqa: BLE001  # whatever a stranger's package raises
+            warnings.warn(f"the {what} {point.name!r} of the package {point.value!r} cannot be "
+                          f"used ({type(error).__name__}: {error})", stacklevel=3)
