@@ -132,11 +132,11 @@ def write_powder(folder: Path) -> None:
         mine.to_csv(folder / part / "devices.csv", index=False)
 
 
-def call(tree: Path, scratch: Path, *words: object, module: str = "radiotwin.cli") -> None:
-    """Call a command of the source tree; what it prints is shown only where it fails."""
-    program = f"import sys; from {module} import main; sys.exit(main())"
+def call(tree: Path, scratch: Path, *words: object, module: str = "") -> None:
+    """Call `radiotwin`, or a module, of the source tree; show its output only where it fails."""
+    command = ["-m", module] if module else ["-c", "from radiotwin.cli import main; main()"]
     environment = os.environ | {"PYTHONPATH": str(tree), "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, "-c", program, *map(str, words)], cwd=scratch,
+    done = subprocess.run([sys.executable, *command, *map(str, words)], cwd=scratch,
                           env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"{' '.join(map(str, words))}: status {done.returncode}\n"

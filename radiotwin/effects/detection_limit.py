@@ -7,7 +7,7 @@ lowest level that the receiver has read.
 
 import numpy as np
 from pydantic import Field
-from scipy.stats import t
+from scipy.special import stdtr
 from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels
@@ -53,9 +53,9 @@ class DetectionLimit(LimitEffect):
                 continue
             limit_db = float(np.quantile(links.level_db[mine & ~blank], LOWEST))
             mean_db, scale_db = view.mean_db[missed], view.scale_db[missed]
-            nats = t.logcdf((limit_db - mean_db) / scale_db, DOF)
+            nats = np.log(stdtr(DOF, (limit_db - mean_db) / scale_db))
             if np.isfinite(declared_db):
-                nats = nats - t.logcdf((declared_db - mean_db) / scale_db, DOF)
+                nats = nats - np.log(stdtr(DOF, (declared_db - mean_db) / scale_db))
             if (limit_db > declared_db + MIN_RISE_DB
                     and nats.sum() / view.design_effect > MIN_NATS):
                 found[receiver] = limit_db

@@ -9,7 +9,6 @@ sight, plus a fitted offset). Exactly: the channel's level over the map with the
 from functools import lru_cache
 
 import numpy as np
-import trimesh
 from pydantic import Field
 from scipy.constants import speed_of_light
 from typing_extensions import override
@@ -155,6 +154,8 @@ def _gain_db(crossing: Crossing, scattered: np.ndarray | float,
 @lru_cache(maxsize=32)
 def _with_box(city: CityMap, box: Box) -> CityMap:
     """Return a map with a box on its ground."""
+    import trimesh  # slow to load, and needed for exact levels only
+
     pose = trimesh.transformations.rotation_matrix(np.radians(box.turn_deg), (0, 0, 1))
     pose[:3, 3] = box.x_m, box.y_m, 0.5 * box.height_m
     mesh = trimesh.creation.box((box.length_m, box.width_m, box.height_m), pose)

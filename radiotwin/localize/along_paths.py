@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from scipy.stats import t
+from scipy.special import stdtrit
 
 from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.effects.fold_model import FoldModel
@@ -191,7 +191,7 @@ class _Search:
         view = self._view(best)
         # Of errors that are scattered as those of other devices the median is 1.
         z = view.residual_db / view.scale_db
-        misfit = np.median(z**2) / float(t.ppf(0.75, DOF)) ** 2
+        misfit = np.median(z**2) / float(stdtrit(DOF, 0.75)) ** 2
         if self.tried[best] >= self._law_nll(start_m) or misfit > MAX_MISFIT:
             return device
         radius_m = self._radius_m(best, view.design_effect * max(misfit, 1.0))

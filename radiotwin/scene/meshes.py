@@ -5,7 +5,6 @@ from pathlib import Path
 
 import mapbox_earcut
 import numpy as np
-import trimesh
 
 from radiotwin.errors import BadInput
 from radiotwin.scene.mitsuba_xml import DeclaredShape
@@ -141,6 +140,8 @@ def read_obj(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
 
 
 def _analytic(shape: DeclaredShape) -> RawMesh:
+    import trimesh  # slow to load, and few scenes have such shapes
+
     if shape.kind == "cube":
         mesh = trimesh.creation.box(extents=(2, 2, 2))
         return RawMesh(mesh.vertices, mesh.faces)

@@ -7,8 +7,6 @@ All that uses a scene's geometry goes through here. The ray tracer loads a file 
 from dataclasses import replace
 from pathlib import Path
 
-import trimesh
-
 from radiotwin.errors import BadInput
 from radiotwin.scene.material_mapping import map_materials
 from radiotwin.scene.meshes import RawMesh, load_shape
@@ -48,6 +46,8 @@ def read_city(xml_path: Path | str) -> list[CityShape]:
     Raises:
         BadInput: As `read_triangles`; or a shape without a known material.
     """
+    import trimesh  # slow to load, and not needed for the 3D map
+
     declared = _declared(Path(xml_path))
     materials, problems = map_materials(declared.shapes, declared.materials, {})
     errors = [problem.message for problem in problems if problem.severity == "error"]

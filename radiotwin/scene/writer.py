@@ -4,12 +4,14 @@ import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-import trimesh
+from typing import TYPE_CHECKING
 
 from radiotwin.progress import progress
 from radiotwin.scene.materials import Material
 from radiotwin.scene.ply import write_ply
+
+if TYPE_CHECKING:
+    import trimesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,7 +25,7 @@ class CityShape:
     """
 
     name: str
-    mesh: trimesh.Trimesh
+    mesh: "trimesh.Trimesh"
     material: Material
 
 
