@@ -9,7 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.links import LinkGeometry
+from radiotwin.links import LinkData, LinkGeometry
 
 MIN_DETECTED = 20  # detected links that a line and its standard deviation are learnt from
 LEVEL_SD_DB = 20.0  # prior standard deviation of a refitted level: weak
@@ -72,6 +72,16 @@ class ChannelModel(ABC):
     def quick(self) -> ChannelModel:
         """A quicker model of small changes, such as moved ends; by default the model itself."""
         return self
+
+    def level_at(self, links: LinkData, exact: bool = False) -> np.ndarray:
+        """Return the mean level (n,) [dB] of measured links, such as with moved devices.
+
+        Args:
+            links: n links.
+            exact: whether `quick` does not do.
+        """
+        channel = self if exact else self.quick
+        return channel.predict(links.geometry)[0]
 
     def level_columns(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Return what of the channel is fitted again together with effects.

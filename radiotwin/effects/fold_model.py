@@ -16,7 +16,7 @@ import numpy as np
 from radiotwin.channel import ChannelModel
 from radiotwin.effects.base import DetectionEffect, Effect, LimitEffect, Term
 from radiotwin.effects.params import EffectParams, Estimate
-from radiotwin.effects.residual_view import ResidualView
+from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.inference import censored_regression
 from radiotwin.inference.censored_regression import (
     CensoredRegression,
@@ -103,10 +103,10 @@ class FoldModel:
         return cls(links, usable if train is None else train & usable, usable, channel, channel_db,
                    columns, prior_sd_db, channel.error_group(geometry), dof)
 
-    def level_at(self, links: LinkData, exact: bool = False) -> np.ndarray:
-        """Return the channel's level (n,) [dB] of any links, quickly or exactly."""
-        channel = self.channel if exact else self.channel.quick
-        return channel.predict(links.geometry)[0]
+    @property
+    def level_at(self) -> LevelAt:
+        """The channel's levels of any links, quickly or exactly."""
+        return self.channel.level_at
 
     def apply(self, effect: Effect, params: Any) -> AppliedEffect:
         """Return an effect on these links."""

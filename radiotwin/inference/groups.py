@@ -7,8 +7,7 @@ def deal_groups(group: np.ndarray, max_folds: int, rng: np.random.Generator) -> 
     """Deal groups to folds of about equal size.
 
     The largest group comes first, and each goes to the fold that is smallest so far, as in
-    scikit-learn's `GroupKFold`. Groups of equal size come in random order; there they come in an
-    order of their labels, which are neighbours on the ground.
+    scikit-learn's `GroupKFold`; groups of equal size come in random order.
 
     Args:
         group: (n,) label of the group.
