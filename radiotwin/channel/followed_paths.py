@@ -8,8 +8,6 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from radiotwin.links import LinkData, LinkGeometry
-from radiotwin.paths import path_powers
-from radiotwin.paths.powers import COMPONENTS, SECTORS
 from radiotwin.scene.citymap import CityMap
 
 GRID_M = 1.0  # estimated positions of devices are rounded to it, and share their paths
@@ -17,13 +15,16 @@ MAX_REMEMBERED = 300_000  # links: 200 MB
 MIN_REMEMBERED = 2  # devices, however many links they have
 
 
-def path_gains(geometry: LinkGeometry, kinds: tuple[str, ...] = COMPONENTS) -> np.ndarray:
+def path_gains(geometry: LinkGeometry, kinds: tuple[str, ...] | None = None) -> np.ndarray:
     """Return the power gain (n,) of some kinds of paths between isotropic antennas.
 
     Args:
         geometry: n links over a map.
-        kinds: names of `radiotwin.paths.PathPowers`' components.
+        kinds: names of `radiotwin.paths.PathPowers`' components; None: all.
     """
+    from radiotwin.paths.powers import COMPONENTS  # late, as everywhere here: numba is large
+
+    kinds = COMPONENTS if kinds is None else kinds
     power = np.zeros(len(geometry))
     for rows, followed, index in _by_device(geometry):
         power[rows] = sum(followed.powers[index, COMPONENTS.index(kind)] for kind in kinds)
@@ -45,6 +46,8 @@ def rays_of(links: LinkData, end: str) -> np.ndarray:
     Returns:
         (n, sectors, 3)
     """
+    from radiotwin.paths.powers import SECTORS
+
     rays = np.zeros((len(links), SECTORS, 3), dtype=np.float32)
     for rows, followed, index in _by_device(links.geometry):
         rays[rows] = getattr(followed, end)[index]
@@ -113,6 +116,8 @@ def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, 
 def _follow(city: CityMap, position_m: tuple[float, float, float], ends_m: np.ndarray,
             frequency_hz: float) -> tuple[_Followed, np.ndarray]:
     """Return the paths from one position to ends (n, 3), and the row of each end."""
+    from radiotwin.paths.powers import COMPONENTS, SECTORS, path_powers
+
     key = (city, position_m, frequency_hz)
     wanted = _keys(ends_m)
     no_rays = np.zeros((0, SECTORS, 3), dtype=np.float32)

@@ -18,7 +18,6 @@ from radiotwin.effects.base import GainEffect
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
-from radiotwin.paths.coefficients import VACUUM_PERMITTIVITY_F_M, fresnel
 from radiotwin.scene.materials import permittivity
 
 MIN_LINKS = 100  # with line of sight
@@ -140,6 +139,8 @@ def two_ray_db(device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float
         roughness_m: standard deviation of the surface's height [m].
         ground_m: height of the plane [m].
     """
+    from radiotwin.paths.coefficients import VACUUM_PERMITTIVITY_F_M, fresnel  # late: numba
+
     heights_m = [np.maximum(end_m[:, 2] - ground_m, MIN_END_HEIGHT_M)
                  for end_m in (device_m, receiver_m)]
     flat_m = np.hypot(*(receiver_m - device_m)[:, :2].T)

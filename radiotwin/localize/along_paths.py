@@ -21,7 +21,6 @@ from radiotwin.effects.residual_view import ResidualView
 from radiotwin.inference.censored_regression import CensoredRegression, FitResult
 from radiotwin.links import LinkData
 from radiotwin.localize.estimate import TwinDevice
-from radiotwin.paths import path_powers
 from radiotwin.progress import progress
 from radiotwin.scene.citymap import CityMap
 
@@ -108,6 +107,8 @@ class Relocation:
     def follow(self, city: CityMap, position_m: tuple[float, ...], ends_m: np.ndarray,
                frequency_hz: float) -> np.ndarray:
         """Return the power (n,) from a position to ends (n, 3)."""
+        from radiotwin.paths import path_powers  # late: numba is large
+
         known = self.powers.setdefault(city, {}).setdefault(position_m, {})
         hashes = _hashes(ends_m).tolist()
         missing = {key: row for row, key in enumerate(hashes) if key not in known}
