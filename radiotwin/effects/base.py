@@ -224,31 +224,31 @@ class ReceiverEffect(_ResponseEffect):
     of_receiver = True
 
 
-class DetectionEffect(Effect):
+class _BlankingEffect(Effect):
+    """An effect of the receiver's that leaves levels as they are."""
+
+    of_receiver = True
+
+    def term(self, links: LinkData, params: Any, level_at: LevelAt) -> Term:
+        """Return a term that adds nothing."""
+        return Term.of_offset(np.zeros(len(links)))
+
+
+class DetectionEffect(_BlankingEffect):
     """An effect that leaves levels as they are and makes links blank whatever their level."""
 
     stage = "detection"
-    of_receiver = True
 
     @abstractmethod
     def dropout_probability(self, links: LinkData, params: Any) -> np.ndarray:
         """Return the probability (n,), below 1, that a link is blank whatever its level."""
 
-    def term(self, links: LinkData, params: Any, level_at: LevelAt) -> Term:
-        """Return a term that adds nothing."""
-        return Term.of_offset(np.zeros(len(links)))
 
-
-class LimitEffect(Effect):
+class LimitEffect(_BlankingEffect):
     """An effect that leaves levels as they are and makes links blank below a level."""
 
     stage = "limit"
-    of_receiver = True
 
     @abstractmethod
     def limits_db(self, links: LinkData, params: Any) -> np.ndarray:
         """Return the level (n,) below which links are blank; -inf where the declared one holds."""
-
-    def term(self, links: LinkData, params: Any, level_at: LevelAt) -> Term:
-        """Return a term that adds nothing."""
-        return Term.of_offset(np.zeros(len(links)))

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
+from radiotwin.channel.base import ANY_LEVEL_SD_DB
 from radiotwin.effects.arrays import subsample
 from radiotwin.effects.base import Effect
 from radiotwin.effects.fold_model import AppliedEffect, FoldModel, response
@@ -23,7 +24,6 @@ MAX_LINKS, MAX_LINKS_OF_MEMBER = 5000, 1500  # that numbers are refined on
 MAX_PROPOSALS = 2  # of one effect that are fitted
 MIN_GAIN_NATS = 5.0  # that a proposal must gain to be refined
 OUTSIDE_NATS = 10.0  # penalty of a step outside the bounds
-ANY_LEVEL_SD_DB = 300.0  # prior of a level that is free
 EXTREMES_DB = (-200.0, 100.0)  # levels at which whatever a receiver does to them shows
 
 
