@@ -1,16 +1,30 @@
-"""Atomic output: files and folders are written under a temporary name, then renamed."""
+"""Atomic output: files and folders are written under a temporary name, flushed, then renamed.
+
+A killed run leaves its temporaries; the next one that writes to the same folder removes them. A
+temporary is locked while its process lives, so that none in use is taken away.
+"""
 
 import errno
+import io
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
+from typing import IO, Any
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, RunFailed
 
-_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
+try:
+    import fcntl
+except ImportError:  # Windows: nothing is locked, and nothing is swept
+    fcntl = None  # type: ignore[assignment]
+
+_DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+_TEMPORARY = re.compile(r"\.radiotwin-[a-z0-9_]{8}(?P<aside>-aside)?(?:[-.].*)?")
 
 
 def require_writable(path: Path | str) -> None:
@@ -21,47 +35,66 @@ def require_writable(path: Path | str) -> None:
 
     Raises:
         BadInput: the folder cannot be made or written, or `path` is not an ordinary file.
+        RunFailed: the disk is full.
     """
     path = Path(path)
     _refuse_folder(path)
-    with (_parent_of(path), _reported(path),
-          tempfile.NamedTemporaryFile(prefix=_prefix(path), dir=path.parent)):
+    with _parent_of(path), _reported(path), _temporary_file(path):
         pass
 
 
 @contextmanager
 def atomic_path(path: Path | str) -> Iterator[Path]:
-    """Write a file atomically.
+    """Write a file atomically, by code that raises OSError where a write or a close fails.
 
     Args:
         path: of the file; missing folders are made.
 
     Yields:
-        a temporary path in the same folder with the same suffixes; it is renamed to `path` on
-        success and removed on failure.
+        a temporary path in the same folder with the same suffixes; it is flushed to the disk and
+        renamed to `path` on success and removed on failure.
 
     Raises:
-        BadInput: the folder cannot be made or written, the disk is full, or `path` is not an
-            ordinary file.
+        BadInput: the folder cannot be made or written, or `path` is not an ordinary file.
+        RunFailed: the disk is full or failed; an older file at `path` is unchanged.
     """
     path = Path(path)
     _refuse_folder(path)
-    with _parent_of(path):
+    with _parent_of(path), _reported(path, only_disk=True), _temporary_file(path) as temporary:
+        yield temporary
         with _reported(path):
-            handle, name = tempfile.mkstemp(prefix=_prefix(path), suffix="".join(path.suffixes),
-                                            dir=path.parent)
-            os.close(handle)
-        temporary = Path(name)
-        try:
-            with _reported(path, _DISK_ERRORS):
-                yield temporary
-            with _reported(path):
-                umask = os.umask(0)
-                os.umask(umask)
-                temporary.chmod(0o666 & ~umask)  # mkstemp makes private files
-                os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+            _flush(temporary)
+            umask = os.umask(0)
+            os.umask(umask)
+            temporary.chmod(0o666 & ~umask)  # mkstemp makes private files
+            os.replace(temporary, path)
+
+
+@contextmanager
+def atomic_file(path: Path | str, hide_errors: bool = False) -> Iterator[IO[bytes]]:
+    """Write a file atomically, by code that takes an open file.
+
+    Args:
+        path: of the file; missing folders are made.
+        hide_errors: keep the first error of a write until the end, for libraries that crash or
+            swallow it (HDF5); all that is written after it is lost.
+
+    Yields:
+        binary file, open for reading and writing.
+
+    Raises:
+        BadInput: as `atomic_path`.
+        RunFailed: as `atomic_path`.
+    """
+    with atomic_path(path) as temporary:
+        if not hide_errors:
+            with open(temporary, "w+b") as file:
+                yield file
+            return
+        with _ErrorsKept(open(temporary, "w+b", buffering=0)) as kept:
+            yield kept  # type: ignore[misc]  # a raw file
+        if kept.error is not None:
+            raise kept.error
 
 
 @contextmanager
@@ -76,23 +109,171 @@ def atomic_folder(path: Path | str) -> Iterator[Path]:
         failure.
 
     Raises:
-        BadInput: the parent cannot be written, the disk is full, or `path` is a file.
+        BadInput: the parent cannot be written, or `path` is a file.
+        RunFailed: the disk is full or failed; an older folder at `path` is unchanged.
     """
     path = Path(path)
     with _reported(path):
         if path.exists() and not path.is_dir():
             raise BadInput(f"{path} is a file; give the name of a folder")
-    with _parent_of(path):
+    with (_parent_of(path), _reported(path, only_disk=True),
+          _temporary_folder(path) as temporary):
+        yield temporary
         with _reported(path):
-            temporary = Path(tempfile.mkdtemp(prefix=_prefix(path), dir=path.parent))
+            for inside in temporary.rglob("*"):
+                if inside.is_file():
+                    _flush(inside)
             temporary.chmod(0o755)
-        try:
-            with _reported(path, _DISK_ERRORS):
-                yield temporary
-            with _reported(path):
-                _swap(temporary, path)
-        finally:
+            _swap(temporary, path)
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """Make a folder for files that are needed for a while; the next run removes a killed one's."""
+    with _temporary_folder(Path(tempfile.gettempdir()) / "scratch") as folder:
+        yield folder
+
+
+class _ErrorsKept(io.RawIOBase):
+    """A file whose writes always succeed.
+
+    Attributes:
+        error: of the first write that did not.
+    """
+
+    def __init__(self, file: io.FileIO) -> None:
+        self._file = file
+        self.error: OSError | None = None
+
+    def write(self, data: Any) -> int:
+        size = memoryview(data).nbytes
+        rest = memoryview(data).cast("B")
+        while self.error is None and rest:
+            try:
+                rest = rest[self._file.write(rest):]
+            except OSError as error:
+                self.error = error
+        return size
+
+    def readinto(self, buffer: Any) -> int:
+        return self._file.readinto(buffer)
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def tell(self) -> int:
+        return self._file.tell()
+
+    def truncate(self, size: int | None = None) -> int:
+        if self.error is None:
+            try:
+                return self._file.truncate(size)
+            except OSError as error:
+                self.error = error
+        return self.tell() if size is None else size
+
+    def readable(self) -> bool:
+        return True
+
+    def writable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def close(self) -> None:
+        if not self._file.closed:
+            try:
+                self._file.close()
+            except OSError as error:
+                self.error = self.error or error
+        super().close()
+
+
+@contextmanager
+def _temporary_file(path: Path) -> Iterator[Path]:
+    """Make and lock an empty file beside `path` with its suffixes; remove it in the end."""
+    _sweep(path.parent)
+    suffix = "".join(path.suffixes[-2:])
+    with _reported(path):
+        while True:
+            handle, name = tempfile.mkstemp(prefix=".radiotwin-", suffix=suffix, dir=path.parent)
+            if _locked(handle, name):
+                break
+    yield from _removed(Path(name), handle)
+
+
+@contextmanager
+def _temporary_folder(path: Path, suffix: str = "") -> Iterator[Path]:
+    """Make and lock an empty folder beside `path`; remove it in the end."""
+    _sweep(path.parent)
+    with _reported(path):
+        while True:
+            name = tempfile.mkdtemp(prefix=".radiotwin-", suffix=suffix, dir=path.parent)
+            handle = None if fcntl is None else os.open(name, os.O_RDONLY)
+            if handle is None or _locked(handle, name):
+                break
+    yield from _removed(Path(name), handle)
+
+
+def _removed(temporary: Path, handle: int | None) -> Iterator[Path]:
+    """Yield a temporary; remove it and release its lock in the end."""
+    if fcntl is None and handle is not None:  # Windows renames no open file
+        os.close(handle)
+        handle = None
+    try:
+        yield temporary
+    finally:
+        if temporary.is_dir():
             shutil.rmtree(temporary, ignore_errors=True)
+        else:
+            temporary.unlink(missing_ok=True)
+        if handle is not None:
+            os.close(handle)
+
+
+def _locked(handle: int, name: str) -> bool:
+    """Lock a new temporary; False if another process has swept it before."""
+    if fcntl is None:
+        return True
+    with suppress(OSError):  # a file system without locks
+        fcntl.flock(handle, fcntl.LOCK_EX)
+    try:
+        if os.path.samestat(os.fstat(handle), os.stat(name)):
+            return True
+    except FileNotFoundError:
+        pass
+    os.close(handle)
+    return False
+
+
+@cache  # once a folder and process: a store of batches writes thousands of files to one
+def _sweep(folder: Path) -> None:
+    """Remove the temporaries of processes that were killed."""
+    if fcntl is None:
+        return
+    with suppress(OSError):
+        for entry in os.scandir(folder):
+            match = _TEMPORARY.fullmatch(entry.name)
+            if match and (entry.is_file(follow_symlinks=False)
+                          or entry.is_dir(follow_symlinks=False)):
+                with suppress(OSError):
+                    _remove_stale(Path(entry.path), aside=bool(match["aside"]))
+
+
+def _remove_stale(path: Path, aside: bool) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises if its process lives
+        if not path.is_dir():
+            path.unlink()
+            return
+        for old in path.iterdir() if aside else ():  # killed in `_swap`
+            if not (path.parent / old.name).exists():
+                os.replace(old, path.parent / old.name)
+        shutil.rmtree(path)
+    finally:
+        os.close(handle)
 
 
 def _swap(new: Path, path: Path) -> None:
@@ -100,18 +281,14 @@ def _swap(new: Path, path: Path) -> None:
     if not path.exists():
         os.replace(new, path)
         return
-    aside = Path(tempfile.mkdtemp(prefix=_prefix(path), dir=path.parent))
-    old = aside / "old"
-    try:
+    with _temporary_folder(path, "-aside") as aside:
+        old = aside / path.name
         os.replace(path, old)
         try:
             os.replace(new, path)
         except OSError:
             os.replace(old, path)
             raise
-    finally:
-        if path.exists():
-            shutil.rmtree(aside, ignore_errors=True)
 
 
 @contextmanager
@@ -130,15 +307,27 @@ def _parent_of(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def _reported(path: Path, numbers: tuple[int, ...] | None = None) -> Iterator[None]:
-    """Turn an OSError, or only those with these error numbers, into BadInput about `path`."""
+def _reported(path: Path, only_disk: bool = False) -> Iterator[None]:
+    """Turn an OSError, or only those of a full or failed disk, into a message about `path`."""
     try:
         yield
     except OSError as error:
-        if numbers is not None and error.errno not in numbers:
+        if error.errno in _DISK_ERRORS:
+            raise RunFailed(f"cannot write {path}: {error.strerror}; what was there before is "
+                            "unchanged: make room, or choose another output path") from error
+        if only_disk:
             raise
         raise BadInput(f"cannot write {path}: {error.strerror or error}; choose another output "
                        "path") from error
+
+
+def _flush(path: Path) -> None:
+    """Have the system write a file to the disk, which may fail only now."""
+    handle = os.open(path, os.O_RDWR | getattr(os, "O_BINARY", 0))
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def _refuse_folder(path: Path) -> None:
@@ -147,7 +336,3 @@ def _refuse_folder(path: Path) -> None:
             raise BadInput(f"{path} is a folder; give the name of a file")
         if path.exists() and not path.is_file():
             raise BadInput(f"{path} is not an ordinary file; give the name of a file")
-
-
-def _prefix(path: Path) -> str:
-    return f".{path.stem[:40]}-"

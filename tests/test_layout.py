@@ -28,7 +28,8 @@ LAYERS = (
     {"scene"},
     {"antennas", "measurements", "command", "doctor"},
     {"geodesy", "llvm", "safe_xml", "cells", "console", "progress", "published"},
-    {"files", "plugins", "tables"},
+    {"files", "inputs", "plugins", "tables"},
+    {"budgets"},
     {"errors"},
 )
 DEPTH = {part: depth for depth, row in enumerate(LAYERS) for part in row}

@@ -14,7 +14,7 @@ import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.safe_xml import parse_elements
-from radiotwin.scene.own_files import require_within
+from radiotwin.inputs import require_within
 
 MAX_INCLUDE_DEPTH = 15  # the limit of Mitsuba
 

@@ -14,7 +14,7 @@ from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import DeviceConfig, SceneConfig, UavConfig, read_config
 from radiotwin.scene.lattice import Lattice
-from radiotwin.scene.own_files import require_within
+from radiotwin.inputs import require_within
 
 if TYPE_CHECKING:
     from radiotwin.radiomap import RadioMap
