@@ -10,7 +10,13 @@ import pytest
 
 from radiotwin import files
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.files import atomic_file, atomic_folder, atomic_path, require_writable, scratch_folder
+from radiotwin.files import (
+    atomic_file,
+    atomic_folder,
+    atomic_path,
+    require_writable,
+    scratch_folder,
+)
 
 
 def test_a_file_appears_when_it_is_finished(tmp_path):

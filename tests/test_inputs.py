@@ -8,7 +8,15 @@ import pytest
 
 from radiotwin.budgets import ROWS
 from radiotwin.errors import BadInput
-from radiotwin.inputs import check_input, open_gzip, read_bytes, read_json, read_text, read_toml, require_within
+from radiotwin.inputs import (
+    check_input,
+    open_gzip,
+    read_bytes,
+    read_json,
+    read_text,
+    read_toml,
+    require_within,
+)
 
 
 def test_a_regular_file_is_read(tmp_path):

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.safe_xml import parse_elements
 from radiotwin.inputs import require_within
+from radiotwin.safe_xml import parse_elements
 
 MAX_INCLUDE_DEPTH = 15  # the limit of Mitsuba
 

@@ -11,10 +11,10 @@ import numpy as np
 
 from radiotwin.antennas import Antenna, Pattern, read_pattern
 from radiotwin.errors import BadInput
+from radiotwin.inputs import require_within
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import DeviceConfig, SceneConfig, UavConfig, read_config
 from radiotwin.scene.lattice import Lattice
-from radiotwin.inputs import require_within
 
 if TYPE_CHECKING:
     from radiotwin.radiomap import RadioMap
