@@ -1,0 +1,190 @@
+"""One command on damaged files, in a forked child that is watched; the rule that its outcome must keep.
+
+Forked from a process that has imported everything: a case takes the time of the command alone.
+"""
+
+import contextlib
+import os
+import resource
+import shutil
+import signal
+import socket
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.fuzz.honest import run_command
+
+ALLOWED_STATUS = (0, 2, 130)
+MAX_PEAK_BYTES, MAX_WALL_S = 2 * 2**30, 60
+CANARY = "only for its owner: 4711"
+_SECRETS = ("/etc/passwd", "/etc/shadow", "/proc/self/environ")
+_WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
+_BREACHES_FILE = "breaches.txt"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command did.
+
+    `breaches`: rules of the sandbox that it broke; empty for a good outcome.
+    """
+
+    status: int
+    wall_s: float
+    peak_bytes: int
+    output: str
+    breaches: tuple[str, ...]
+
+
+def run_watched(command: str, case: Path, listener: socket.socket) -> Outcome:
+    """Run a command in `case / "work"`.
+
+    `case` holds a canary beside it, which no command may read; `listener` is a server which nothing may call.
+    """
+    (case / "canary").write_text(CANARY)
+    for name in ("home", "tmp"):
+        (case / name).mkdir(exist_ok=True)
+    started = time.monotonic()
+    pid = os.fork()
+    if pid == 0:
+        _child(command, case)
+    status, usage, killed = _wait(pid, started)
+    wall_s = time.monotonic() - started
+    output = (case / "output.txt").read_text(errors="replace")
+    breaches = [killed] if killed else []
+    if not killed and status not in ALLOWED_STATUS:
+        breaches.append(f"exit status {status}")
+    if "Traceback" in output:
+        breaches.append("traceback")
+    with contextlib.suppress(FileNotFoundError):
+        breaches += sorted(set((case / _BREACHES_FILE).read_text(errors="replace").splitlines()))
+    breaches += _leaks(case, listener)
+    return Outcome(status, wall_s, usage.ru_maxrss * 1024, output, tuple(breaches))
+
+
+def _leaks(case: Path, listener: socket.socket) -> list[str]:
+    found = []
+    with contextlib.suppress(BlockingIOError):
+        listener.accept()[0].close()
+        found.append("network: a connection was opened")
+    for path in case.joinpath("work").rglob("*"):
+        if path.name.startswith(".radiotwin-"):
+            found.append("temporary left over")
+        elif path.is_file() and not path.is_symlink() and path.stat().st_size < 2**24 \
+                and CANARY.encode() in path.read_bytes():
+            found.append("canary in an output")
+    if any(case.joinpath("tmp").iterdir()):
+        found.append("left over in the temporary folder")
+    return sorted(set(found))
+
+
+def _wait(pid: int, started: float) -> tuple[int, resource.struct_rusage, str]:
+    page, killed = os.sysconf("SC_PAGE_SIZE"), ""
+    while True:
+        done, status, usage = os.wait4(pid, os.WNOHANG)
+        if done:
+            return os.waitstatus_to_exitcode(status), usage, killed
+        with contextlib.suppress(OSError, IndexError, ValueError):
+            resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * page
+            if resident > MAX_PEAK_BYTES:
+                killed = killed or f"memory above {MAX_PEAK_BYTES // 2**20} MiB"
+        if time.monotonic() - started > MAX_WALL_S:
+            killed = killed or f"longer than {MAX_WALL_S} s"
+        if killed:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        time.sleep(0.005)
+
+
+def _child(command: str, case: Path) -> None:
+    """Run the command line as its process would, and end this process without returning."""
+    status = 70
+    try:
+        output = os.open(case / "output.txt", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        for descriptor in (1, 2):
+            os.dup2(output, descriptor)
+        os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+        sys.stdout = open(1, "w", encoding="utf-8", closefd=False)
+        sys.stderr = open(2, "w", encoding="utf-8", closefd=False)
+        os.chdir(case / "work")
+        os.environ |= {"HOME": str(case / "home"), "XDG_CACHE_HOME": str(case / "home"), "TMPDIR": str(case / "tmp"),
+                       "COLUMNS": "100"}
+        import tempfile
+        tempfile.tempdir = str(case / "tmp")
+        resource.setrlimit(resource.RLIMIT_FSIZE, (2**30, 2**30))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        module, *arguments = command.split(" ")
+        sys.argv = [module, *arguments]
+        breaches = os.open(case / _BREACHES_FILE, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+        sys.addaudithook(_Watch(case, breaches))
+        try:
+            run_command(module)
+            status = 0
+        except SystemExit as end:
+            status = end.code if isinstance(end.code, int) else 0 if end.code is None else 1
+    except BaseException:
+        import traceback
+        traceback.print_exc()
+    finally:
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(Exception):
+                stream.flush()
+        os._exit(status & 255)
+
+
+class _Watch:
+    """Audit hook: writes down what a command must not do; it does not forbid it."""
+
+    def __init__(self, case: Path, breaches: int) -> None:
+        self.inside = (str(case / "work"), str(case / "home"), str(case / "tmp"), os.devnull)
+        self.case, self.breaches, self.busy = case, breaches, False
+
+    def __call__(self, event: str, arguments: tuple) -> None:
+        if self.busy or event not in _EVENTS:
+            return
+        self.busy = True
+        try:
+            text = getattr(self, _EVENTS[event])(event, arguments)
+            if text:
+                os.write(self.breaches, (text.replace("\n", " ") + "\n").encode("utf-8", "replace"))
+        finally:
+            self.busy = False
+
+    def _open(self, event: str, arguments: tuple) -> str | None:
+        path, mode, flags = arguments
+        if not isinstance(path, str | bytes | os.PathLike):
+            return None
+        path = os.path.realpath(os.fsdecode(path))
+        if flags & _WRITING or (isinstance(mode, str) and set(mode) & set("wax+")):
+            return None if path.startswith(self.inside) else f"writes outside: {path}"
+        if path in _SECRETS or path == str(self.case / "canary"):
+            return f"reads outside: {path}"
+        return None
+
+    def _change(self, event: str, arguments: tuple) -> str | None:
+        paths = [os.path.realpath(os.fsdecode(each)) for each in arguments if isinstance(each, str | bytes | os.PathLike)]
+        outside = [path for path in paths if not path.startswith(self.inside)]
+        return f"{event} outside: {outside[0]}" if outside else None
+
+    def _always(self, event: str, arguments: tuple) -> str | None:
+        return f"{event}: {arguments[0] if event != 'socket.connect' else arguments[1]!r}"
+
+    def _library(self, event: str, arguments: tuple) -> str | None:
+        path = os.path.realpath(os.fsdecode(arguments[0])) if isinstance(arguments[0], str | bytes) else ""
+        return f"{event}: {path}" if path.startswith(self.inside[:3]) else None
+
+
+_EVENTS = {
+    "open": "_open", "os.remove": "_change", "os.rename": "_change", "os.mkdir": "_change", "os.rmdir": "_change",
+    "os.symlink": "_change", "os.link": "_change", "os.chmod": "_change", "shutil.rmtree": "_change",
+    "os.system": "_always", "subprocess.Popen": "_always", "os.exec": "_always", "os.posix_spawn": "_always",
+    "socket.connect": "_always", "socket.getaddrinfo": "_always", "ctypes.dlopen": "_library"}
+
+
+def prepare_case(honest: Path, case: Path) -> Path:
+    """Copy the honest files to `case / "work"`; return that folder."""
+    shutil.rmtree(case, ignore_errors=True)
+    shutil.copytree(honest, case / "work")
+    return case / "work"

@@ -1,0 +1,77 @@
+"""Which file is damaged, and the command that then reads it."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Target:
+    """A file of the honest folder and a command that reads it.
+
+    `kind` is the class of files in the counts; `slow` commands are not in the 200 cases of every test run.
+    """
+
+    kind: str
+    file: str
+    command: str
+    slow: bool = False
+
+    @property
+    def suffix(self) -> str:
+        """Ending of the file, which decides how it is damaged."""
+        return "." + self.file.rpartition(".")[2]
+
+
+_SURVEY = "open/measurements.csv"
+_FIT = "radiotwin fit survey/{} --scene scene --model log_distance -o out"
+_RUN = ("marl.fedqmix --scene scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare false "
+        "--hidden 8 --out run --resume")
+_MESH = "scene/meshes/building_000.ply"
+TARGETS = (
+    *(Target("scene.toml", "scene/scene.toml", command) for command in (
+        "radiotwin survey scene --truth segmented --flights 1 -o out/measurements.csv",
+        "radiotwin map twin --scene scene --altitudes 55 -o out.npz", "radiotwin export-scene scene -o out.glb",
+        "radiotwin report scene -o out.html")),
+    *(Target("city.xml", "scene/city.xml", command) for command in (
+        "radiotwin survey scene --truth segmented --flights 1 -o out/measurements.csv",
+        "radiotwin export-scene scene -o out", "radiotwin build-scene scene/city.xml --check")),
+    *(Target("mesh", _MESH, command) for command in (
+        "radiotwin survey scene --truth segmented --flights 1 -o out/measurements.csv",
+        "radiotwin export-scene scene -o out.obj")),
+    Target("foreign city", "city.xml", "radiotwin build-scene city.xml -o out"),
+    Target("OpenStreetMap", "town.osm", "radiotwin build-scene town.osm -o out"),
+    Target("GeoJSON map", "town.geojson", "radiotwin build-scene town.geojson -o out"),
+    Target("GeoPackage", "town.gpkg", "radiotwin build-scene town.gpkg -o out"),
+    Target("materials", "materials.toml", "radiotwin build-scene town.geojson --material-table materials.toml -o out"),
+    Target("antenna", "antennas/pattern.msi", "radiotwin report antennas -o out.html"),
+    Target("antenna", "antennas/pattern.csv", "radiotwin report antennas -o out.html"),
+    Target("measurements", "survey/measurements.csv", _FIT.format("measurements.csv")),
+    Target("measurements", "survey/devices.csv", _FIT.format("measurements.csv")),
+    Target("measurements", "survey/packed.csv.gz", _FIT.format("packed.csv.gz")),
+    Target("measurements", "survey/table.parquet", _FIT.format("table.parquet")),
+    Target("measurements", _SURVEY, f"radiotwin close-loop {_SURVEY} --base log-distance -o out", slow=True),
+    Target("measurements", _SURVEY, f"radiotwin locate {_SURVEY} --twin loop/twin -o out.csv"),
+    Target("measurements", "survey/measurements.csv", "radiotwin compare survey/measurements.csv --scene scene -o out",
+           slow=True),
+    *(Target("log to import", file, "radiotwin import log.csv --columns import.toml -o out")
+      for file in ("log.csv", "sites.csv", "import.toml")),
+    *(Target("twin", file, command) for file, command in (
+        ("twin/twin.json", "radiotwin map twin --scene scene --altitudes 55 -o out.nc"),
+        ("twin/channel.safetensors", "radiotwin map twin --scene scene --altitudes 55 -o out.csv"),
+        ("twin_nn/twin.json", "radiotwin report twin_nn --scene scene -o out.html"),
+        ("twin_nn/channel.safetensors", "radiotwin map twin_nn --scene scene --altitudes 55 -o out.tif"),
+        ("loop/twin/twin.json", f"radiotwin locate {_SURVEY} --twin loop/twin -o out.csv"),
+        ("loop/twin/twin.json", "radiotwin map loop/twin --scene scene --altitudes 55 -o out.nc"))),
+    *(Target("radio map", "map.nc", command) for command in (
+        "radiotwin map map.nc --scene scene -o out.kmz", "radiotwin map map.nc --scene scene -o out.tif",
+        "radiotwin survey scene --truth map.nc --flights 1 -o out/measurements.csv",
+        "radiotwin report scene --truth map.nc -o out.html")),
+    *(Target("run folder", file, "radiotwin report loop -o out.html")
+      for file in ("loop/closeloop.json", "loop/residuals.csv.gz", "loop/drivers.png")),
+    *(Target("run folder", f"comparison/{name}", "radiotwin report comparison --scene scene -o out.html")
+      for name in ("compare.json",)),
+    Target("run folder", "run/config.json", "radiotwin report run -o out.html"),
+    Target("run folder", "run/flights.csv", "radiotwin report run -o out.html"),
+    Target("run folder", "run/comparison.csv", "radiotwin report run -o out.html"),
+    Target("checkpoint", "run/checkpoint.pt", _RUN),
+    Target("checkpoint", "run/config.json", _RUN),
+)
