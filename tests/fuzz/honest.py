@@ -55,7 +55,7 @@ def make_honest(folder: Path) -> None:
 
 def _write_survey(folder: Path) -> None:
     rng = np.random.default_rng(1)
-    device_m = rng.uniform(0, 300, (3, 2))
+    device_m = rng.uniform(0, 300, (4, 2))
     rows = []
     for flight in range(3):
         path_m = np.cumsum(rng.normal(0, 15, (25, 2)), axis=0) + 150
@@ -66,8 +66,9 @@ def _write_survey(folder: Path) -> None:
                 rows.append((flight * 100 + slot, f"f{flight}", f"r{flight % 2}", x, y, 51.5, f"d{device}", level_db))
     names = ["time_s", "flight", "receiver", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device", "gain_db"]
     pd.DataFrame(rows, columns=names).to_csv(folder / "measurements.csv", index=False)
-    pd.DataFrame({"device": [f"d{i}" for i in range(3)], "x_m": device_m[:, 0], "y_m": device_m[:, 1], "z_m": 1.5,
-                  "role": "anchor"}).to_csv(folder / "devices.csv", index=False)
+    device_m[3] = np.nan
+    pd.DataFrame({"device": [f"d{i}" for i in range(4)], "x_m": device_m[:, 0], "y_m": device_m[:, 1], "z_m": 1.5,
+                  "role": ["anchor"] * 3 + ["unknown"]}).to_csv(folder / "devices.csv", index=False)
 
 
 def _write_maps(folder: Path) -> None:
@@ -93,8 +94,8 @@ def _write_log(folder: Path) -> None:
         f"{1.7e9 + i},{50 + i * 1e-4},{8 + i * 2e-4},{40 + i % 3},c{i % 2},{-70 - i % 20}\n" for i in range(60)))
     (folder / "sites.csv").write_text("device,latitude,longitude,height\nc0,50.001,8.001,20\nc1,50.002,8.004,25\n")
     (folder / "import.toml").write_text(
-        'devices = "sites.csv"\n[columns]\ntime = "when"\nlatitude = "lat"\nlongitude = "lon"\n'
-        'altitude = "alt"\ndevice = "cell"\nlevel = "rsrp"\n')
+        'devices = "sites.csv"\ntime_format = "epoch s"\nlevel_unit = "dBm"\nlength_unit = "m"\n[columns]\n'
+        'time = "when"\nlatitude = "lat"\nlongitude = "lon"\naltitude = "alt"\ndevice = "cell"\nlevel = "rsrp"\n')
 
 
 def _declare_antennas(scene: Path) -> None:
