@@ -22,7 +22,7 @@ COMMANDS = (
     "radiotwin survey scene --truth segmented --flights 2 -o survey/measurements.csv",
     "radiotwin fit survey/measurements.csv --scene scene --model log_distance -o twin",
     "radiotwin fit survey/measurements.csv --scene scene -o twin_nn",
-    "radiotwin map twin --scene scene --altitudes 55 -o map.nc",
+    "radiotwin map twin --scene scene -o map.nc",
     "radiotwin compare survey/measurements.csv --scene scene -o comparison",
     "radiotwin close-loop open/measurements.csv --base log-distance -o loop",
     f"marl.fedqmix --scene {RUN} --out run",

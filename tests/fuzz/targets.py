@@ -62,8 +62,8 @@ TARGETS = (
         ("loop/twin/twin.json", f"radiotwin locate {_SURVEY} --twin loop/twin -o out.csv"),
         ("loop/twin/twin.json", "radiotwin map loop/twin --scene scene --altitudes 55 -o out.nc"))),
     *(Target("radio map", "map.nc", command) for command in (
-        "radiotwin map map.nc --scene scene -o out.kmz", "radiotwin map map.nc --scene scene -o out.tif",
-        "radiotwin survey scene --truth map.nc --flights 1 -o out/measurements.csv",
+        "radiotwin map map.nc --scene scene -o out.npz", "radiotwin map map.nc --scene scene --altitudes 55 -o out.tif",
+        "radiotwin map map.nc --scene scene --devices d1 -o out.png",
         "radiotwin report scene --truth map.nc -o out.html")),
     *(Target("run folder", file, "radiotwin report loop -o out.html")
       for file in ("loop/closeloop.json", "loop/residuals.csv.gz", "loop/drivers.png")),
