@@ -50,7 +50,8 @@ def test_a_rejected_truth_is_not_shown_by_another_way_nor_maps_over_other_lattic
         read_run(folder, truth=str(folder / "part.nc"))
 
 
-def test_a_planning_run_shows_its_flights_and_its_table(run_folder, tmp_path):
+def test_a_planning_run_shows_its_flights_and_its_table(run_folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(run_folder)  # a scene that a run names is read there, see below
     (tmp_path / "config.json").write_text(json.dumps({"run": {"scene": str(run_folder / "scene"),
                                                               "truth": "segmented"}}))
     pd.DataFrame({"method": ["qmix", "<i>"], "trained_in": ["NN twin", None], "real_episodes": [10, 0],
@@ -65,7 +66,7 @@ def test_a_planning_run_shows_its_flights_and_its_table(run_folder, tmp_path):
 
 
 @pytest.mark.parametrize("name, content, words", [
-    (None, None, "holds nothing to show"), ("closeloop.json", "{", "cannot be read as JSON"),
+    (None, None, "holds nothing to show"), ("closeloop.json", "{", "is not readable JSON"),
     ("closeloop.json", "[]", "is no JSON object"), ("closeloop.json", '{"schema": "x"}', "this version reads"),
     ("compare.json", '{"schema": "radiotwin.comparison/1", "scores": 3}', "is damaged"),
     ("flights.csv", "flight,uav\nf,u\n", "column 'time_s' is missing"), ("twin.json", "{}", "is damaged")])
