@@ -13,7 +13,7 @@ MAX_NUMBER = 1e15  # no quantity of a run is larger, in any unit
 
 
 class Record(BaseModel):
-    """Part of a record; fields that it does not name are dropped, so that none is used unchecked."""
+    """Part of a record; fields that it does not name are dropped, so that all are checked."""
 
     model_config = ConfigDict(strict=True, extra="ignore", allow_inf_nan=False)
 

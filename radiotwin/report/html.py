@@ -114,7 +114,7 @@ def _source(package: str, name: str) -> Markup:
 
 
 def _policy(style: Markup, scripts: Sequence[Markup]) -> str:
-    """Return the content security policy of a page that holds a style and scripts, and no others."""
+    """Return the content security policy of a page with one style and scripts."""
     def hashes(sources: Sequence[Markup]) -> str:
         digests = [hashlib.sha256(source.encode()).digest() for source in sources]
         return " ".join(f"'sha256-{base64.b64encode(each).decode()}'" for each in digests) \

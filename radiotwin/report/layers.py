@@ -113,7 +113,8 @@ def flight_layer(run: Run) -> list[dict]:
         return []
     track = tracks.groupby(["flight", "uav"], sort=False).ngroup()
     if track.max() >= MAX_TRACKS:
-        run.notes.append(f"Of {track.max() + 1:,} tracks of UAVs the first {MAX_TRACKS:,} are shown.")
+        run.notes.append(f"Of {track.max() + 1:,} tracks of UAVs the first {MAX_TRACKS:,} are "
+                         "shown.")
         tracks = tracks[track < MAX_TRACKS]
     step = -(-len(tracks) // MAX_POSITIONS)
     if step > 1:

@@ -8,7 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.result_file import errors, make_report, read_report, upgrade_report, write_report
+from radiotwin.closeloop.result_file import (
+    errors,
+    make_report,
+    read_report,
+    upgrade_report,
+    write_report,
+)
 from radiotwin.closeloop.run import close_loop
 from radiotwin.errors import BadInput
 
