@@ -75,6 +75,8 @@ class Budget:
 
 FILE_BYTES = Budget("FILE_BYTES", 2 * 2**30, "bytes")  # after decompression
 DOCUMENT_BYTES = Budget("DOCUMENT_BYTES", 128 * 2**20, "bytes")  # JSON: tenfold in memory
+RECORD_BYTES = Budget("RECORD_BYTES", 32 * 2**20, "bytes")  # JSON of a run that a page shows
+ENTRIES = Budget("ENTRIES", 100_000, "entries")  # of one list or object in it
 SETTINGS_BYTES = Budget("SETTINGS_BYTES", 4 * 2**20, "bytes")  # TOML
 NESTING = Budget("NESTING", 100, "levels of nesting")
 ROWS = Budget("ROWS", 50_000_000, "rows")
@@ -85,3 +87,7 @@ VERTICES = Budget("VERTICES", 20_000_000, "vertices")  # of a city, as is the ne
 FACES = Budget("FACES", 40_000_000, "faces")
 SHAPES = Budget("SHAPES", 200_000, "shapes")
 DEVICES = Budget("DEVICES", 100_000, "devices")
+PAGE_VALUES = Budget("PAGE_VALUES", 1_000_000_000, "values")  # of all maps that a page is made of
+PAGE_MAPS = Budget("PAGE_MAPS", 200, "radio maps")
+PICTURE_BYTES = Budget("PICTURE_BYTES", 8 * 2**20, "bytes")  # a figure inside a page
+PICTURE_PIXELS = Budget("PICTURE_PIXELS", 50_000_000, "pixels")

@@ -1,20 +1,66 @@
-"""Read further models for a comparison, and write its tables."""
+"""Read further models for a comparison, write its tables, and read them."""
 
+import gzip
 import json
 import warnings
+from collections import Counter
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pandas as pd
+from pydantic import field_validator
 
-from radiotwin.compare import Comparison
+from radiotwin.compare import CLASSES, Comparison
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_path
+from radiotwin.files import atomic_file, atomic_path
 from radiotwin.radiomap import RadioMap
+from radiotwin.records import Number, Record, Whole, read_record, validated
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin
 
 SCHEMA = "radiotwin.comparison/1"  # of compare.json
+
+
+class ScoreRecord(Record):
+    """Errors of a model on a class of links."""
+
+    model: str
+    against: str
+    positions: Literal["estimated", "true"]
+    links: Literal["all", "LoS", "NLoS"]
+    n: Whole
+    rmse_db: Number | None
+    mae_db: Number | None
+    bias_db: Number | None
+
+
+class LocationRecord(Record):
+    """Where a model located a device."""
+
+    model: str
+    device: str
+    x_m: Number | None = None
+    y_m: Number | None = None
+    error_m: Number | None
+    credible_radius_m: Number | None = None
+    located: bool = False
+
+
+class ComparisonRecord(Record):
+    """Content of `compare.json`."""
+
+    scores: list[ScoreRecord]
+    locations: list[LocationRecord]
+
+    @field_validator("scores")
+    @classmethod
+    def _complete(cls, scores: list[ScoreRecord]) -> list[ScoreRecord]:
+        classes = Counter((each.model, each.against, each.positions) for each in scores)
+        rows = {(each.model, each.against, each.positions, each.links) for each in scores}
+        if len(rows) < len(scores) or any(count != len(CLASSES) for count in classes.values()):
+            raise ValueError(f"not one row for each of {', '.join(CLASSES)} of a model")
+        return scores
 
 
 def judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
@@ -69,9 +115,35 @@ def write_comparison(comparison: Comparison, scene: Scene, folder: Path | str) -
         temporary.write_text(json.dumps(record, indent=1, allow_nan=False), encoding="utf-8")
     for name, table in (("scores.csv", comparison.scores), ("locations.csv", comparison.locations),
                         ("predictions.csv.gz", comparison.predictions)):
-        with atomic_path(folder / name) as temporary:
-            table.to_csv(temporary, index=False, float_format="%.4f",
-                         compression="gzip" if name.endswith(".gz") else None)
+        with atomic_file(folder / name) as file:
+            text = table.to_csv(index=False, float_format="%.4f").encode()
+            # The same bytes when it is run again: no time in the header.
+            file.write(gzip.compress(text, mtime=0) if name.endswith(".gz") else text)
+
+
+def read_comparison(path: Path) -> Comparison:
+    """Read the tables of a comparison.
+
+    Args:
+        path: of a `compare.json`.
+
+    Returns:
+        scores and locations; twins and predictions are empty.
+
+    Raises:
+        BadInput: it cannot be read, it is of another version, or it is damaged.
+    """
+    record = read_record(path, "comparison (compare.json)")
+    if record.get("schema") != SCHEMA:
+        raise BadInput(f"{path}: schema is {repr(record.get('schema'))[:60]}, this version reads "
+                       f"{SCHEMA!r}; make the run again")
+    record = validated(ComparisonRecord, record, path, "run `radiotwin compare` again")
+    scores = pd.DataFrame(record["scores"], columns=list(ScoreRecord.model_fields))
+    locations = pd.DataFrame(record["locations"], columns=list(LocationRecord.model_fields))
+    for table in (scores, locations):
+        numbers = [name for name in table if name.endswith(("_db", "_m"))]
+        table[numbers] = table[numbers].astype(float)
+    return Comparison(scores, locations, {}, pd.DataFrame())
 
 
 def _rows(table: pd.DataFrame) -> list[dict]:

@@ -10,13 +10,16 @@ import numpy as np
 
 from radiotwin import __version__
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.closeloop.result_schema import ReportRecord
 from radiotwin.closeloop.run import Loop
 from radiotwin.closeloop.selection import CandidateScore
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 from radiotwin.links import LinkData
+from radiotwin.records import read_record, validated
 
 SCHEMA, SCHEMA_1 = "radiotwin.closeloop/2", "radiotwin.closeloop/1"
+REMEDY = "run `radiotwin close-loop` again"
 MAX_GROUPS = 100  # thousands of transmitter positions say nothing one by one
 
 
@@ -101,18 +104,58 @@ def write_report(report: dict[str, Any], path: Path) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def upgrade_report(report: dict[str, Any]) -> dict[str, Any]:
-    """Return the content of a `closeloop.json` of this version or of version 0.1 as of this one.
+def read_report(path: Path) -> dict[str, Any]:
+    """Read a `closeloop.json` of this version or of version 0.1.
+
+    Args:
+        path: of the file.
+
+    Returns:
+        its content as of this version; each field has the type of `ReportRecord`.
 
     Raises:
-        BadInput: it is of neither.
-        KeyError, TypeError, AttributeError: it is damaged.
+        BadInput: it cannot be read, it is of another version, or it is damaged.
+    """
+    return upgrade_report(read_record(path, "result of a close-loop (closeloop.json)"), path)
+
+
+def upgrade_report(report: dict[str, Any], source: object = "closeloop.json") -> dict[str, Any]:
+    """Return the content of a `closeloop.json` of this version or of version 0.1 as of this one.
+
+    Args:
+        report: content of the file.
+        source: where it is from; messages begin with it.
+
+    Raises:
+        BadInput: it is of neither, or damaged.
     """
     schema = report.get("schema")
-    if schema == SCHEMA:
-        return report
-    if schema != SCHEMA_1:
-        raise BadInput(f"schema is {schema!r}, this version reads {SCHEMA!r} and {SCHEMA_1!r}")
+    if schema not in (SCHEMA, SCHEMA_1):
+        raise BadInput(f"{source}: schema is {repr(schema)[:60]}, this version reads {SCHEMA!r} "
+                       f"and {SCHEMA_1!r}; make the run again")
+    if schema == SCHEMA_1:
+        try:
+            report = _from_version_1(report)
+        except (KeyError, TypeError, AttributeError) as error:
+            raise BadInput(f"{source} is damaged ({type(error).__name__}: {error}); {REMEDY}"
+                           ) from None
+    return check_report(report, source)
+
+
+def check_report(report: dict[str, Any], source: object = "closeloop.json") -> dict[str, Any]:
+    """Return the content of a `closeloop.json` of this version with nothing but checked fields.
+
+    Args:
+        report: content of the file.
+        source: where it is from; messages begin with it.
+
+    Raises:
+        BadInput: a field is missing or has another type.
+    """
+    return validated(ReportRecord, report, source, REMEDY)
+
+
+def _from_version_1(report: dict[str, Any]) -> dict[str, Any]:
     new_names = {"remarks": "notes", "structure_before": "dependences_before"}
     new = {new_names.get(name, name): value for name, value in report.items()}
     new["effects"] = [{("params" if name == "setting" else name): value

@@ -16,7 +16,7 @@ from radiotwin.report.closeloop_maps import (
     residual_map_figure,
 )
 from radiotwin.report.effect_figures import effect_figure
-from radiotwin.report.labels import INTERPOLATIONS, name_label
+from radiotwin.report.labels import INTERPOLATIONS, effect_picture, name_label
 from radiotwin.report.map_background import MapBackground
 from radiotwin.report.style import AFTER, BEFORE, FITTED, hide_spines, new_figure, save, shorten
 from radiotwin.scene import Scene
@@ -38,12 +38,12 @@ def write_closeloop_figures(loop: Loop, scene: Scene | None, report: dict,
         scene: whose buildings are drawn; None: no 3D map.
         report: content of `closeloop.json`.
         folder: for `waterfall.png`, `residual_map.png`, `level_map.png`, `drivers.png`, and
-            `effect_RANK_NAME.png` for each effect; effects of an earlier run are removed.
+            `effect_RANK_NAME.png` for each effect; those of an earlier run are removed.
     """
     folder, data = Path(folder), collect(loop)
     background = MapBackground(data.links, scene)
-    for old in folder.glob("effect_*.png"):
-        old.unlink()
+    for old in [*folder.glob("effect_*.png"), folder / "level_map.png"]:
+        old.unlink(missing_ok=True)
     save(waterfall_figure(report), folder / "waterfall.png")
     save(residual_map_figure(data, background), folder / "residual_map.png")
     level_map = level_map_figure(data, background)
@@ -51,10 +51,10 @@ def write_closeloop_figures(loop: Loop, scene: Scene | None, report: dict,
         save(level_map, folder / "level_map.png")
     save(dependence_figure(data), folder / "drivers.png")
     for rank, effect in enumerate(data.effects, start=1):
-        save(effect_figure(effect, background), folder / f"effect_{rank}_{effect.name}.png")
+        save(effect_figure(effect, background), folder / effect_picture(rank, effect.name))
     if data.interpolated_db is not None:
         save(contribution_map_figure(data.interpolated_db, background),
-             folder / f"effect_{len(data.effects) + 1}_correlated_shadowing.png")
+             folder / effect_picture(len(data.effects) + 1, "correlated_shadowing"))
 
 
 def waterfall_figure(report: dict) -> Figure:

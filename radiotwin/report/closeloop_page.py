@@ -1,12 +1,15 @@
 """Make the page of a close-loop, or its part of a run's page, from `closeloop.json`."""
 
 from collections import Counter
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from radiotwin.closeloop.result_file import check_report
 from radiotwin.report.html import Table, read_picture, write_page
 from radiotwin.report.labels import (
     INTERPOLATIONS,
+    effect_picture,
     join_names,
     name_label,
     parameter_label,
@@ -46,6 +49,9 @@ CARDS = (("rmse_db", "RMSE", " dB"), ("bias_db", "bias", " dB"),
          ("std_db", "standard deviation", " dB"), ("correlation", "correlation", ""))
 MAX_NAMED = 4  # variables in a sentence
 MAX_ROWS = 40  # groups with more members are left out of the tables
+MAX_COLUMNS = 30  # of the scores
+MAX_MODELS = 100
+MAX_EFFECTS = 30  # with a figure each
 
 
 def write_closeloop_page(report: dict, folder: Path | str, title: str) -> None:
@@ -55,8 +61,12 @@ def write_closeloop_page(report: dict, folder: Path | str, title: str) -> None:
         report: content of `closeloop.json`.
         folder: of the page and of the figures that go into it.
         title: heading of the page.
+
+    Raises:
+        BadInput: a damaged report or figure, or a path that cannot be written.
+        RunFailed: the disk is full.
     """
-    folder = Path(folder)
+    folder, report = Path(folder), check_report(report)
     write_page("closeloop.html", folder / "closeloop.html", {
         "title": title, "page_title": title, "facts": _facts(report),
         "closeloop": closeloop_context(report, folder)})
@@ -94,8 +104,9 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         folder: of the figures.
 
     Raises:
-        KeyError, TypeError, ValueError: a damaged report.
+        BadInput: a damaged report or figure.
     """
+    report = check_report(report, folder / "closeloop.json")
     candidates = report["candidates"]
     verdict = BADGES[report["verdict"]]
     if report["verdict"] == "effect":
@@ -105,6 +116,7 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         "lead": closeloop_summary(report), "verdict": verdict, "cards": _cards(report),
         "figures": [picture for picture in pictures if picture],
         "effects": _effects(report, folder),
+        "more_effects": max(len(report["effects"]) - MAX_EFFECTS, 0),
         "errors": _error_table(report, ("los",)),
         "errors_by_member": _error_table(report, ("device", "receiver", "flight")),
         "trials": f"{len(candidates)} trials in {len({c['step'] for c in candidates})} steps",
@@ -128,14 +140,14 @@ def _cards(report: dict) -> list[tuple[str, str]]:
 def _effects(report: dict, folder: Path) -> dict[str, list[dict]]:
     """Return the effects grouped by their heading."""
     sections: dict[str, list[dict]] = {}
-    for effect in report["effects"]:
+    for effect in report["effects"][:MAX_EFFECTS]:
         name, label = effect["name"], name_label(effect["name"])
         heading = "Interpolated, not explained" if name in INTERPOLATIONS else "Effects found"
         rows = [[parameter_label(key), _number(p["value"]), _interval(p), p["unit"]]
                 for key, p in effect["parameters"].items()]
         sections.setdefault(heading, []).append({
             "rank": effect["rank"], "name": name, "label": label, "evidence": _evidence(effect),
-            "picture": read_picture(folder, f"effect_{effect['rank']}_{name}.png", label),
+            "picture": read_picture(folder, effect_picture(effect["rank"], name), label),
             "parameters": Table(("parameter", "value", "90 % interval", "unit"), rows)})
     return sections
 
@@ -172,8 +184,9 @@ def _evidence(effect: dict) -> str:
 def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
     """Return errors before and after for groups of links, and of other models for all links."""
     rows: list[list[str]] = []
-    others = report["baselines"] if "los" in kinds else {}
+    others = dict(islice(report["baselines"].items(), MAX_MODELS if "los" in kinds else 0))
     columns = list(dict.fromkeys([*COLUMNS, *(key for each in others.values() for key in each)]))
+    columns = columns[:MAX_COLUMNS]
     groups = [("all links", report["error"])] if "los" in kinds else []
     for kind in kinds:
         group = report["error"].get(f"by_{kind}", {})
@@ -199,7 +212,7 @@ def _candidate_table(candidates: list[dict]) -> Table:
             for c in candidates]
     return Table(("step", "effect", "kept, or why not", "held-out gain [nats]",
                   "held-out RMSE [dB]", "p"), rows, "", 3,
-                 [number for number, c in enumerate(candidates) if c["kept"]])
+                 {number for number, c in enumerate(candidates) if c["kept"]})
 
 
 def _facts(report: dict) -> list[str]:

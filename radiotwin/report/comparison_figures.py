@@ -10,7 +10,7 @@ from radiotwin.compare import Comparison
 from radiotwin.radiomap import RadioMap
 from radiotwin.report.labels import MODELS
 from radiotwin.report.map_figures import model_maps_figure, panels, true_positions_m
-from radiotwin.report.style import LOS_COLOUR, NLOS_COLOUR, save
+from radiotwin.report.style import LOS_COLOUR, NLOS_COLOUR, plain, save
 from radiotwin.scene import Scene
 from radiotwin.scene.preview import draw_heights, height_grid
 
@@ -66,7 +66,7 @@ def scatter_figure(comparison: Comparison, models: list[str]) -> Figure:
         ax.plot(ends_db, ends_db, color="black", linewidth=0.8)
         error_db = (links[model] - links["measured_db"]).dropna()
         rmse_db = np.sqrt(np.mean(error_db**2))
-        ax.set(title=f"{MODELS.get(model, model)}, RMSE {rmse_db:.1f} dB", aspect="equal",
+        ax.set(title=f"{plain(MODELS.get(model, model))}, RMSE {rmse_db:.1f} dB", aspect="equal",
                xlabel="measured [dB]", ylabel="predicted [dB]", xlim=ends_db, ylim=ends_db)
         ax.grid(alpha=0.25)
         ax.legend(markerscale=4, loc="upper left")
@@ -104,7 +104,7 @@ def estimates_figure(comparison: Comparison, models: list[str], scene: Scene) ->
                 ax.add_artist(Circle((device.x_m, device.y_m), radius_m, fill=False,
                                      color=NLOS_COLOUR, linewidth=1, alpha=0.8))
         errors_m = comparison.locations.query("model == @model")["error_m"]
-        ax.set_title(f"{MODELS.get(model, model)}: median error {errors_m.median():.1f} m")
+        ax.set_title(f"{plain(MODELS.get(model, model))}: median error {errors_m.median():.1f} m")
         ax.set(xlim=bounds[:2], ylim=bounds[2:])
     handles = dict(zip(*reversed(axes[0, 0].get_legend_handles_labels())))
     figure.colorbar(image, ax=axes, label="height [m]", shrink=0.8)

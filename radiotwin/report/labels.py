@@ -1,5 +1,7 @@
 """Names of variables, effects, models and parameters as they are printed."""
 
+import re
+
 VARIABLES = {  # label and unit
     "distance_m": ("distance", "m"), "elevation_deg": ("elevation at the device", "°"),
     "azimuth_deg": ("azimuth at the device", "° from north"),
@@ -49,6 +51,11 @@ INTERPOLATIONS = ("correlated_shadowing", "unexplained_trend")
 def name_label(name: str) -> str:
     """Return the printed name of an effect or a base: `receiver_drift` -> `receiver drift`."""
     return NAMES.get(name, name.replace("_", " "))
+
+
+def effect_picture(rank: int, name: str) -> str:
+    """Return the file name of an effect's figure; no name of an effect makes another path of it."""
+    return f"effect_{rank}_{re.sub(r'[^A-Za-z0-9_.-]', '_', name)[:100]}.png"
 
 
 def variable_label(name: str) -> tuple[str, str]:

@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.compare import comparable_db
+from radiotwin.measurements import MAX_COORDINATE_M
 from radiotwin.radiomap import RadioMap
 from radiotwin.report.packing import pack, pack_db, pack_m
 from radiotwin.report.run_folder import TRUTH, Run
@@ -13,6 +14,9 @@ from radiotwin.report.style import level_range_db, residual_range_db
 MAX_VALUES = 2_000_000  # of all maps together, 2 bytes each
 MAX_LINKS = 60_000
 MAX_POSITIONS = 200_000  # of the UAVs on all flights together
+MAX_TRACKS = 2000  # flights times UAVs
+MAX_DEVICES = 20_000  # with a mark on the city
+MAX_MAP_DEVICES = 1000  # with a map to choose
 
 
 def map_layers(run: Run) -> list[dict]:
@@ -27,7 +31,8 @@ def map_layers(run: Run) -> list[dict]:
     truth = run.maps.get(TRUTH)
     layers = []
     for name, radio_map in run.maps.items():
-        thin = radio_map.dataset.isel(y=slice(None, None, step), x=slice(None, None, step))
+        thin = radio_map.dataset.isel(device=slice(_map_devices(run, name)),
+                                      y=slice(None, None, step), x=slice(None, None, step))
         fields = [_field(f"{name}: gain", "gain [dB]", thin["gain_db"].values, "gain")]
         if "sigma_db" in thin:
             fields.append(_field(f"{name}: standard deviation", "σ [dB]", thin["sigma_db"].values,
@@ -35,10 +40,10 @@ def map_layers(run: Run) -> list[dict]:
         fields.append({"label": f"{name}: line of sight", "kind": "los", "title": "line of sight",
                        "low": 0, "high": 1, "values": pack(thin["los"].values.astype(np.uint8))})
         if truth is not None and name != TRUTH and _same_lattice(radio_map, truth):
-            error_db = _error_db(radio_map, truth)[..., ::step, ::step]
+            error_db = _error_db(RadioMap(thin), truth, step)
             fields.append(_field(f"{name}: error (model − truth)", "model − truth [dB]", error_db,
                                  "error"))
-        layers.append({"name": name, "devices": radio_map.devices, "fields": fields,
+        layers.append({"name": name, "devices": RadioMap(thin).devices, "fields": fields,
                        **{axis: thin[axis].values.astype(float).round(3).tolist()
                           for axis in "xyz"}, "step_m": radio_map.lattice.step_m * step})
     return layers
@@ -86,7 +91,7 @@ def device_layer(run: Run) -> list[dict]:
         entry = devices.setdefault(device.device, {"name": device.device, "true": None,
                                                    "estimate": None})
         entry["role"] = device.role
-        if not np.isfinite(position_m).all():
+        if not (np.abs(position_m) <= MAX_COORDINATE_M).all():  # or none
             continue
         if device.role == "anchor":
             entry["true"] = entry["true"] or position_m
@@ -106,6 +111,11 @@ def flight_layer(run: Run) -> list[dict]:
     tracks = run.tracks
     if tracks is None or tracks.empty:
         return []
+    track = tracks.groupby(["flight", "uav"], sort=False).ngroup()
+    if track.max() >= MAX_TRACKS:
+        run.notes.append(f"Of {track.max() + 1:,} tracks of UAVs the first {MAX_TRACKS:,} are "
+                         "shown.")
+        tracks = tracks[track < MAX_TRACKS]
     step = -(-len(tracks) // MAX_POSITIONS)
     if step > 1:
         run.notes.append(f"Of {len(tracks):,} positions of UAVs every {step}th is shown.")
@@ -152,14 +162,24 @@ def _field(label: str, title: str, level_db: np.ndarray, kind: str) -> dict:
             "values": pack_db(level_db)}
 
 
-def _error_db(radio_map: RadioMap, truth: RadioMap) -> np.ndarray:
-    """Return (device, z, y, x) map minus truth; NaN where the truth has no value."""
+def _error_db(radio_map: RadioMap, truth: RadioMap, step: int) -> np.ndarray:
+    """Return (device, z, y, x) map minus truth at every n-th position; NaN where there is none."""
     error_db = np.full(radio_map.gain_db.shape, np.nan)
-    model_db = comparable_db(radio_map, truth)
+    model_db, true_db = comparable_db(radio_map, truth), truth.gain_db[..., ::step, ::step]
+    row_of = {device: row for row, device in enumerate(truth.devices)}
     for row, device in enumerate(radio_map.devices):
-        if device in truth.devices:
-            error_db[row] = model_db[row] - truth.gain_db[truth.devices.index(device)]
+        if device in row_of:
+            error_db[row] = model_db[row] - true_db[row_of[device]]
     return error_db
+
+
+def _map_devices(run: Run, name: str) -> int:
+    """Return the number of devices of a map that are shown; adds a note where some are not."""
+    devices, altitudes = run.maps[name].gain_db.shape[:2]
+    shown = min(devices, MAX_MAP_DEVICES, max(MAX_VALUES // (3 * altitudes), 1))
+    if shown < devices:
+        run.notes.append(f"Of the map {name} the first {shown:,} of {devices:,} devices are shown.")
+    return shown
 
 
 def _same_lattice(one: RadioMap, other: RadioMap) -> bool:

@@ -15,6 +15,7 @@ from radiotwin.report.style import (
     GAIN_COLOURS,
     level_range_db,
     new_figure,
+    plain,
     save,
 )
 from radiotwin.scene import Scene
@@ -23,6 +24,8 @@ from radiotwin.scene.preview import height_grid
 BUILDING_M = 2.0  # lowest height that is outlined
 OUTLINE_CELLS = 400  # along the longer side
 MAX_COLUMNS = 5
+MAX_PANELS = 100
+MAX_RATIO = 5  # of the sides of a panel
 ERROR_RANGE_DB = 25.0
 HeightGrid = tuple[np.ndarray, tuple[float, float, float, float]]
 """(ny, nx) heights [m], and x_min, x_max, y_min, y_max [m]."""
@@ -40,17 +43,18 @@ def write_picture(radio_map: RadioMap, scene: Scene, path: Path | str) -> None:
 
 
 def radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
-    """Draw the gain of every device at the lowest altitude, a panel for each.
+    """Draw the gain of each of `MAX_PANELS` devices at the lowest altitude, a panel for each.
 
     Args:
         radio_map: map to draw.
         scene: whose buildings are outlined.
     """
-    names, gain_db = radio_map.devices, radio_map.gain_db[:, 0]
+    names = radio_map.devices[:MAX_PANELS]
+    gain_db = radio_map.gain_db[:len(names), 0]
     columns = min(len(names), MAX_COLUMNS)
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     figure, axes = panels(-(-len(names) // columns), columns, 2.6,
-                          0.6 + 2.3 * (y_max - y_min) / (x_max - x_min))
+                          0.6 + 2.3 * min((y_max - y_min) / (x_max - x_min), MAX_RATIO))
     colour_range = level_range_db(gain_db)
     heights = height_grid(scene, OUTLINE_CELLS)
     position_m = true_positions_m(scene)
@@ -60,15 +64,17 @@ def radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
             continue
         image = _draw_map(ax, gain_db[number], radio_map, heights, GAIN_COLOURS, *colour_range)
         _mark_device(ax, position_m.get(names[number]), 8)
-        ax.set_title(names[number], fontsize=10)
+        ax.set_title(plain(names[number]), fontsize=10)
         if number % columns:
             ax.set(ylabel="", yticklabels=[])
         if number + columns < len(names):
             ax.set(xlabel="", xticklabels=[])
     figure.colorbar(image, ax=axes, label="channel gain [dB]", shrink=0.7)
-    source = radio_map.dataset.attrs.get("source", "")
+    source = plain(str(radio_map.dataset.attrs.get("source", "")))
+    left_out = len(radio_map.devices) - len(names)
+    more = f"; {left_out} more devices" if left_out else ""
     figure.suptitle(f"{source} at {radio_map.lattice.z_m[0]:g} m (triangle: device; white: not "
-                    "detected)")
+                    f"detected{more})")
     return figure
 
 
@@ -90,14 +96,14 @@ def model_maps_figure(truth: RadioMap, models: dict[str, RadioMap], scene: Scene
     axes[0, 0].set_title("truth")
     axes[1, 0].set_axis_off()
     axes[1, 0].text(
-        0.02, 0.5, f"device {device}\nat {truth.lattice.z_m[0]:g} m altitude\n\n"
+        0.02, 0.5, f"device {plain(device)}\nat {truth.lattice.z_m[0]:g} m altitude\n\n"
         "top: channel gain\nbottom: model − truth\ntriangle: device\nwhite: not detected\n\n"
         "models: mean of\nthe detected levels", transform=axes[1, 0].transAxes, fontsize=11)
     for column, (name, radio_map) in enumerate(models.items(), start=1):
         model_db = comparable_db(radio_map, truth)[radio_map.devices.index(device), 0]
         error_db = model_db - true_db
         _draw_map(axes[0, column], model_db, radio_map, heights, GAIN_COLOURS, *colour_range)
-        axes[0, column].set_title(MODELS.get(name, name))
+        axes[0, column].set_title(plain(MODELS.get(name, name)))
         error_image = _draw_map(axes[1, column], error_db, truth, heights, DIFFERENCE_COLOURS,
                                 -ERROR_RANGE_DB, ERROR_RANGE_DB)
         axes[1, column].set_title(f"difference, RMSE {np.sqrt(np.nanmean(error_db**2)):.1f} dB",

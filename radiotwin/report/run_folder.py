@@ -1,16 +1,24 @@
 """Read the folder of a run: of a demo, a twin, a close-loop, a planning run, or a scene."""
 
-import json
+import os
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pandas as pd
 
-from radiotwin.closeloop.result_file import SCHEMA, SCHEMA_1, upgrade_report
+from radiotwin.budgets import MAP_VALUES, PAGE_MAPS, PAGE_VALUES
+from radiotwin.closeloop.result_file import read_report
 from radiotwin.compare import Comparison
+from radiotwin.comparison_output import read_comparison
 from radiotwin.errors import BadInput
+from radiotwin.inputs import require_within
 from radiotwin.measurements import read_measurements
 from radiotwin.radiomap import RadioMap
+from radiotwin.records import Record, read_record, validated
+from radiotwin.report.run_tables import PLANNING, POSITION, RESIDUALS, TRACK, read_table
 from radiotwin.scene import Scene
 from radiotwin.survey import segmented_truth
 from radiotwin.twin import Twin
@@ -18,12 +26,15 @@ from radiotwin.twin import Twin
 TRUTH = "truth"
 MEASUREMENTS = tuple(f"{folder}measurements{suffix}" for folder in ("", "survey/")
                      for suffix in (".csv", ".csv.gz", ".parquet"))
-POSITION = ["x_m", "y_m", "z_m"]
-TRACK = ["flight", "uav", "time_s", *POSITION]
-RESIDUALS = ["flight", "receiver", "device", "los", *(f"receiver_{name}" for name in POSITION),
-             *(f"device_{name}" for name in POSITION), "before_db", "after_db"]
 CONTENT = ("scene.toml, twin.json, closeloop.json, compare.json, config.json of a planning run, or "
            "measurements.csv")
+
+
+class PlanningRecord(Record):
+    """Settings of a planning run that its page uses."""
+
+    scene: str | None = None
+    truth: str | None = None
 
 
 @dataclass(eq=False)
@@ -73,28 +84,27 @@ def read_run(folder: Path | str, scene: Path | None = None, truth: str | None = 
         BadInput: no such folder, nothing in it that can be shown, or damaged content.
     """
     folder = Path(folder)
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise BadInput(f"{folder} is not a folder; give the folder of a run: it holds {CONTENT}")
     run = Run(folder)
-    run.closeloop, run.closeloop_folder = _find_record(
-        (folder, folder / "closeloop"), "closeloop.json", SCHEMA, SCHEMA_1)
-    if run.closeloop is not None:
-        run.closeloop = _upgraded(run.closeloop, f"{run.closeloop_folder}/closeloop.json")
-    record, run.comparison_folder = _find_record(
-        (folder, folder / "comparison"), "compare.json", "radiotwin.comparison/1")
-    run.comparison = _comparison(record, run.comparison_folder)
+    found = _first(folder, "closeloop.json", "closeloop/closeloop.json")
+    if found is not None:
+        run.closeloop, run.closeloop_folder = read_report(found), found.parent
+        table = _first(found.parent, "residuals.csv.gz")
+        if table is not None:
+            run.residuals = read_table(table, RESIDUALS, {"time_s": "number or nothing"})
+    found = _first(folder, "compare.json", "comparison/compare.json")
+    if found is not None:
+        run.comparison, run.comparison_folder = read_comparison(found), found.parent
     settings = _planning_settings(folder)
     inputs = (run.closeloop or {}).get("inputs", {})
     run.scene = _scene(run, scene, inputs.get("scene") or settings.get("scene"))
-    run.twin = next((Twin.load(path) for path in (folder, folder / "twin")
-                     if (path / "twin.json").is_file()), None)
-    if settings and (folder / "comparison.csv").is_file():
-        run.planning = _read_table(folder / "comparison.csv",
-                                   ["method", "trained_in", "real_episodes", "truth_ratio"])
+    found = _first(folder, "twin.json", "twin/twin.json")
+    run.twin = Twin.load(found.parent) if found is not None else None
+    found = _first(folder, "comparison.csv")
+    if settings and found is not None:
+        run.planning = read_table(found, PLANNING)
     _read_maps(run, truth or ("segmented" if settings.get("truth") == "segmented" else None))
-    if run.closeloop_folder is not None:
-        path = run.closeloop_folder / "residuals.csv.gz"
-        run.residuals = _read_table(path, RESIDUALS) if path.is_file() else None
     run.tracks = _tracks(run, measurements)
     if all(part is None for part in (run.scene, run.twin, run.closeloop, run.comparison,
                                      run.planning, run.tracks)):
@@ -102,17 +112,33 @@ def read_run(folder: Path | str, scene: Path | None = None, truth: str | None = 
     return run
 
 
+def _first(folder: Path, *names: str) -> Path | None:
+    """Return the first file of the folder, none of which a link may lead elsewhere."""
+    found = next((folder / name for name in names if os.path.isfile(folder / name)), None)
+    return None if found is None else require_within(folder, found, str(folder))
+
+
 def _scene(run: Run, given: Path | None, named: str | None) -> Scene | None:
     if given is not None:
         return Scene.load(given)
-    for path in (run.folder, run.folder / "scene"):
-        if (path / "scene.toml").is_file():
-            return Scene.load(path)
-    if named and (Path(named) / "scene.toml").is_file():
-        return Scene.load(named)
-    reason = f"the scene {named} does not exist" if named else "the run names no scene"
-    run.notes.append(f"No 3D map: {reason}; give one with --scene.")
+    found = _first(run.folder, "scene.toml", "scene/scene.toml")
+    if found is not None:
+        return Scene.load(found.parent)
+    reason = "the run names no scene; give one with --scene"
+    if named and os.path.isfile(Path(named) / "scene.toml"):
+        if _is_within((run.folder, Path.cwd()), Path(named)):
+            return Scene.load(named)
+        # A stranger's run must not choose what is read here and goes into a page.
+        reason = (f"the run names the scene {named}, which is neither in its folder nor in the "
+                  f"current one; give it with --scene")
+    elif named:
+        reason = f"the scene {named} does not exist; give one with --scene"
+    run.notes.append(f"No 3D map: {reason}.")
     return None
+
+
+def _is_within(folders: Iterable[Path], path: Path) -> bool:
+    return any(path.resolve().is_relative_to(folder.resolve()) for folder in folders)
 
 
 def _read_maps(run: Run, truth: str | None) -> None:
@@ -124,21 +150,25 @@ def _read_maps(run: Run, truth: str | None) -> None:
                            "be compared with the run; give a map of that scene")
     elif truth == "segmented" and run.scene is not None:
         run.maps[TRUTH] = segmented_truth(run.scene)
-    elif run.scene is not None and (run.scene.folder / "truth.nc").is_file():
-        found = RadioMap.read(run.scene.folder / "truth.nc")
+    elif run.scene is not None and (path := _first(run.scene.folder, "truth.nc")):
+        found = _read_map(path, run)
         try:
             run.scene.check_map(found)
             run.maps[TRUTH] = found
         except BadInput as error:
             run.notes.append(f"{run.scene.folder / 'truth.nc'} is not shown: {error}.")
     if run.twin is not None and run.scene is not None:
+        MAP_VALUES.check(len(run.twin.devices) * int(np.prod(run.scene.lattice.shape)),
+                         f"the twin's map over the lattice of {run.scene.folder}")
         corrected = run.twin.is_corrected
         run.maps["twin, corrected" if corrected else "twin"] = run.twin.radio_map(run.scene)
     truth_path = run.scene and (run.scene.folder / "truth.nc").resolve()
-    for path in sorted(run.folder.glob("*.nc")):
+    paths = sorted(run.folder.glob("*.nc"))
+    PAGE_MAPS.check(len(paths), run.folder)
+    for path in paths:
         if path.stem in run.maps or path.resolve() == truth_path:
             continue
-        found = RadioMap.read(path)
+        found = _read_map(path, run)
         if run.scene is not None and not run.scene.over_lattice(found):
             run.notes.append(
                 f"{path} is not shown: it is not over the lattice of {run.scene.folder}.")
@@ -146,14 +176,22 @@ def _read_maps(run: Run, truth: str | None) -> None:
             run.maps[path.stem] = found
 
 
+def _read_map(path: Path, run: Run) -> RadioMap:
+    found = RadioMap.read(require_within(path.parent, path, str(path.parent)))
+    values = sum(each.gain_db.size for each in (found, *run.maps.values()))
+    PAGE_VALUES.check(values, f"the radio maps of {run.folder}")
+    return found
+
+
 def _tracks(run: Run, measurements: Path | None) -> pd.DataFrame | None:
     """Return the UAVs' positions from a planning run, measurements, or a close-loop's links."""
-    path = run.folder / "flights.csv"
-    if measurements is None and path.is_file():
-        return _read_table(path, TRACK)
-    found = measurements or next((run.folder / name for name in MEASUREMENTS
-                                  if (run.folder / name).is_file()), None)
+    path = _first(run.folder, "flights.csv")
+    if measurements is None and path is not None:
+        return read_table(path, TRACK)
+    found = measurements or _first(run.folder, *MEASUREMENTS)
     if found is not None:
+        if measurements is None:
+            _first(found.parent, "devices.csv")
         links = read_measurements(found).table
     elif run.residuals is not None and "time_s" in run.residuals:
         links = run.residuals
@@ -163,72 +201,15 @@ def _tracks(run: Run, measurements: Path | None) -> pd.DataFrame | None:
         columns={"receiver": "uav"} | {f"receiver_{name}": name for name in POSITION})
     if "time_s" not in tracks or tracks["time_s"].isna().any():
         return None  # positions without an order are no flight
-    return tracks[TRACK].drop_duplicates().reset_index(drop=True)
+    return tracks[list(TRACK)].drop_duplicates().reset_index(drop=True)
 
 
-def _comparison(record: dict | None, folder: Path | None) -> Comparison | None:
-    if record is None:
-        return None
-    try:
-        scores, locations = (pd.DataFrame(record[name]) for name in ("scores", "locations"))
-        numbers = ["rmse_db", "mae_db", "bias_db"]
-        scores[numbers] = scores[numbers].astype(float)
-        if len(locations):
-            locations["error_m"] = locations["error_m"].astype(float)
-        return Comparison(scores, locations, {}, pd.DataFrame())
-    except (KeyError, TypeError, ValueError) as error:
-        raise BadInput(f"{folder}/compare.json is damaged ({type(error).__name__}: {error}); run "
-                       "`radiotwin compare` again") from None
-
-
-def _planning_settings(folder: Path) -> dict:
+def _planning_settings(folder: Path) -> dict[str, Any]:
     """Return the settings of `marl.fedqmix`; empty for any other folder."""
-    path = folder / "config.json"
-    settings = _read_json(path).get("run", {}) if path.is_file() else {}
-    return settings if isinstance(settings, dict) else {}
-
-
-def _find_record(folders: tuple[Path, ...], name: str,
-                 *schemas: str) -> tuple[dict | None, Path | None]:
-    """Return the content of the first file of a name, and its folder."""
-    for folder in folders:
-        path = folder / name
-        if path.is_file():
-            record = _read_json(path)
-            if record.get("schema") not in schemas:
-                raise BadInput(f"{path}: schema is {record.get('schema')!r}, this version reads "
-                               f"{' and '.join(map(repr, schemas))}; make the run again")
-            return record, folder
-    return None, None
-
-
-def _upgraded(record: dict, path: str) -> dict:
-    """Return the content of a `closeloop.json` of any version as of this one."""
-    try:
-        return upgrade_report(record)
-    except (KeyError, TypeError, AttributeError) as error:
-        raise BadInput(f"{path} is damaged ({type(error).__name__}: {error}); run "
-                       "`radiotwin close-loop` again") from None
-
-
-def _read_json(path: Path) -> dict:
-    try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise BadInput(f"{path} cannot be read as JSON ({error}); make the run again") from None
-    if not isinstance(record, dict):
-        raise BadInput(f"{path} is no JSON object; make the run again")
-    return record
-
-
-def _read_table(path: Path, columns: list[str]) -> pd.DataFrame:
-    """Read a table that has at least the columns given."""
-    text = dict.fromkeys(("flight", "uav", "receiver", "device", "method"), str)
-    try:
-        table = pd.read_csv(path, dtype=text)
-    except (OSError, ValueError, EOFError) as error:
-        raise BadInput(f"{path} cannot be read: {error}; make the run again") from None
-    missing = [name for name in columns if name not in table]
-    if missing:
-        raise BadInput(f"{path}: column {missing[0]!r} is missing; make the run again")
-    return table
+    path = _first(folder, "config.json")
+    if path is None:
+        return {}
+    settings = read_record(path, "settings of a planning run").get("run", {})
+    if not isinstance(settings, dict):
+        return {}
+    return validated(PlanningRecord, settings, path, "make the run again")

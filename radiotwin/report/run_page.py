@@ -7,15 +7,23 @@ import numpy as np
 from matplotlib import colormaps
 
 from radiotwin import __version__
-from radiotwin.errors import BadInput
 from radiotwin.report.city import city_mesh
 from radiotwin.report.closeloop_page import closeloop_context
 from radiotwin.report.comparison_page import comparison_context
 from radiotwin.report.html import Table, read_picture, write_page
-from radiotwin.report.layers import bounds_m, device_layer, flight_layer, link_layer, map_layers
+from radiotwin.report.layers import (
+    MAX_DEVICES,
+    bounds_m,
+    device_layer,
+    flight_layer,
+    link_layer,
+    map_layers,
+)
 from radiotwin.report.run_folder import Run
 
 SCALES = {"gain": "viridis", "sigma": "cividis", "error": "coolwarm", "link": "coolwarm_r"}
+SCRIPTS = (("pythreejs", "three.js"), ("radiotwin.report", "stage.js"),
+           ("radiotwin.report", "overlay.js"), ("radiotwin.report", "viewer.js"))
 LOS_COLOURS = [[209, 73, 91], [42, 127, 158]]  # RGB of no and of line of sight
 
 
@@ -27,7 +35,8 @@ def write_report(run: Run, path: Path | str) -> None:
         path: HTML file, written completely or not at all.
 
     Raises:
-        BadInput: a damaged `closeloop.json`, or a path that cannot be written.
+        BadInput: a damaged `closeloop.json` or figure, or a path that cannot be written.
+        RunFailed: the disk is full.
     """
     title = run.scene.config.name if run.scene else run.folder.resolve().name
     shown = run.scene or run.tracks is not None or run.residuals is not None or run.twin
@@ -38,7 +47,8 @@ def write_report(run: Run, path: Path | str) -> None:
     write_page("run.html", path, {
         "title": title, "page_title": f"radiotwin: {title}", "viewer": viewer, "notes": run.notes,
         "closeloop": _closeloop(run), "comparison": comparison, "planning": _planning(run),
-        "estimates": _estimates(run), "facts": _facts(run)})
+        "estimates": _estimates(run), "facts": _facts(run)},
+        SCRIPTS if viewer else ())
 
 
 def _viewer_data(run: Run) -> dict[str, Any]:
@@ -54,27 +64,24 @@ def _viewer_data(run: Run) -> dict[str, Any]:
         heights_m.append(float(run.tracks["z_m"].fillna(0.0).max()))
     scales = {kind: (255 * colormaps[name](np.linspace(0, 1, 101))[:, :3]).round().astype(int)
               .tolist() for kind, name in SCALES.items()} | {"los": LOS_COLOURS}
+    devices = device_layer(run)
+    if len(devices) > MAX_DEVICES:
+        run.notes.append(f"Of {len(devices):,} devices the first {MAX_DEVICES:,} are drawn.")
     return {"scales": scales, "bounds": bounds_m(run), "top_m": max(heights_m, default=1.0),
-            "city": city, "maps": maps, "links": link_layer(run), "devices": device_layer(run),
+            "city": city, "maps": maps, "links": link_layer(run), "devices": devices[:MAX_DEVICES],
             "flights": flight_layer(run)}
 
 
 def _closeloop(run: Run) -> dict[str, Any] | None:
     if run.closeloop is None or run.closeloop_folder is None:
         return None
-    try:
-        return closeloop_context(run.closeloop, run.closeloop_folder)
-    except (KeyError, TypeError, ValueError) as error:
-        raise BadInput(
-            f"{run.closeloop_folder}/closeloop.json is damaged ({type(error).__name__}: {error}); "
-            "run `radiotwin close-loop` again") from None
+    return closeloop_context(run.closeloop, run.closeloop_folder)
 
 
 def _planning(run: Run) -> dict[str, Any] | None:
     if run.planning is None:
         return None
-    rows = [[row.method, "" if row.trained_in != row.trained_in else row.trained_in,
-             f"{row.real_episodes:,}", f"{row.truth_ratio:.3f}"]
+    rows = [[row.method, row.trained_in, f"{row.real_episodes:,.0f}", f"{row.truth_ratio:.3f}"]
             for row in run.planning.itertuples()]
     columns = ("method", "trained in", "real episodes", "collected in the truth")
     return {"table": Table(columns, rows, "Share of all data that is collected in the truth", 2),

@@ -1,5 +1,6 @@
 """Define the look that all figures share: colours, canvas, labels and the file."""
 
+import io
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from radiotwin.files import atomic_path
+from radiotwin.files import atomic_file
+from radiotwin.report.texts import shown
 
 GAIN_COLOURS = "viridis"
 DIFFERENCE_COLOURS = "RdBu_r"  # of model − truth, red: the model predicts more
@@ -27,8 +29,10 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 def save(figure: Figure, path: Path | str) -> None:
     """Write a figure as a PNG file, completely or not at all."""
-    with atomic_path(path) as temporary:
-        figure.savefig(temporary, dpi=DPI, format="png")
+    data = io.BytesIO()  # Pillow loses the reason of a write to a file that fails
+    figure.savefig(data, dpi=DPI, format="png")
+    with atomic_file(path) as file:
+        file.write(data.getbuffer())
 
 
 def hide_spines(ax: Axes) -> None:
@@ -36,14 +40,14 @@ def hide_spines(ax: Axes) -> None:
     ax.spines[["top", "right"]].set_visible(False)
 
 
-def plain(text: str) -> str:
-    """Escape the character that starts a formula in matplotlib."""
-    return text.replace("$", r"\$")
+def plain(text: str, max_length: int = 100) -> str:
+    """Return a foreign text for a figure: short, on one line, nothing hidden, and no formula."""
+    return " ".join(shown(text, max_length).split()).replace("$", r"\$")
 
 
 def shorten(text: str, max_length: int = 14) -> str:
     """Cut a name so that it fits under an axis."""
-    return plain(text if len(text) <= max_length else text[: max_length - 1] + "…")
+    return plain(text, max_length)
 
 
 def residual_range_db(residual_db: np.ndarray) -> float:

@@ -1,13 +1,20 @@
 """`closeloop.json`: what earlier versions wrote is read as what this one writes."""
 
 import copy
+import functools
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.result_file import errors, make_report, upgrade_report, write_report
+from radiotwin.closeloop.result_file import (
+    errors,
+    make_report,
+    read_report,
+    upgrade_report,
+    write_report,
+)
 from radiotwin.closeloop.run import close_loop
 from radiotwin.errors import BadInput
 
@@ -65,3 +72,50 @@ def test_it_has_what_a_new_report_has(old, open_ground, tmp_path):
 def test_other_schemas_are_refused():
     with pytest.raises(BadInput, match="schema is 'radiotwin.closeloop/7', this version reads"):
         upgrade_report({"schema": "radiotwin.closeloop/7"})
+
+
+def places(value, at=()):
+    """Return the path of every value of a report that is no object and no list."""
+    if isinstance(value, dict | list):
+        items = value.items() if isinstance(value, dict) else enumerate(value)
+        return [place for name, each in items for place in places(each, (*at, name))]
+    return [at]
+
+
+def changed(report, place, value):
+    new = copy.deepcopy(report)
+    part = new
+    for name in place[:-1]:
+        part = part[name]
+    part[place[-1]] = value
+    return new
+
+
+def test_a_text_in_place_of_a_number_is_refused_anywhere(old, tmp_path):
+    new = upgrade_report(old)
+    shown = [place for place in places(new) if not {"params", "criteria"} & set(place)]
+    one_of_each = {tuple(name if isinstance(name, str) else 0 for name in place): place for place in shown}
+    assert len(one_of_each) > 100
+    for place in one_of_each.values():
+        text = isinstance(functools.reduce(lambda part, name: part[name], place, new), str)
+        for value in ({"a": 1}, ["a"], 7) if text else ("<img src=x onerror=alert()>", {"a": 1}, ["a"], 1e308):
+            with pytest.raises(BadInput, match="this version reads" if place == ("schema",) else "is damaged"):
+                upgrade_report(changed(new, place, value))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_missing_part_is_one_message(old, tmp_path, version):
+    report = old if version == 1 else upgrade_report(old)
+    path = tmp_path / "closeloop.json"
+    for name in ("schema", "base", "verdict", "effects", "candidates", "heldout", "error", "baselines", "remaining"):
+        for new in ({key: value for key, value in report.items() if key != name}, report | {name: None}):
+            path.write_text(json.dumps(new))
+            with pytest.raises(BadInput, match=f"^{path}(:| is damaged) .*again$") as error:
+                read_report(path)
+            assert "\n" not in str(error.value)
+
+
+def test_fields_that_are_not_checked_are_not_kept(old):
+    new = upgrade_report(old)
+    effect = new["effects"][0] | {"figure": "<img>", "__html__": "<img>"}
+    assert upgrade_report(new | {"extra": "<img>", "effects": [effect, *new["effects"][1:]]}) == new

@@ -1,9 +1,13 @@
 """The page of a close-loop: right for each verdict, and never stopped by what a file may hold."""
 
+import os
 import re
+from io import BytesIO
 
 import pytest
+from matplotlib.figure import Figure
 
+from radiotwin.errors import BadInput
 from radiotwin.report.closeloop_page import closeloop_summary, write_closeloop_page
 from radiotwin.report.labels import join_names, parameter_label, variable_label
 
@@ -103,10 +107,27 @@ def test_a_last_resort_is_not_called_an_explanation(tmp_path):
 def test_a_figure_outside_the_folder_is_not_read(tmp_path):
     folder = tmp_path / "run"
     (folder / "effect_1_").mkdir(parents=True)
-    (tmp_path / "private.png").write_bytes(b"private")
-    (folder / "waterfall.png").symlink_to(tmp_path / "private.png")
+    picture = BytesIO()
+    Figure().savefig(picture, format="png")
+    (tmp_path / "private.png").write_bytes(picture.getvalue())
     stranger = report(effects=[DRIFT | {"name": "/../../private"}])
     assert "data:image/png" not in page(stranger, folder)
+    (folder / "waterfall.png").symlink_to(tmp_path / "private.png")
+    with pytest.raises(BadInput, match="waterfall.png leads out of"):
+        page(stranger, folder)
+    (folder / "waterfall.png").unlink()
+    os.mkfifo(folder / "waterfall.png")
+    assert "data:image/png" not in page(stranger, folder), "nor waited for"
+    (folder / "waterfall.png").unlink()
+    (folder / "waterfall.png").write_bytes(b"<svg onload=alert()>")
+    with pytest.raises(BadInput, match="waterfall.png is not a PNG file"):
+        page(stranger, folder)
+    (folder / "waterfall.png").write_bytes(picture.getvalue()[:16] + b"\xff" * 8)
+    with pytest.raises(BadInput, match="pixels; at most .* RADIOTWIN_MAX_PICTURE_PIXELS"):
+        page(stranger, folder)
+    os.truncate(folder / "waterfall.png", 2**34)
+    with pytest.raises(BadInput, match="bytes; at most .* RADIOTWIN_MAX_PICTURE_BYTES"):
+        page(stranger, folder)
 
 
 def test_names_in_words():

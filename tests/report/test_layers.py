@@ -9,6 +9,7 @@ import pytest
 from radiotwin.radiomap import RadioMap
 from radiotwin.report import Run, city, layers, read_run
 from radiotwin.report.packing import NOT_DETECTED, pack, pack_db
+from radiotwin.twin import Twin, TwinDevice
 
 
 def unpacked(packed):
@@ -64,7 +65,7 @@ def test_the_error_counts_only_what_the_truth_detects(run_folder):
     np.testing.assert_array_equal(error == NOT_DETECTED, np.isnan(truth.gain_db))
     assert fields["twin: error (model − truth)"]["low"] == -fields["twin: error (model − truth)"]["high"]
     stranger = RadioMap(twin.dataset.assign_coords(device=[f"x{n}" for n in range(len(twin.devices))]))
-    assert np.isnan(layers._error_db(stranger, truth)).all()
+    assert np.isnan(layers._error_db(stranger, truth, step=1)).all()
 
 
 def links(n=6):
@@ -91,3 +92,24 @@ def test_flights_start_at_zero_and_keep_their_order(tmp_path):
     first, second = layers.flight_layer(Run(tmp_path, tracks=tracks))
     assert (first["name"], first["start_s"], first["end_s"]) == ("f0", 10, 2) and len(second["uavs"]) == 2
     assert unpacked(first["uavs"][0]["x"]).tolist() == [1, 2] and unpacked(second["uavs"][1]["t"]).tolist() == [1]
+
+
+def test_devices_and_tracks_beyond_what_can_be_drawn_are_counted(run_folder, monkeypatch):
+    run = read_run(run_folder)
+    monkeypatch.setattr(layers, "MAX_MAP_DEVICES", 3)
+    monkeypatch.setattr(layers, "MAX_TRACKS", 3)
+    shown = layers.map_layers(run)
+    assert [len(each["devices"]) for each in shown] == [3, 3] and len(shown[1]["fields"]) == 4
+    assert unpacked(shown[1]["fields"][-1]["values"]).shape[0] == 3
+    assert [len(each["uavs"]) for each in layers.flight_layer(run)] == [2, 1]
+    assert [note.split(" are shown")[0] for note in run.notes] == [
+        "Of the map truth the first 3 of 7 devices", "Of the map twin the first 3 of 7 devices",
+        "Of 4 tracks of UAVs the first 3"]
+
+
+def test_positions_that_no_city_has_are_not_drawn(tmp_path):
+    far = [TwinDevice("a", 1e16, 0.0, 1.5, "anchor", True, 0.0, None),
+           TwinDevice("b", 5.0, 5.0, 1.5, "anchor", True, 0.0, None)]
+    run = Run(tmp_path, twin=Twin(None, far, "gain_db", None))
+    assert [each["true"] for each in layers.device_layer(run)] == [None, [5.0, 5.0, 1.5]]
+    assert layers.bounds_m(run) == [4.0, 6.0, 4.0, 6.0], "a browser would count to 1e16"

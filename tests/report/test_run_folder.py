@@ -1,7 +1,9 @@
 """What is found in a folder, and what is said of one that holds nothing or something damaged."""
 
 import json
+import os
 import shutil
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -9,6 +11,8 @@ import pytest
 from radiotwin.errors import BadInput
 from radiotwin.radiomap import RadioMap
 from radiotwin.report import read_run, write_report
+
+VERSION_1 = Path(__file__).parents[1] / "closeloop" / "version_1" / "closeloop.json"
 
 
 def test_everything_in_a_demos_folder_is_found(run_folder):
@@ -50,7 +54,8 @@ def test_a_rejected_truth_is_not_shown_by_another_way_nor_maps_over_other_lattic
         read_run(folder, truth=str(folder / "part.nc"))
 
 
-def test_a_planning_run_shows_its_flights_and_its_table(run_folder, tmp_path):
+def test_a_planning_run_shows_its_flights_and_its_table(run_folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(run_folder)  # a scene that a run names is read there, see below
     (tmp_path / "config.json").write_text(json.dumps({"run": {"scene": str(run_folder / "scene"),
                                                               "truth": "segmented"}}))
     pd.DataFrame({"method": ["qmix", "<i>"], "trained_in": ["NN twin", None], "real_episodes": [10, 0],
@@ -65,15 +70,106 @@ def test_a_planning_run_shows_its_flights_and_its_table(run_folder, tmp_path):
 
 
 @pytest.mark.parametrize("name, content, words", [
-    (None, None, "holds nothing to show"), ("closeloop.json", "{", "cannot be read as JSON"),
+    (None, None, "holds nothing to show"), ("closeloop.json", "{", "is not readable JSON"),
     ("closeloop.json", "[]", "is no JSON object"), ("closeloop.json", '{"schema": "x"}', "this version reads"),
     ("compare.json", '{"schema": "radiotwin.comparison/1", "scores": 3}', "is damaged"),
+    ("compare.json", json.dumps({"schema": "radiotwin.comparison/1", "locations": [], "scores": [
+        {"model": "m", "against": "a", "positions": "true", "links": "all", "n": 1, "rmse_db": 1.0, "mae_db": 1.0,
+         "bias_db": "<img>"}]}), "scores.0.bias_db"),
+    ("compare.json", json.dumps({"schema": "radiotwin.comparison/1", "locations": [], "scores": [
+        {"model": "m", "against": "a", "positions": "true", "links": "all", "n": 1, "rmse_db": 1.0, "mae_db": 1.0,
+         "bias_db": 1.0}]}), "not one row for each of all, LoS, NLoS"),
+    ("config.json", '{"run": {"scene": 3}}', "scene: "), ("config.json", "[]", "is no JSON object"),
+    ("closeloop.json", "[" * 10**5, "levels of nesting"), ("closeloop.json", '{"a": ' + "9" * 5000 + "}", "readable"),
     ("flights.csv", "flight,uav\nf,u\n", "column 'time_s' is missing"), ("twin.json", "{}", "is damaged")])
 def test_bad_folders_get_one_message(tmp_path, name, content, words):
     if name:
         (tmp_path / name).write_text(content)
     with pytest.raises(BadInput, match=words):
         read_run(tmp_path)
+
+
+LINKS = ("closeloop", "comparison", "twin", "scene", "survey", "closeloop.json", "compare.json", "twin.json",
+         "config.json", "flights.csv", "comparison.csv", "measurements.csv", "residuals.csv.gz", "map.nc",
+         "survey/devices.csv", "scene/scene.toml")
+
+
+@pytest.mark.parametrize("name", LINKS)
+def test_what_a_link_leads_to_is_not_read(run_folder, tmp_path, name):
+    """The same content is read where it lies in the folder, and refused where a link leads out of it."""
+    elsewhere, folder = tmp_path / "elsewhere", tmp_path / "run"
+    shutil.copytree(run_folder, elsewhere)
+    report = json.loads(VERSION_1.read_text())
+    for path in (elsewhere, elsewhere / "closeloop"):
+        path.mkdir(exist_ok=True)
+        (path / "closeloop.json").write_text(json.dumps(report))
+        (path / "residuals.csv.gz").write_bytes(b"")
+    (elsewhere / "comparison").mkdir()
+    for path in (elsewhere, elsewhere / "comparison"):
+        (path / "compare.json").write_text('{"schema": "radiotwin.comparison/1", "scores": [], "locations": []}')
+    for file in ("twin.json", "channel.safetensors"):
+        shutil.copy(elsewhere / "twin" / file, elsewhere / file)
+    (elsewhere / "config.json").write_text('{"run": {}}')
+    for file in ("flights.csv", "comparison.csv"):
+        (elsewhere / file).write_text("flight,uav,time_s,x_m,y_m,z_m,method,trained_in,real_episodes,truth_ratio\n"
+                                      "f,u,1,2,3,4,m,t,1,0.5\n")
+    shutil.copy(elsewhere / "scene" / "truth.nc", elsewhere / "map.nc")
+    pd.read_csv(elsewhere / "survey" / "measurements.csv.gz").to_csv(elsewhere / "measurements.csv", index=False)
+    shutil.copy(elsewhere / "survey" / "devices.csv", elsewhere)
+    folder.mkdir()
+    if name in ("comparison.csv",):
+        shutil.copy(elsewhere / "config.json", folder)
+    if name == "residuals.csv.gz":
+        shutil.copy(elsewhere / "closeloop.json", folder)
+    if "/" in name:
+        shutil.copytree(elsewhere / name.split("/")[0], folder / name.split("/")[0])
+        (folder / name).unlink()
+    (folder / name).symlink_to(elsewhere / name)
+    with pytest.raises(BadInput, match="leads out of .*only files in that folder may be named"):
+        read_run(folder)
+
+
+@pytest.mark.parametrize("name", ["closeloop.json", "twin.json", "flights.csv", "config.json", "map.nc", "measurements.csv"])
+def test_pipes_are_not_waited_for(tmp_path, name):
+    os.mkfifo(tmp_path / name)
+    with pytest.raises(BadInput, match="holds nothing to show|not a regular file|does not exist"):
+        read_run(tmp_path)
+
+
+def test_a_scene_that_a_run_names_is_read_below_the_current_folder_only(run_folder, tmp_path, monkeypatch):
+    (tmp_path / "config.json").write_text(json.dumps({"run": {"scene": str(run_folder / "scene")}}))
+    (tmp_path / "flights.csv").write_text("flight,uav,time_s,x_m,y_m,z_m\nf,u,0,1,2,3\n")
+    run = read_run(tmp_path)
+    assert run.scene is None and "give it with --scene" in run.notes[0] and str(run_folder) in run.notes[0]
+    assert read_run(tmp_path, scene=run_folder / "scene").scene is not None
+    monkeypatch.chdir(run_folder)
+    assert read_run(tmp_path).scene is not None
+    for named in ("x" * 5000, "a\0b", "../" * 2000):
+        (tmp_path / "config.json").write_text(json.dumps({"run": {"scene": named}}))
+        assert read_run(tmp_path).scene is None
+
+
+@pytest.mark.parametrize("folder", ["x" * 300, "a\0b", "\udcff"])
+def test_names_that_no_folder_has_are_bad_input(folder):
+    with pytest.raises(BadInput, match="is not a folder"):
+        read_run(folder)
+
+
+def test_maps_have_a_budget(run_folder, tmp_path, monkeypatch):
+    folder = shutil.copytree(run_folder, tmp_path / "run")
+    for number in range(3):
+        shutil.copy(folder / "scene" / "truth.nc", folder / f"m{number}.nc")
+    assert len(read_run(folder).maps) == 5
+    monkeypatch.setenv("RADIOTWIN_MAX_PAGE_MAPS", "2")
+    with pytest.raises(BadInput, match="3 radio maps; at most 2"):
+        read_run(folder)
+    monkeypatch.setenv("RADIOTWIN_MAX_PAGE_MAPS", "3")
+    monkeypatch.setenv("RADIOTWIN_MAX_PAGE_VALUES", "9000")
+    with pytest.raises(BadInput, match="values; at most 9,000"):
+        read_run(folder)
+    monkeypatch.setenv("RADIOTWIN_MAX_MAP_VALUES", "100")
+    with pytest.raises(BadInput, match="values; at most 100"):
+        read_run(folder)
 
 
 def test_a_close_loop_without_its_entries_is_bad_input(tmp_path):

@@ -1,0 +1,130 @@
+"""Schema of `closeloop.json`, by which it is read: it may come from somebody else."""
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from radiotwin.records import Number, Record, Whole
+
+
+class ScoresRecord(Record):
+    """Errors of a model on a group of links; further ones are numbers, too."""
+
+    model_config = {"extra": "allow"}
+    __pydantic_extra__: dict[str, Number | None]
+
+    n: Whole
+    rmse_db: Number | None
+
+
+class BaselineRecord(ScoresRecord):
+    """Errors of another model on all links."""
+
+    n: Whole = 0
+
+
+class BothRecord(Record):
+    """Errors before and after the effects were added."""
+
+    before: ScoresRecord
+    after: ScoresRecord
+
+
+class ErrorRecord(BothRecord):
+    """Errors of all links and of groups of them, by the groups' names."""
+
+    noise_floor_db: Number | None
+    by_los: dict[Literal["los", "nlos"], BothRecord] = Field(default_factory=dict)
+    by_device: dict[str, BothRecord] = Field(default_factory=dict)
+    by_receiver: dict[str, BothRecord] = Field(default_factory=dict)
+    by_flight: dict[str, BothRecord] = Field(default_factory=dict)
+
+
+class ParameterRecord(Record):
+    """Estimate with its 90 % interval."""
+
+    value: Number | None
+    low: Number | None
+    high: Number | None
+    unit: str
+
+
+class EvidenceRecord(Record):
+    """What speaks for an effect."""
+
+    heldout_nll_gain: Number | None
+    p_value: Number | None
+
+
+class EffectRecord(Record):
+    """An effect that was found."""
+
+    name: str
+    variant: str = ""
+    rank: Whole
+    params: dict[str, Any] = Field(default_factory=dict)
+    parameters: dict[str, ParameterRecord]
+    confused_with: list[str] = Field(default_factory=list)
+    indistinguishable_from: list[str] = Field(default_factory=list)
+    evidence: EvidenceRecord
+
+
+class CandidateRecord(Record):
+    """An effect that was tried."""
+
+    name: str
+    step: Whole
+    heldout_rmse_db: Number | None
+    heldout_nll_gain: Number | None
+    p_value: Number | None
+    kept: bool
+    reason: str
+
+
+class DependenceRecord(Record):
+    """A variable that the residual depends on."""
+
+    variable: str
+    p_value: Number | None
+    effect_db: Number | None = None
+
+
+class RemainingRecord(Record):
+    """What the residual depends on after all."""
+
+    structured: bool
+    drivers: list[DependenceRecord]
+
+
+class FoldsRecord(Record):
+    """How links were held out."""
+
+    by: str
+    folds: Whole
+    n: Whole
+
+
+class InputsRecord(Record):
+    """Files that the loop was given."""
+
+    measurements: str | None = None
+    scene: str | None = None
+
+
+class ReportRecord(Record):
+    """Content of `closeloop.json`."""
+
+    schema_: Literal["radiotwin.closeloop/2"] = Field(alias="schema")
+    radiotwin_version: str = ""
+    base: str
+    verdict: Literal["effect", "none", "unexplained"]
+    effects: list[EffectRecord]
+    candidates: list[CandidateRecord]
+    heldout: FoldsRecord
+    error: ErrorRecord
+    baselines: dict[str, BaselineRecord]
+    dependences_before: list[DependenceRecord] = Field(default_factory=list)
+    remaining: RemainingRecord
+    criteria: dict[str, Number] = Field(default_factory=dict)
+    notes: list[str]
+    inputs: InputsRecord = Field(default_factory=InputsRecord)
