@@ -71,5 +71,5 @@ def test_broken_patterns(tmp_path, name, text, message):
 
 
 def test_no_pattern(tmp_path):
-    with pytest.raises(BadInput, match="is not a file"):
+    with pytest.raises(BadInput, match="none.msi does not exist"):
         read_pattern(tmp_path / "none.msi")

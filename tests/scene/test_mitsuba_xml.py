@@ -116,7 +116,12 @@ def test_merged_shapes_are_opened_and_cameras_passed_over(tmp_path):
     assert [shape.name for shape in read_mitsuba_xml(path).shapes] == ["a", "b"]
 
 
-def test_deeply_nested_merges(tmp_path):
-    deep = 5_000
+@pytest.mark.parametrize(("deep", "allowed"), [(90, True), (5_000, False)])
+def test_deeply_nested_merges(tmp_path, deep, allowed):
     merge = '<shape type="merge">' * deep + '<shape type="cube" id="a"/>' + "</shape>" * deep
-    assert [shape.name for shape in read_mitsuba_xml(write(tmp_path, merge)).shapes] == ["a"]
+    path = write(tmp_path, merge)
+    if allowed:
+        assert [shape.name for shape in read_mitsuba_xml(path).shapes] == ["a"]
+        return
+    with pytest.raises(BadInput, match="levels of nesting; at most 100 .* RADIOTWIN_MAX_NESTING"):
+        read_mitsuba_xml(path)

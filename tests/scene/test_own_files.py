@@ -90,7 +90,7 @@ def test_no_way_leads_out_of_a_scene_folder(small_scene, tmp_path, spoil):
 
 def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "a.ply")
-    with pytest.raises(BadInput, match="not an ordinary file"):
+    with pytest.raises(BadInput, match="not a regular file"):
         read_ply(tmp_path / "a.ply")
 
 
