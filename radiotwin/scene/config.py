@@ -234,7 +234,7 @@ def _explain(path: Path, error: ValidationError) -> str:
     for problem in problems[:_MAX_MESSAGES]:
         key = ".".join(str(part)[:60] for part in problem["loc"]) or "scene"
         reason = problem["msg"].removeprefix("Value error, ")
-        unit = _UNITS.get(re.sub(r"\.\d+$", "", key).rstrip("s").rpartition("_")[2], "")
+        unit = _UNITS.get(re.sub(r"\.\d+$", "", key).rpartition("_")[2], "")
         given = repr(problem["input"])
         if problem["type"].startswith(("greater_than", "less_than")) and unit:
             reason += f" {unit}"

@@ -82,18 +82,11 @@ def load_shape(shape: DeclaredShape) -> RawMesh:
     else:
         raise BadInput(f"{shape.node.position}: a shape of type {shape.kind[:60]!r} is not read; "
                        "export it as ply (read are: ply, obj, cube, rectangle, sphere)")
-    finite = np.isfinite(raw.vertices).all(axis=1)
-    if not finite.all():
-        raise BadInput(f"{shape.mesh_path or shape.node.position}: vertex "
-                       f"{np.flatnonzero(~finite)[0] + 1} is not finite (NaN or infinite; "
-                       f"{np.count_nonzero(~finite)} such vertices); export the mesh again")
     linear, offset = shape.to_world[:3, :3], shape.to_world[:3, 3]
     with np.errstate(all="ignore"):
         vertices = raw.vertices @ linear.T + offset
         mirrored = np.linalg.det(linear) < 0
-    if not np.abs(vertices).max(initial=0) <= _MAX_COORDINATE:
-        raise BadInput(f"{shape.node.position}: the shape has a vertex more than "
-                       f"{_MAX_COORDINATE:g} from the origin; correct its mesh or its transform")
+    _check_vertices(vertices, f"{shape.node.position}, after the transform")
     return RawMesh(vertices, raw.faces[:, ::-1] if mirrored else raw.faces, raw.polygons)
 
 
@@ -106,6 +99,7 @@ def _read_mesh_file(shape: DeclaredShape) -> RawMesh:
         raise BadInput(f"mesh file {path} does not exist (named in {shape.node.position}); put it "
                        "there or remove the shape")
     vertices, polygons = read_ply(path) if shape.kind == "ply" else read_obj(path)
+    _check_vertices(vertices, str(path))
     for group in polygons:
         wrong = (group < 0) | (group >= len(vertices))
         if wrong.any():
@@ -116,6 +110,19 @@ def _read_mesh_file(shape: DeclaredShape) -> RawMesh:
     faces = [_triangulate(vertices, group) for group in areal]
     return RawMesh(vertices, np.concatenate(faces) if faces else np.zeros((0, 3), dtype=np.int64),
                    sum(len(group) for group in areal if group.shape[1] > 3))
+
+
+def _check_vertices(vertices: np.ndarray, source: str) -> None:
+    finite = np.isfinite(vertices).all(axis=1)
+    if not finite.all():
+        raise BadInput(f"{source}: vertex {np.flatnonzero(~finite)[0] + 1} is not finite (NaN or "
+                       f"infinite; {np.count_nonzero(~finite)} such vertices); export the mesh "
+                       "again")
+    farthest = np.abs(vertices).max(axis=1, initial=0)
+    if not (farthest <= _MAX_COORDINATE).all():
+        row = int(farthest.argmax())
+        raise BadInput(f"{source}: vertex {row + 1} is {farthest[row]:g} from the origin; allowed "
+                       f"is up to {_MAX_COORDINATE:g}: correct the mesh or its transform")
 
 
 def _triangulate(vertices: np.ndarray, polygons: np.ndarray) -> np.ndarray:
@@ -188,7 +195,11 @@ def _analytic(shape: DeclaredShape) -> RawMesh:
     if shape.kind == "rectangle":
         corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
         return RawMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=shape.node.number("radius", 1.0))
+    radius = shape.node.number("radius", 1.0)
+    if abs(radius) > _MAX_COORDINATE:
+        raise BadInput(f"{shape.node.position}: a radius of {radius:g} is not possible; allowed is "
+                       f"up to {_MAX_COORDINATE:g}")
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
     centre = next((child for child in shape.node.children
                    if child.attributes.get("name") == "center"), None)
     return RawMesh(ball.vertices + (0 if centre is None else read_vector(centre, 0.0)), ball.faces)
