@@ -89,5 +89,6 @@ UAVS = Budget("UAVS", 10_000, "UAVs")
 POSITIONS = Budget("POSITIONS", 10_000_000, "positions")  # of a lattice
 ELEMENTS = Budget("ELEMENTS", 2_000_000, "XML elements")  # of a city
 TAG_BYTES = Budget("TAG_BYTES", 8 * 2**20, "bytes in one tag")  # of XML
+FILES = Budget("FILES", 1_000, "files that include each other")  # of a Mitsuba file
 SEARCH_FOLDERS = Budget("SEARCH_FOLDERS", 100, "folders to search")  # of a Mitsuba file
 CORNERS = Budget("CORNERS", 10_000, "corners in one face")  # cutting it takes their square

@@ -20,6 +20,7 @@ from radiotwin.scene.city_rules import check_city
 from radiotwin.scene.xml_tree import Node, XmlReader, read_numbers, read_vector, shown
 
 MAX_INCLUDE_DEPTH = 15  # the limit of Mitsuba
+MAX_NAME = 1000  # characters of a file's name with its folders: no system has longer ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +156,9 @@ class _Reader:
             node.attributes[key] = "".join(parts)
 
     def _find(self, node: Node, name: str) -> Path:
+        if len(name) > MAX_NAME:
+            raise BadInput(f"{node.position}: {shown(name)} is not the name of a file: it has "
+                           f"{len(name):,} characters")
         name = name.replace("\\", "/")
         for folder in (node.file.parent, *self.folders):
             if os.path.isfile(folder / name):

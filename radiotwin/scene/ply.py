@@ -140,8 +140,6 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
         except (KeyError, IndexError, ValueError):
             raise BadInput(f"{path}, line {number}: {line.strip()[:60]!r} is not a PLY header "
                            "line; export the mesh again") from None
-        COLUMNS.check(len(elements[-1].properties if elements else ()) + len(elements),
-                      f"{path}, line {number}")
     if order is None:
         raise BadInput(f"{path}: the PLY header has no format line; export the mesh again")
     _check_elements(path, elements, len(data) - start)
@@ -150,6 +148,7 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
 
 def _check_elements(path: Path, elements: list[_Element], size: int) -> None:
     """Compare the header's counts with the size of the rest, before any memory is reserved."""
+    COLUMNS.check(sum(len(element.properties) for element in elements), path)
     names = [(element.name, name) for element in elements for name, *_ in element.properties]
     if len(set(names)) < len(names) or len({element.name for element in elements}) < len(elements):
         raise BadInput(f"{path}: the PLY header declares an element or a property twice; export "

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from radiotwin.budgets import DOCUMENT_BYTES, ELEMENTS, NESTING
+from radiotwin.budgets import DOCUMENT_BYTES, ELEMENTS, FILES, NESTING
 from radiotwin.errors import BadInput
 from radiotwin.safe_xml import parse_elements
 
@@ -56,7 +56,7 @@ class XmlReader:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self._bytes = self._elements = 0
+        self._bytes = self._elements = self._files = 0
 
     def read(self, path: Path) -> Node:
         """Parse one file.
@@ -71,6 +71,8 @@ class XmlReader:
             BadInput: No such file, malformed XML (with line and column), declared entities, too
                 large, or nested too deep.
         """
+        self._files += 1
+        FILES.check(self._files, self._path)
         top = Node("", {}, path, 0)
         open_nodes = [top]
         limits = ELEMENTS.limit, NESTING.limit
