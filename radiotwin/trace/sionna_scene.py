@@ -40,7 +40,7 @@ def import_sionna() -> Any:
     own = mitsuba.FileResolver()
     own.clear()
     own.append(os.path.dirname(os.path.realpath(mitsuba.__file__)))
-    mitsuba.set_file_resolver(own)
+    mitsuba.set_file_resolver(own)  # type: ignore[operator]  # as its stub says
     return sionna.rt
 
 
