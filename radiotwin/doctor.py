@@ -195,7 +195,7 @@ def _check_llvm(diagnosis: Diagnosis) -> Rows:
 def _check_tracing(diagnosis: Diagnosis) -> Rows:
     """Trace one link in free space and compare it with Friis' equation."""
     item = "one link of 100 m at 2.4 GHz"
-    command = [sys.executable, "-c", _TRACE]
+    command = [sys.executable, "-P", "-c", _TRACE]
     try:
         done = subprocess.run(command, check=False, capture_output=True, text=True,
                               timeout=TRACE_TIMEOUT_S)

@@ -86,7 +86,7 @@ def _version_in_name(name: str) -> tuple[int, ...] | None:
 
 
 def _run_python(program: str, path: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-c", program, str(path)], check=False,
+    return subprocess.run([sys.executable, "-P", "-c", program, str(path)], check=False,
                           capture_output=True, text=True, timeout=PROBE_TIMEOUT_S)
 
 

@@ -4,8 +4,12 @@ from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, Strict
 
+MAX_COORDINATE_M = 1e6
+"""Of the local frame [m]: beyond, single precision is coarser than a decimetre."""
 Number = Annotated[float, Strict()]
 """A finite number; an integer is accepted, `true` and texts are not."""
+Metres = Annotated[Number, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
+"""A coordinate of the local frame."""
 
 
 class Table(BaseModel):
@@ -25,4 +29,4 @@ class Origin(Table):
 
     latitude_deg: Number = Field(ge=-90, le=90)
     longitude_deg: Number = Field(ge=-180, le=180)
-    altitude_m: Number = 0.0
+    altitude_m: Number = Field(0.0, ge=-12_000, le=100_000)

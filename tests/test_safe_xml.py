@@ -1,5 +1,6 @@
 """Hostile XML through every reader of the package: refused at once, nothing read outside."""
 
+import os
 import time
 
 import pytest
@@ -46,3 +47,26 @@ def test_deep_nesting_is_no_danger(tmp_path):
     (tmp_path / "a.xml").write_text("<scene>" + "<shape>" * deep + "</shape>" * deep + "</scene>")
     with pytest.raises(BadInput):
         CityMap.from_xml(tmp_path / "a.xml")
+
+
+def test_a_tag_without_end_is_not_read_again_and_again(tmp_path):
+    """Rationale: Expat reads an unfinished tag from its beginning in every call: 40 MB took minutes."""
+    (tmp_path / "a.xml").write_bytes(b'<scene a="' + b"x" * 40_000_000)
+    began_s = time.monotonic()
+    with pytest.raises(BadInput, match=r"bytes in one tag; at most 8,388,608 .* RADIOTWIN_MAX_TAG_BYTES"):
+        read_mitsuba_xml(tmp_path / "a.xml")
+    assert time.monotonic() - began_s < 5
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_pipes_and_large_files(tmp_path, monkeypatch, reader):
+    read, path = READERS[reader][0], tmp_path / "a.xml"
+    path.write_text("<scene/>" + " " * 100)
+    monkeypatch.setenv("RADIOTWIN_MAX_FILE_BYTES", "50")
+    monkeypatch.setenv("RADIOTWIN_MAX_DOCUMENT_BYTES", "50")
+    with pytest.raises(BadInput, match="108 bytes; at most 50 are read"):
+        read(path)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(BadInput, match="not a regular file"):
+        read(path)

@@ -53,9 +53,13 @@ class Pattern:
 
 
 def _bracket(grid: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the index of the grid value below each value, and the fraction of the step above."""
+    """Return the index of the grid value below each value, and the fraction of the step above.
+
+    Beyond the ends of the grid the fraction is that of the end.
+    """
     index = np.clip(np.searchsorted(grid, values, side="right") - 1, 0, len(grid) - 2)
-    return index, (values - grid[index]) / (grid[index + 1] - grid[index])
+    held = np.clip(values, grid[0], grid[-1])
+    return index, (held - grid[index]) / (grid[index + 1] - grid[index])
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,6 @@
 """Readers of antenna patterns: MSI Planet (.msi, .pln) and CSV."""
 
+import io
 import re
 from pathlib import Path
 
@@ -7,7 +8,9 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.antennas.pattern import Pattern
+from radiotwin.budgets import COLUMNS, DOCUMENT_BYTES
 from radiotwin.errors import BadInput
+from radiotwin.inputs import read_bytes
 
 MAX_GAIN_DBI = 60.0  # [dBi], about that of a dish of 20 m at 5 GHz; more is taken for an error
 AZIMUTH_DEG = np.arange(0.0, 360.0)  # grid of the patterns between two cuts
@@ -34,17 +37,16 @@ def read_pattern(path: Path | str) -> Pattern:
         The pattern in the antenna's own frame.
 
     Raises:
-        BadInput: no such file, an unknown format, a missing part, or an impossible number; with
-            file and row.
+        BadInput: no such file, an unknown format, a missing part, an impossible number, or too
+            large; with file and row.
     """
     path = Path(path)
     readers = {".msi": _read_msi, ".pln": _read_msi, ".csv": _read_csv}
     if path.suffix.lower() not in readers:
         raise BadInput(f"{path}: unknown format {path.suffix!r} of an antenna; allowed are "
                        f"{', '.join(readers)}")
-    if not path.is_file():
-        raise BadInput(f"{path} is not a file; give the pattern of an antenna")
-    pattern = readers[path.suffix.lower()](path)
+    text = read_bytes(path, "pattern of an antenna", DOCUMENT_BYTES)
+    pattern = readers[path.suffix.lower()](path, text)
     if not -MAX_GAIN_DBI <= pattern.peak_dbi <= MAX_GAIN_DBI:
         raise BadInput(f"{path}: a gain of {pattern.peak_dbi:g} dBi is not possible; allowed is up "
                        f"to {MAX_GAIN_DBI:g} dBi")
@@ -75,11 +77,11 @@ def between_cuts(horizontal_db: np.ndarray, vertical_db: np.ndarray) -> np.ndarr
         - fraction * (horizontal_db[180] - back_db)
 
 
-def _read_msi(path: Path) -> Pattern:
+def _read_msi(path: Path, text: bytes) -> Pattern:
     gain_dbi: float | None = None
     cuts: dict[str, dict[float, float]] = {"HORIZONTAL": {}, "VERTICAL": {}}
     cut: dict[float, float] | None = None
-    for row, line in enumerate(path.read_text(encoding="latin-1").splitlines(), start=1):
+    for row, line in enumerate(text.decode("latin-1").splitlines(), start=1):
         fields = line.split()
         if not fields:
             continue
@@ -87,8 +89,8 @@ def _read_msi(path: Path) -> Pattern:
         if key == "GAIN":
             found = _GAIN.fullmatch(" ".join(fields[1:]))
             if not found:
-                raise BadInput(f"{path}, row {row}: {line.strip()!r} is not GAIN, a number, and "
-                               "dBd or dBi")
+                raise BadInput(f"{path}, row {row}: {line.strip()[:60]!r} is not GAIN, a number, "
+                               "and dBd or dBi")
             is_dbi = (found[2] or "dBd").lower() == "dbi"
             gain_dbi = float(found[1]) + (0.0 if is_dbi else 2.15)  # 0 dBd: a half-wave dipole
         elif key in cuts:
@@ -99,8 +101,8 @@ def _read_msi(path: Path) -> Pattern:
             except ValueError:
                 angle = attenuation = np.nan
             if not (0 <= angle <= 360 and 0 <= attenuation < 200):
-                raise BadInput(f"{path}, row {row}: {line.strip()!r} is not an angle (0 to 360) "
-                               "and an attenuation (0 dB or more)")
+                raise BadInput(f"{path}, row {row}: {line.strip()[:60]!r} is not an angle (0 to "
+                               "360) and an attenuation (0 dB or more)")
             cut[angle % 360] = -attenuation
     for key, cut in cuts.items():
         if len(cut) < 2:
@@ -119,9 +121,11 @@ def _resample(cut: dict[float, float]) -> np.ndarray:
     return np.interp(AZIMUTH_DEG, angles, values, period=360)
 
 
-def _read_csv(path: Path) -> Pattern:
+def _read_csv(path: Path, text: bytes) -> Pattern:
+    COLUMNS.check(text.partition(b"\n")[0].count(b",") + 1, path)
     try:
-        table = pd.read_csv(path, skipinitialspace=True)
+        table = pd.read_csv(io.BytesIO(text), skipinitialspace=True, encoding="utf-8-sig",
+                            usecols=lambda name: name in _COLUMNS)
     except (ValueError, OSError) as error:
         raise BadInput(f"{path} cannot be read as CSV: {error}") from None
     columns = list(_COLUMNS)
@@ -134,13 +138,16 @@ def _read_csv(path: Path) -> Pattern:
         bad = ~numbers[name].between(low, high)
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
-            raise BadInput(f"{path}: row {row + 2}, column {name}: {table[name][row]!r} is not a "
+            given = str(table[name][row])[:60]
+            raise BadInput(f"{path}: row {row + 2}, column {name}: {given!r} is not a "
                            f"number from {low} to {high}")
-    numbers["azimuth_deg"] %= 360
-    grid = numbers.drop_duplicates(columns[:2]).pivot(
-        index="elevation_deg", columns="azimuth_deg", values="gain_dbi")
-    if grid.isna().any(axis=None) or len(grid) < 2:
-        raise BadInput(f"{path}: {len(table)} rows are no full grid of {len(grid)} elevations and "
-                       f"{grid.shape[1]} azimuths; give a gain for every pair")
+    # A tiny negative angle becomes 360, which is 0
+    numbers["azimuth_deg"] = numbers["azimuth_deg"] % 360 % 360
+    numbers = numbers.drop_duplicates(columns[:2])
+    across, up = (numbers[name].nunique() for name in columns[:2])
+    if across * up != len(numbers) or up < 2:
+        raise BadInput(f"{path}: {len(table)} rows are no full grid of {up} elevations and "
+                       f"{across} azimuths; give a gain for every pair")
+    grid = numbers.pivot(index="elevation_deg", columns="azimuth_deg", values="gain_dbi")
     return Pattern(grid.columns.to_numpy(dtype=float), grid.index.to_numpy(dtype=float),
                    grid.to_numpy(dtype=float))

@@ -1,11 +1,14 @@
 """`scene.toml`: the declarations of a scene besides its geometry, checked when it is read."""
 
-import tomllib
-from pathlib import Path
+import os
+import re
+from collections import Counter
+from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
 
 import tomli_w
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -14,21 +17,40 @@ from pydantic import (
     model_validator,
 )
 
+from radiotwin.budgets import DEVICES, UAVS
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 from radiotwin.geodesy import local_crs
-from radiotwin.tables import Number, Origin, Table
+from radiotwin.inputs import read_toml
+from radiotwin.scene.lattice import check_lattice
+from radiotwin.tables import MAX_COORDINATE_M, Metres, Number, Origin, Table
 
 ANTENNA_HEIGHT_M = 1.5  # of a device above the ground [m]: a person, a meter, a low pole
-_MAX_POSITIONS = 10_000_000  # of a lattice: 80 MB of gains per device
-Name = Annotated[str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9_.+-]+$")]
+_MAX_MESSAGES = 10
+# Names become parts of file names: none is hidden, or the folder itself, or the one above.
+Name = Annotated[str, Field(min_length=1, max_length=64,
+                            pattern=r"^[A-Za-z0-9_+-][A-Za-z0-9_.+-]*$")]
+Altitude = Annotated[Number, Field(gt=0, le=MAX_COORDINATE_M)]
+
+
+def _below(name: str) -> str:
+    """Return the name of a file if it can only mean one below the folder that names it."""
+    parts = PurePosixPath(name).parts
+    if (not parts or ".." in parts or re.search(r"^/|[\\:]", name) or not name.isprintable()
+            or len(name) > 255):
+        raise ValueError("give the name of a file below the scene folder, such as "
+                         "antennas/NAME.msi, without .., \\, : or control characters")
+    return name
+
+
+FileName = Annotated[str, AfterValidator(_below)]
 
 
 class RadioConfig(Table):
     """One radio for all links; a device's own frequency or power may come with later formats."""
 
     frequency_hz: Number = 2.4e9
-    bandwidth_hz: Number = Field(1e6, gt=0)
+    bandwidth_hz: Number = Field(1e6, gt=0, le=450e9)
     tx_power_dbm: Number = Field(0.0, ge=-100, le=100)
     noise_dbm: Number = Field(-102.0, ge=-200, le=50)
     sensitivity_dbm: Number = Field(-120.0, ge=-250, le=50)
@@ -53,10 +75,10 @@ class RadioConfig(Table):
 class Extent(Table):
     """The part of the plane that UAVs fly over and devices are searched in."""
 
-    x_min_m: Number
-    x_max_m: Number
-    y_min_m: Number
-    y_max_m: Number
+    x_min_m: Metres
+    x_max_m: Metres
+    y_min_m: Metres
+    y_max_m: Metres
 
     @model_validator(mode="after")
     def _not_empty(self) -> "Extent":
@@ -73,15 +95,15 @@ class Extent(Table):
 class LatticeConfig(Table):
     """Step and altitudes of the lattice over the extent."""
 
-    step_m: Number = Field(20.0, gt=0)
-    altitudes_m: list[Annotated[Number, Field(gt=0)]] = Field(min_length=1)
+    step_m: Number = Field(20.0, ge=1e-6, le=MAX_COORDINATE_M)
+    altitudes_m: list[Altitude] = Field(min_length=1)
 
     @field_validator("altitudes_m")
     @classmethod
     def _unique(cls, altitudes_m: list[float]) -> list[float]:
-        for altitude_m in altitudes_m:
-            if altitudes_m.count(altitude_m) > 1:
-                raise ValueError(f"{altitude_m:g} is listed twice; every altitude must be unique")
+        twice = _first_double(altitudes_m)
+        if twice is not None:
+            raise ValueError(f"{twice:g} is listed twice; every altitude must be unique")
         return altitudes_m
 
 
@@ -89,11 +111,11 @@ class DeviceConfig(Table):
     """True position of a device; a survey reports that of anchors only."""
 
     device: Name
-    x_m: Number
-    y_m: Number
-    z_m: Number = Field(ANTENNA_HEIGHT_M, gt=0)
+    x_m: Metres
+    y_m: Metres
+    z_m: Altitude = ANTENNA_HEIGHT_M
     role: Literal["anchor", "unknown"] = "unknown"
-    antenna: str | None = Field(None, description="file in the scene folder; None: isotropic")
+    antenna: FileName | None = Field(None, description="file in the scene folder; None: isotropic")
     azimuth_deg: Number | None = Field(None, ge=-360, le=360,
                                        description="clockwise from north [0]")
     tilt_deg: Number | None = Field(None, ge=-90, le=90, description="upwards is positive [0]")
@@ -110,21 +132,21 @@ class UavConfig(Table):
     """A UAV: one altitude, from start to terminal, on `battery` units (move 1, hover 0.5)."""
 
     uav: Name
-    altitude_m: Number = Field(gt=0)
-    start_x_m: Number
-    start_y_m: Number
-    terminal_x_m: Number
-    terminal_y_m: Number
+    altitude_m: Altitude
+    start_x_m: Metres
+    start_y_m: Metres
+    terminal_x_m: Metres
+    terminal_y_m: Metres
     battery: Number = Field(gt=0, le=100_000)
-    antenna: str | None = Field(None, description="file in the scene folder; None: isotropic")
+    antenna: FileName | None = Field(None, description="file in the scene folder; None: isotropic")
 
 
 class MissionConfig(Table):
     """The data-harvesting mission of Chen et al. 2023."""
 
-    data_units: Number = Field(16_000.0, gt=0, description="data waiting at each device")
-    rate_scale: Number = Field(100.0, gt=0, description="data units per slot and bit/s/Hz")
-    slot_s: Number = Field(2.0, gt=0, description="duration of one move or hover")
+    data_units: Number = Field(16_000.0, gt=0, le=1e15, description="data waiting at each device")
+    rate_scale: Number = Field(100.0, gt=0, le=1e15, description="data units per slot and bit/s/Hz")
+    slot_s: Number = Field(2.0, gt=0, le=86_400, description="duration of one move or hover")
 
 
 class SceneConfig(Table):
@@ -149,38 +171,30 @@ class SceneConfig(Table):
     def _consistent(self) -> "SceneConfig":
         for kind, names in (("device", [device.device for device in self.devices]),
                             ("uav", [uav.uav for uav in self.uavs])):
-            double = {name for name in names if names.count(name) > 1}
+            double = [name for name, count in Counter(names).items() if count > 1]
             if double:
-                raise ValueError(f"{kind} {sorted(double)[0]!r} is declared twice; every name must "
+                raise ValueError(f"{kind} {min(double)!r} is declared twice; every name must "
                                  "be unique")
         if self.crs is not None and (self.origin is None or self.crs != local_crs(self.origin)):
             remedy = f'crs = "{local_crs(self.origin)}"' if self.origin else "an [origin]"
             raise ValueError("crs is not that of the local frame about [origin]; remove it, or "
                              f"write {remedy}")
-        self._check_size()
+        check_lattice(*self.extent.bounds, self.lattice.step_m, self.lattice.altitudes_m)
         if len({uav.antenna for uav in self.uavs}) > 1:
             raise ValueError("uavs have different antennas; one radio map serves all of them, so "
                              "give all the same")
         for device in self.devices:
             self._check_in_extent(device)
+        altitudes_m = set(self.lattice.altitudes_m)
         for uav in self.uavs:
-            if uav.altitude_m not in self.lattice.altitudes_m:
+            if uav.altitude_m not in altitudes_m:
+                known = str(self.lattice.altitudes_m[:10]).replace("]", ", …]" if len(
+                    altitudes_m) > 10 else "]")
                 raise ValueError(f"uav {uav.uav!r}: altitude_m = {uav.altitude_m:g} is not one of "
-                                 f"lattice.altitudes_m = {self.lattice.altitudes_m}")
+                                 f"lattice.altitudes_m = {known}")
             for end in ("start", "terminal"):
                 self._check_on_lattice(uav, end)
         return self
-
-    def _check_size(self) -> None:
-        x_min_m, x_max_m, y_min_m, y_max_m = self.extent.bounds
-        step_m, altitudes = self.lattice.step_m, len(self.lattice.altitudes_m)
-        width_m, depth_m = x_max_m - x_min_m, y_max_m - y_min_m
-        positions = (width_m / step_m + 1) * (depth_m / step_m + 1) * altitudes
-        if positions > _MAX_POSITIONS:
-            raise ValueError(
-                f"lattice.step_m = {step_m:g} over an extent of {width_m:g} x {depth_m:g} m and "
-                f"{altitudes} altitudes makes {positions:.3g} positions; allowed are "
-                f"{_MAX_POSITIONS:,}: widen the step or narrow the extent")
 
     def _check_in_extent(self, device: DeviceConfig) -> None:
         x_min_m, x_max_m, y_min_m, y_max_m = self.extent.bounds
@@ -206,11 +220,24 @@ class SceneConfig(Table):
         return self.radio.sensitivity_dbm - self.radio.tx_power_dbm
 
 
+def _first_double(values: list[float]) -> float | None:
+    counts = Counter(values)
+    return next((value for value in values if counts[value] > 1), None)
+
+
+_UNITS = {"m": "m", "hz": "Hz", "dbm": "dBm", "db": "dB", "deg": "degrees", "s": "s"}
+
+
 def _explain(path: Path, error: ValidationError) -> str:
     lines = []
-    for problem in error.errors():
-        key = ".".join(str(part) for part in problem["loc"]) or "scene"
+    problems = error.errors(include_url=False)
+    for problem in problems[:_MAX_MESSAGES]:
+        key = ".".join(str(part)[:60] for part in problem["loc"]) or "scene"
         reason = problem["msg"].removeprefix("Value error, ")
+        unit = _UNITS.get(re.sub(r"\.\d+$", "", key).rpartition("_")[2], "")
+        given = repr(problem["input"])
+        if problem["type"].startswith(("greater_than", "less_than")) and unit:
+            reason += f" {unit}"
         if problem["type"] == "extra_forbidden":
             lines.append(f"{path}: {key}: unknown key; remove it or correct its name")
         elif problem["type"] == "missing":
@@ -218,7 +245,9 @@ def _explain(path: Path, error: ValidationError) -> str:
         elif isinstance(problem["input"], dict | BaseModel):
             lines.append(f"{path}: {key}: {reason}")
         else:
-            lines.append(f"{path}: {key} = {problem['input']!r}: {reason}")
+            lines.append(f"{path}: {key} = {given[:80] + '…' * (len(given) > 80)}: {reason}")
+    if len(problems) > _MAX_MESSAGES:
+        lines.append(f"{path}: and {len(problems) - _MAX_MESSAGES} more such mistakes")
     return "\n".join(lines)
 
 
@@ -230,10 +259,16 @@ def parse_config(data: dict[str, Any], path: Path | str) -> SceneConfig:
         path: File named in messages.
 
     Raises:
-        BadInput: An unknown key or an impossible value; names file, key, value and what is allowed.
+        BadInput: An unknown key, an impossible value, or too many of them; names file, key, value
+            and what is allowed.
     """
+    for name, budget in (("devices", DEVICES), ("uavs", UAVS)):
+        if isinstance(data.get(name), list):
+            budget.check(len(data[name]), path)
     try:
         return SceneConfig.model_validate(data)
+    except BadInput as bad:  # a budget
+        raise BadInput(f"{path}: {bad}") from None
     except ValidationError as error:
         raise BadInput(_explain(Path(path), error)) from None
 
@@ -248,16 +283,9 @@ def read_config(path: Path | str) -> SceneConfig:
         BadInput: No such file, not TOML, an unknown key or an impossible value.
     """
     path = Path(path)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise BadInput(f"{path} does not exist; `radiotwin build-scene` makes a scene "
-                       "folder") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadInput(f"{path} cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise BadInput(f"{path} is not valid TOML: {error}") from None
-    return parse_config(data, path)
+    if not os.path.lexists(path):
+        raise BadInput(f"{path} does not exist; `radiotwin build-scene` makes a scene folder")
+    return parse_config(read_toml(path, "scene.toml"), path)
 
 
 def write_config(config: SceneConfig, path: Path | str) -> None:

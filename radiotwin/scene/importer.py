@@ -17,7 +17,7 @@ from radiotwin.scene.material_mapping import map_materials
 from radiotwin.scene.materials import Material
 from radiotwin.scene.meshes import clean, load_shape
 from radiotwin.scene.mitsuba_xml import DeclaredShape, read_mitsuba_xml
-from radiotwin.scene.names import RESERVED_NAMES, safe_name, unique_name
+from radiotwin.scene.names import RESERVED_NAMES, Names, safe_name, unique_name
 from radiotwin.scene.problems import Problem, error, fixed, listed, warning
 from radiotwin.scene.surfaces import FLAT_M, Surfaces
 
@@ -98,7 +98,7 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
 
 
 def _safe_names(shapes: Sequence[DeclaredShape]) -> tuple[list[str], list[Problem]]:
-    taken = set(RESERVED_NAMES)
+    taken = Names(RESERVED_NAMES)
     names, changed, double = [], [], []
     for shape in shapes:
         wanted = shape.name.removeprefix("mesh-")

@@ -6,7 +6,19 @@ from functools import cached_property
 
 import numpy as np
 
+from radiotwin.budgets import POSITIONS
 from radiotwin.errors import BadInput
+
+
+def check_lattice(x_min_m: float, x_max_m: float, y_min_m: float, y_max_m: float, step_m: float,
+                  altitudes_m: Sequence[float]) -> None:
+    """Raise BadInput if a lattice, see `Lattice.over`, has more positions than are allowed."""
+    width_m, depth_m = x_max_m - x_min_m, y_max_m - y_min_m
+    positions = (width_m / step_m + 1) * (depth_m / step_m + 1) * len(altitudes_m)
+    if not positions <= POSITIONS.limit:
+        POSITIONS.refuse(
+            f"lattice.step_m = {step_m:g} over an extent of {width_m:g} x {depth_m:g} m and "
+            f"{len(altitudes_m)} altitudes", f"{positions:.3g} positions")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +47,11 @@ class Lattice:
             y_max_m: North border, included where the step fits [m].
             step_m: Horizontal distance of neighbours [m].
             altitudes_m: Altitudes in any order [m].
+
+        Raises:
+            BadInput: Too many positions.
         """
+        check_lattice(x_min_m, x_max_m, y_min_m, y_max_m, step_m, altitudes_m)
         nx, ny = (int(np.floor((high - low) / step_m + 1e-9)) + 1
                   for low, high in ((x_min_m, x_max_m), (y_min_m, y_max_m)))
         return cls(x_min_m + step_m * np.arange(nx), y_min_m + step_m * np.arange(ny),
@@ -72,8 +88,13 @@ class Lattice:
         """
         index = []
         for axis, values in zip((2, 1, 0), (self.z_m, self.y_m, self.x_m)):
-            nearest = np.abs(positions_m[:, axis, None] - values[None, :]).argmin(axis=1)
-            off = np.abs(values[nearest] - positions_m[:, axis]) > 0.01
+            given = positions_m[:, axis]
+            after = np.searchsorted(values, given).clip(1, max(len(values) - 1, 1))
+            before = after - 1
+            after = np.minimum(after, len(values) - 1)
+            nearest = np.where(np.abs(given - values[before]) <= np.abs(values[after] - given),
+                               before, after)
+            off = ~(np.abs(values[nearest] - given) <= 0.01)
             if off.any():
                 position = positions_m[np.flatnonzero(off)[0]]
                 raise BadInput(

@@ -15,9 +15,10 @@ from radiotwin.scene.materials import (
     ranges_text,
     traceable,
 )
-from radiotwin.scene.mitsuba_xml import DeclaredShape, Node
+from radiotwin.scene.mitsuba_xml import DeclaredShape
 from radiotwin.scene.names import safe_name, unique_name
 from radiotwin.scene.problems import Problem, listed
+from radiotwin.scene.xml_tree import Node
 
 
 def map_materials(shapes: Sequence[DeclaredShape], declared: Mapping[str, Node],

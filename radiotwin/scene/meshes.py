@@ -1,18 +1,27 @@
-"""Triangles of one shape: read from its file or made from its kind, transformed and cleaned."""
+"""Triangles of shapes: read from their files or made from their kind, transformed and cleaned."""
 
+import io
+import os
+from array import array
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import mapbox_earcut
 import numpy as np
 
+from radiotwin.budgets import CORNERS, DOCUMENT_BYTES, FACES, VERTICES
 from radiotwin.errors import BadInput
+from radiotwin.inputs import read_bytes
 from radiotwin.scene.mitsuba_xml import DeclaredShape
 from radiotwin.scene.ply import read_ply
+from radiotwin.scene.xml_tree import read_vector
 
 WELD_M = 1e-4  # vertices equal when rounded to this are one; float32 resolves 6e-5 m at 1 km
 # Height of a triangle over its longest side below which its normal is numerical noise
 _MIN_ASPECT = 1e-6
+# In the file's units: a city in UTM coordinates and millimetres reaches 10^10
+_MAX_COORDINATE = 1e11
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +39,28 @@ class RawMesh:
     polygons: int = 0
 
 
+def load_shapes(shapes: Iterable[DeclaredShape], source: Path) -> Iterator[RawMesh]:
+    """Load the shapes of a city one by one, within the budgets of all their vertices and faces.
+
+    Args:
+        shapes: As read from the XML file.
+        source: That file.
+
+    Yields:
+        Triangles of each shape, see `load_shape`.
+
+    Raises:
+        BadInput: As `load_shape`, or a budget is exceeded.
+    """
+    vertices = faces = 0
+    for shape in shapes:
+        mesh = load_shape(shape)
+        vertices, faces = vertices + len(mesh.vertices), faces + len(mesh.faces)
+        VERTICES.check(vertices, f"{source} with its meshes")
+        FACES.check(faces, f"{source} with its meshes")
+        yield mesh
+
+
 def load_shape(shape: DeclaredShape) -> RawMesh:
     """Read or make a declared shape's triangles and apply its `to_world` transform.
 
@@ -40,24 +71,23 @@ def load_shape(shape: DeclaredShape) -> RawMesh:
         Triangles in the file's units and axes.
 
     Raises:
-        BadInput: A missing, truncated or unreadable mesh file, an unsupported kind of shape, or
-            coordinates that are not finite; with the mesh file, or the line of the XML file.
+        BadInput: A missing, truncated, unreadable or too large mesh file, an unsupported kind of
+            shape, or coordinates that are not finite; with the mesh file, or the line of the XML
+            file.
     """
     if shape.kind in ("ply", "obj"):
         raw = _read_mesh_file(shape)
     elif shape.kind in ("cube", "rectangle", "sphere"):
         raw = _analytic(shape)
     else:
-        raise BadInput(f"{shape.node.position}: a shape of type '{shape.kind}' is not read; export "
-                       "it as ply (read are: ply, obj, cube, rectangle, sphere)")
-    finite = np.isfinite(raw.vertices).all(axis=1)
-    if not finite.all():
-        raise BadInput(f"{shape.mesh_path or shape.node.position}: vertex "
-                       f"{np.flatnonzero(~finite)[0] + 1} is not finite (NaN or infinite; "
-                       f"{np.count_nonzero(~finite)} such vertices); export the mesh again")
+        raise BadInput(f"{shape.node.position}: a shape of type {shape.kind[:60]!r} is not read; "
+                       "export it as ply (read are: ply, obj, cube, rectangle, sphere)")
     linear, offset = shape.to_world[:3, :3], shape.to_world[:3, 3]
-    faces = raw.faces[:, ::-1] if np.linalg.det(linear) < 0 else raw.faces
-    return RawMesh(raw.vertices @ linear.T + offset, faces, raw.polygons)
+    with np.errstate(all="ignore"):
+        vertices = raw.vertices @ linear.T + offset
+        mirrored = np.linalg.det(linear) < 0
+    _check_vertices(vertices, f"{shape.node.position}, after the transform")
+    return RawMesh(vertices, raw.faces[:, ::-1] if mirrored else raw.faces, raw.polygons)
 
 
 def _read_mesh_file(shape: DeclaredShape) -> RawMesh:
@@ -65,19 +95,34 @@ def _read_mesh_file(shape: DeclaredShape) -> RawMesh:
     if path is None:
         raise BadInput(f"{shape.node.position}: the shape names no mesh file; add "
                        '<string name="filename" value="meshes/NAME.ply"/>')
-    if not path.is_file():
+    if not os.path.exists(path):
         raise BadInput(f"mesh file {path} does not exist (named in {shape.node.position}); put it "
                        "there or remove the shape")
     vertices, polygons = read_ply(path) if shape.kind == "ply" else read_obj(path)
+    _check_vertices(vertices, str(path))
     for group in polygons:
         wrong = (group < 0) | (group >= len(vertices))
         if wrong.any():
             raise BadInput(f"{path}: a face names vertex {group[wrong][0]}, there are "
                            f"{len(vertices)} (counted from 0); export the mesh again")
     areal = [group for group in polygons if group.ndim == 2 and group.shape[1] >= 3]
+    FACES.check(sum(len(group) * (group.shape[1] - 2) for group in areal), path)
     faces = [_triangulate(vertices, group) for group in areal]
     return RawMesh(vertices, np.concatenate(faces) if faces else np.zeros((0, 3), dtype=np.int64),
                    sum(len(group) for group in areal if group.shape[1] > 3))
+
+
+def _check_vertices(vertices: np.ndarray, source: str) -> None:
+    finite = np.isfinite(vertices).all(axis=1)
+    if not finite.all():
+        raise BadInput(f"{source}: vertex {np.flatnonzero(~finite)[0] + 1} is not finite (NaN or "
+                       f"infinite; {np.count_nonzero(~finite)} such vertices); export the mesh "
+                       "again")
+    farthest = np.abs(vertices).max(axis=1, initial=0)
+    if not (farthest <= _MAX_COORDINATE).all():
+        row = int(farthest.argmax())
+        raise BadInput(f"{source}: vertex {row + 1} is {farthest[row]:g} from the origin; allowed "
+                       f"is up to {_MAX_COORDINATE:g}: correct the mesh or its transform")
 
 
 def _triangulate(vertices: np.ndarray, polygons: np.ndarray) -> np.ndarray:
@@ -115,28 +160,30 @@ def read_obj(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
         (v, 3) vertices, and an (n, k) array of vertex indices for each number of corners k.
 
     Raises:
-        BadInput: A line with a wrong number, with its row.
+        BadInput: No such file, too large, or a line with a wrong number, with its row.
     """
-    vertices: list = []
-    polygons: dict[int, list] = {}
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    for row, line in enumerate(lines, start=1):
+    vertices = array("d")
+    polygons: dict[int, array] = {}
+    data = read_bytes(path, "OBJ mesh", DOCUMENT_BYTES)
+    for row, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8", "replace"), start=1):
         words = line.split()
         try:
             if words[:1] == ["v"]:
-                vertices.append([float(word) for word in words[1:4]])
-                if len(vertices[-1]) < 3:
-                    raise ValueError
+                x, y, z = (float(word) for word in words[1:4])
+                vertices.extend((x, y, z))
             elif words[:1] == ["f"]:
+                CORNERS.check(len(words) - 1, f"{path}, row {row}")
                 numbers = [int(word.split("/")[0]) for word in words[1:]]
                 # OBJ counts from 1, and from -1 backwards from the last vertex so far
-                corners = [n - 1 if n > 0 else len(vertices) + n if n else -1 for n in numbers]
-                polygons.setdefault(len(corners), []).append(corners)
-        except ValueError:
+                corners = [n - 1 if n > 0 else len(vertices) // 3 + n if n else -1
+                           for n in numbers]
+                polygons.setdefault(len(corners), array("q")).extend(corners)
+        except (ValueError, OverflowError):
             raise BadInput(f"{path}, row {row}: {line.strip()[:60]!r} is not a vertex or face as "
                            "OBJ has them; export the mesh again") from None
+    VERTICES.check(len(vertices) // 3, path)
     return (np.array(vertices, dtype=float).reshape(-1, 3),
-            [np.array(group) for group in polygons.values()])
+            [np.array(group, dtype=np.int64).reshape(-1, k) for k, group in polygons.items() if k])
 
 
 def _analytic(shape: DeclaredShape) -> RawMesh:
@@ -148,11 +195,14 @@ def _analytic(shape: DeclaredShape) -> RawMesh:
     if shape.kind == "rectangle":
         corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
         return RawMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=shape.node.number("radius", 1.0))
-    centre = next((child.attributes for child in shape.node.children
-                   if child.attributes.get("name") == "center"), {})
-    return RawMesh(ball.vertices + np.array([float(centre.get(axis, 0)) for axis in "xyz"]),
-                   ball.faces)
+    radius = shape.node.number("radius", 1.0)
+    if abs(radius) > _MAX_COORDINATE:
+        raise BadInput(f"{shape.node.position}: a radius of {radius:g} is not possible; allowed is "
+                       f"up to {_MAX_COORDINATE:g}")
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    centre = next((child for child in shape.node.children
+                   if child.attributes.get("name") == "center"), None)
+    return RawMesh(ball.vertices + (0 if centre is None else read_vector(centre, 0.0)), ball.faces)
 
 
 def clean(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:

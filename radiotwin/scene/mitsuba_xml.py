@@ -1,58 +1,26 @@
 """Mitsuba 3 / Sionna RT scene files, read without Mitsuba.
 
 Read: `ply`, `obj`, `cube`, `rectangle` and `sphere` shapes (also within `merge`), `to_world`
-transforms, materials by reference or inline, `<default>` parameters, `<include>` and `<path>`.
-Cameras, lights and integrators have no meaning for radio and are skipped. This is the only reader
-of scene XML: nothing of a file that is not read here reaches Mitsuba.
+transforms, materials by reference or inline, `<default>` parameters, `<include>` and `<path>`
+within the file's folder. Cameras, lights and integrators have no meaning for radio and are
+skipped. A scene folder may say less, see `radiotwin.scene.city_rules`. This is the only reader of
+scene XML: nothing of a file reaches Mitsuba but the triangles and materials that are read here.
 """
 
-from collections.abc import Iterator
+import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from radiotwin.budgets import DOCUMENT_BYTES, SEARCH_FOLDERS, SHAPES
 from radiotwin.errors import BadInput
 from radiotwin.inputs import require_within
-from radiotwin.safe_xml import parse_elements
+from radiotwin.scene.city_rules import check_city
+from radiotwin.scene.xml_tree import Node, XmlReader, read_numbers, read_vector, shown
 
 MAX_INCLUDE_DEPTH = 15  # the limit of Mitsuba
-
-
-@dataclass
-class Node:
-    """An XML element with its position in the file."""
-
-    tag: str
-    attributes: dict[str, str]
-    file: Path
-    line: int
-    children: list["Node"] = field(default_factory=list)
-
-    @property
-    def position(self) -> str:
-        """File and line, for messages."""
-        return f"{self.file}, line {self.line}"
-
-    def get(self, tag: str, name: str) -> str | None:
-        """Return the value of the child `<tag name="name" value="...">`, or None."""
-        for node in self.children:
-            if node.tag == tag and node.attributes.get("name") == name:
-                return node.attributes.get("value")
-        return None
-
-    def number(self, name: str, default: float) -> float:
-        """Return the value of the child `<float name="name">`, or the default."""
-        text = self.get("float", name)
-        return default if text is None else _numbers(self, text, (1,))[0]
-
-    def walk(self) -> Iterator["Node"]:
-        """Yield this element and all below it in the file's order, without recursion."""
-        waiting = [self]
-        while waiting:
-            node = waiting.pop()
-            yield node
-            waiting += reversed(node.children)
+MAX_NAME = 1000  # characters of a file's name with its folders: no system has longer ones
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,50 +57,51 @@ class DeclaredCity:
     materials: dict[str, Node] = field(default_factory=dict)
 
 
-def read_mitsuba_xml(path: Path | str, includes: bool = True) -> DeclaredCity:
+def read_mitsuba_xml(path: Path | str, scene_folder: bool = False) -> DeclaredCity:
     """Read a scene file and the files that it includes; meshes are not opened.
 
     Args:
         path: XML file; mesh files are looked for relative to the file that names them.
-        includes: Whether `<include>` and `<path>` are allowed.
+        scene_folder: Whether it is the `city.xml` of a scene folder, which may say less.
 
     Returns:
         Shapes and materials.
 
     Raises:
         BadInput: No such file, malformed XML, not a scene, an element that is not allowed, a value
-            that is not a number, or a file outside the folder of `path`; with file and line.
+            that is not a number, a file outside the folder of `path`, or too much of anything;
+            with file and line.
     """
-    return _Reader(Path(path), includes).city
+    return _Reader(Path(path), scene_folder).city
 
 
 class _Reader:
-    def __init__(self, path: Path, includes: bool) -> None:
+    def __init__(self, path: Path, scene_folder: bool) -> None:
         self.city = DeclaredCity()
-        self.includes = includes
+        self.scene_folder = scene_folder
         self.parameters: dict[str, str] = {}
+        self.lengths: list[int] = []  # of the parameters' names, from the longest
+        self.substituted = 0  # characters
         self.folders = [path.parent]
-        self._read_file(path, 0)
+        self.xml = XmlReader(path)
+        self._read_file(path, ())
 
-    def _read_file(self, path: Path, depth: int) -> None:
-        root = parse_xml(path)
-        for node in () if self.includes else root.walk():
-            if node.tag in ("include", "path"):
-                raise BadInput(f"{node.position}: <{node.tag}> is not allowed in a scene folder; "
-                               "build the scene with `radiotwin build-scene`")
+    def _read_file(self, path: Path, above: tuple[Path, ...]) -> None:
+        root = self.xml.read(path)
         if root.tag != "scene":
-            raise BadInput(f"{root.position}: the file begins with <{root.tag}>, not <scene>; "
+            raise BadInput(f"{root.position}: the file begins with <{root.tag[:60]}>, not <scene>; "
                            "give a Mitsuba or Sionna RT scene file")
-        self._read_children(root, depth)
+        if self.scene_folder:
+            check_city(root)
+        self._read_children(root, (*above, path.resolve()))
 
-    def _read_children(self, parent: Node, depth: int) -> None:
+    def _read_children(self, parent: Node, files: tuple[Path, ...]) -> None:
         waiting = parent.children[::-1]
         while waiting:
             node = waiting.pop()
             if node.tag == "default":
                 self._substitute(node)
-                self.parameters.setdefault(node.attributes.get("name", ""),
-                                           node.attributes.get("value", ""))
+                self._declare(node.attributes.get("name", ""), node.attributes.get("value", ""))
                 continue
             if node.tag not in ("include", "path", "bsdf", "shape"):
                 continue
@@ -142,38 +111,62 @@ class _Reader:
             for element in node.walk():
                 self._substitute(element)
             if node.tag == "include":
-                if depth >= MAX_INCLUDE_DEPTH:
-                    raise BadInput(f"{node.position}: more than {MAX_INCLUDE_DEPTH} files include "
-                                   "each other; remove the loop")
-                self._read_file(self._find(node, node.attributes.get("filename", "")), depth + 1)
+                self._include(node, files)
             elif node.tag == "path":
-                self.folders.append(node.file.parent / node.attributes.get("value", ""))
+                folder = node.file.parent / node.attributes.get("value", "")
+                if folder not in self.folders:
+                    self.folders.append(folder)
+                    SEARCH_FOLDERS.check(len(self.folders), node.position)
             elif node.tag == "bsdf":
                 self.city.materials[node.attributes.get("id", "")] = node
             else:
                 self._read_shape(node)
+
+    def _include(self, node: Node, files: tuple[Path, ...]) -> None:
+        path = self._find(node, node.attributes.get("filename", ""))
+        if len(files) > MAX_INCLUDE_DEPTH or path.resolve() in files:
+            raise BadInput(f"{node.position}: more than {MAX_INCLUDE_DEPTH} files include each "
+                           "other, or one itself; remove the loop")
+        self._read_file(path, files)
+
+    def _declare(self, name: str, value: str) -> None:
+        self.parameters.setdefault(name, value)
+        if name and len(name) not in self.lengths:
+            self.lengths = sorted([*self.lengths, len(name)], reverse=True)
 
     def _substitute(self, node: Node) -> None:
         """Replace `$name` by the parameter's value; identifiers may keep an undeclared `$`."""
         for key, text in node.attributes.items():
             if "$" not in text:
                 continue
-            for name in sorted(self.parameters, key=len, reverse=True):
-                text = text.replace(f"${name}", self.parameters[name])
-            if "$" in text and key not in ("id", "name"):
-                raise BadInput(f"{node.position}: {key}={text!r} uses a parameter that is not "
-                               'declared; add <default name="..." value="..."/> before it '
-                               f"(declared: {', '.join(self.parameters) or 'none'})")
-            node.attributes[key] = text
+            first, *rest = text.split("$")
+            parts = [first]
+            for part in rest:
+                length = next((length for length in self.lengths
+                               if part[:length] in self.parameters), 0)
+                if not length and key not in ("id", "name"):
+                    declared = ", ".join(list(self.parameters)[:20]) or "none"
+                    raise BadInput(
+                        f"{node.position}: {key}={shown(text)} uses a parameter that is not "
+                        'declared; add <default name="..." value="..."/> before it '
+                        f"(declared: {declared})")
+                parts += [self.parameters[part[:length]] if length else "$", part[length:]]
+                self.substituted += len(parts[-1]) + len(parts[-2])
+                DOCUMENT_BYTES.check(self.substituted, f"{node.position}: with its parameters")
+            node.attributes[key] = "".join(parts)
 
     def _find(self, node: Node, name: str) -> Path:
+        if len(name) > MAX_NAME:
+            raise BadInput(f"{node.position}: {shown(name)} is not the name of a file: it has "
+                           f"{len(name):,} characters")
         name = name.replace("\\", "/")
         for folder in (node.file.parent, *self.folders):
-            if (folder / name).is_file():
+            if os.path.isfile(folder / name):
                 return require_within(self.folders[0], folder / name, node.position)
         return require_within(self.folders[0], node.file.parent / name, node.position)
 
     def _read_shape(self, node: Node) -> None:
+        SHAPES.check(len(self.city.shapes) + 1, node.file)
         kind = node.attributes.get("type", "")
         file_name = node.get("string", "filename")
         mesh_path = None if file_name is None else self._find(node, file_name)
@@ -192,53 +185,6 @@ class _Reader:
             DeclaredShape(identifier, kind, node, to_world, mesh_path, material))
 
 
-def parse_xml(path: Path) -> Node:
-    """Parse one file into a tree of elements with line numbers.
-
-    Args:
-        path: XML file.
-
-    Returns:
-        The root element.
-
-    Raises:
-        BadInput: No such file, malformed XML (with line and column), or declared entities.
-    """
-    top = Node("", {}, path, 0)
-    open_nodes = [top]
-
-    def start(tag: str, attributes: dict[str, str], line: int) -> None:
-        node = Node(tag, attributes, path, line)
-        open_nodes[-1].children.append(node)
-        open_nodes.append(node)
-
-    def end(tag: str) -> None:
-        open_nodes.pop()
-
-    parse_elements(path, start, end)
-    return top.children[0]
-
-
-def _numbers(node: Node, text: str, counts: tuple[int, ...]) -> np.ndarray:
-    try:
-        values = np.array([float(word) for word in text.replace(",", " ").split()])
-    except ValueError:
-        values = None
-    if values is None or len(values) not in counts or not np.isfinite(values).all():
-        allowed = " or ".join(str(count) for count in counts)
-        raise BadInput(f"{node.position}: <{node.tag}> has {text!r} where {allowed} finite "
-                       "number(s) should be")
-    return values
-
-
-def _vector(node: Node, default: float) -> np.ndarray:
-    """Return the (3,) of `value="x, y, z"`, of `value="s"`, or of x=, y=, z=."""
-    if "value" in node.attributes:
-        return np.broadcast_to(_numbers(node, node.attributes["value"], (1, 3)), 3)
-    return np.array([_numbers(node, node.attributes.get(axis, str(default)), (1,))[0]
-                     for axis in "xyz"])
-
-
 def read_transform(node: Node) -> np.ndarray:
     """Return the matrix of a `<transform>`: its operations, each applied after the one before.
 
@@ -255,14 +201,14 @@ def read_transform(node: Node) -> np.ndarray:
     for step in node.children:
         operation = np.eye(4)
         if step.tag == "translate":
-            operation[:3, 3] = _vector(step, 0.0)
+            operation[:3, 3] = read_vector(step, 0.0)
         elif step.tag == "scale":
-            operation[:3, :3] = np.diag(_vector(step, 1.0))
+            operation[:3, :3] = np.diag(read_vector(step, 1.0))
         elif step.tag == "rotate":
-            angle_deg = _numbers(step, step.attributes.get("angle", "0"), (1,))[0]
-            operation[:3, :3] = _rotation(step, _vector(step, 0.0), np.radians(angle_deg))
+            angle_deg = read_numbers(step, step.attributes.get("angle", "0"), (1,))[0]
+            operation[:3, :3] = _rotation(step, read_vector(step, 0.0), np.radians(angle_deg))
         elif step.tag == "matrix":
-            values = _numbers(step, step.attributes.get("value", ""), (9, 16))
+            values = read_numbers(step, step.attributes.get("value", ""), (9, 16))
             size = 3 if len(values) == 9 else 4
             operation[:size, :size] = values.reshape(size, size)
         else:

@@ -1,10 +1,13 @@
 """Extent, altitudes, devices and UAVs for a city that declares none."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import cycle, product
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
 
+from radiotwin.budgets import DEVICES, UAVS
 from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import (
@@ -20,6 +23,7 @@ from radiotwin.scene.surfaces import Surfaces
 _DEVICE_CLEARANCE_M = 10.0  # free ground around a device [m]
 _UAV_CLEARANCE_M = 2.0  # free air beside the start of a UAV [m]
 _MAX_CELLS = 2_000_000  # of a `BuiltGrid`
+_MAX_LENGTHS = 10_000  # of an extent, in its widths
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +46,15 @@ class BuiltGrid:
         Args:
             extent: Area of the grid.
             buildings: 3D map of the buildings alone; None: there are none.
+
+        Raises:
+            BadInput: The extent is but a line.
         """
         x_min, x_max, y_min, y_max = extent.bounds
         width, depth = x_max - x_min, y_max - y_min
+        if max(width, depth) > _MAX_LENGTHS * min(width, depth):
+            raise BadInput(f"an extent of {width:g} x {depth:g} m is but a line; its longer side "
+                           f"may be {_MAX_LENGTHS:,} times the other: widen it")
         cell_m = max(min(1.0, width / 50, depth / 50), np.sqrt(width * depth / _MAX_CELLS))
         x_m = np.arange(x_min + cell_m / 2, x_max, cell_m)
         y_m = np.arange(y_min + cell_m / 2, y_max, cell_m)
@@ -179,8 +189,9 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
         rng: Source of the positions.
 
     Raises:
-        BadInput: There is not enough free ground.
+        BadInput: There is not enough free ground, or too many are asked for.
     """
+    DEVICES.check(count, "--devices")
     if count == 0:
         return []
     rows, columns = np.nonzero(grid.clearance_m() >= _DEVICE_CLEARANCE_M)
@@ -194,9 +205,12 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
     chosen: list[np.ndarray] = []
     while len(chosen) < count:
         drawn = rng.choice(len(free), min(len(free), 1000), replace=False, p=weight / weight.sum())
+        squares = _Squares(apart_m, chosen)
         for index in drawn:
-            if all(np.hypot(*(free[index] - other)) >= apart_m for other in chosen):
+            if all(np.hypot(*(free[index] - other)) >= apart_m
+                   for other in squares.around(free[index])):
                 chosen.append(free[index])
+                squares.add(free[index])
                 if len(chosen) == count:
                     break
         apart_m *= 0.8
@@ -209,12 +223,41 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
             for number, ((x, y), bottom) in enumerate(zip(positions, bottom_m))]
 
 
+class _Squares:
+    """Points by the square of the plane that they lie in, so that few are compared with a new one.
+
+    Args:
+        side_m: Side of a square [m].
+        points: (2,) positions [m].
+    """
+
+    def __init__(self, side_m: float, points: Iterable[np.ndarray]) -> None:
+        self._side_m = side_m
+        self._points: dict[tuple[int, int], list[np.ndarray]] = {}
+        for point in points:
+            self.add(point)
+
+    def _square(self, point: np.ndarray) -> tuple[int, int]:
+        column, row = np.floor(point / self._side_m)
+        return int(column), int(row)
+
+    def add(self, point: np.ndarray) -> None:
+        self._points.setdefault(self._square(point), []).append(point)
+
+    def around(self, point: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield all points that are nearer than a side, and some that are not."""
+        column, row = self._square(point)
+        for x, y in product((column - 1, column, column + 1), (row - 1, row, row + 1)):
+            yield from self._points.get((x, y), ())
+
+
 def _spread_out(positions: np.ndarray, count: int) -> set[int]:
     """Choose `count` positions, from the middle on each the farthest from those before."""
     chosen = [int(np.linalg.norm(positions - positions.mean(axis=0), axis=1).argmin())]
+    gaps = np.linalg.norm(positions - positions[chosen[0]], axis=1)
     while len(chosen) < count:
-        gaps = np.linalg.norm(positions[:, None] - positions[None, chosen], axis=2).min(axis=1)
         chosen.append(int(gaps.argmax()))
+        np.minimum(gaps, np.linalg.norm(positions - positions[chosen[-1]], axis=1), out=gaps)
     return set(chosen)
 
 
@@ -232,8 +275,9 @@ def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: Ci
         buildings: 3D map of the buildings alone; None: there are none.
 
     Raises:
-        BadInput: No lattice position is free at an altitude.
+        BadInput: No lattice position is free at an altitude, or too many are asked for.
     """
+    UAVS.check(count, "--uavs")
     x_min, x_max, y_min, y_max = extent.bounds
     positions = Lattice.over(*extent.bounds, lattice.step_m, lattice.altitudes_m)
     x, y = np.meshgrid(positions.x_m, positions.y_m)
@@ -242,9 +286,8 @@ def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: Ci
     battery = max(20.0, float(round(0.8 * sum(x.shape))))
     offsets_m = _UAV_CLEARANCE_M * np.array(
         [[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
-    uavs = []
-    for number in range(count):
-        altitude_m = lattice.altitudes_m[number % len(lattice.altitudes_m)]
+    places: dict[float, tuple[float, float]] = {}
+    for altitude_m in lattice.altitudes_m[:count]:
         points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, altitude_m)])[nearest]
         free = np.ones(len(points), dtype=bool)
         if buildings is not None:
@@ -254,6 +297,10 @@ def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: Ci
             raise BadInput(f"at {altitude_m:g} m every lattice position is inside a building; "
                            "choose higher altitudes")
         x_m, y_m, _ = (float(value) for value in points[free.argmax()])
+        places[altitude_m] = x_m, y_m
+    uavs = []
+    for number, altitude_m in zip(range(count), cycle(lattice.altitudes_m)):
+        x_m, y_m = places[altitude_m]
         uavs.append(UavConfig(uav=f"uav{number + 1}", altitude_m=altitude_m, start_x_m=x_m,
                               start_y_m=y_m, terminal_x_m=x_m, terminal_y_m=y_m, battery=battery))
     return uavs

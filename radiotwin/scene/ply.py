@@ -5,12 +5,16 @@ vertex, and refuses binary files that mix triangles with quadrilaterals.
 """
 
 import struct
+from array import array
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from radiotwin.budgets import COLUMNS, CORNERS, DOCUMENT_BYTES, FACES, VERTICES
 from radiotwin.errors import BadInput
+from radiotwin.inputs import read_bytes
 
 _TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2",
           "ushort": "u2", "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4",
@@ -18,6 +22,8 @@ _TYPES = {"char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2
 _STRUCT_CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f",
                  "f8": "d"}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+_INDICES = ("vertex_indices", "vertex_index")  # names that programs give the list of a face
+_BUDGETS = {"vertex": VERTICES, "face": FACES}
 
 
 @dataclass
@@ -38,6 +44,31 @@ class _Element:
                            (name, order + kind, (lengths[name],))]
         return np.dtype(fields)
 
+    def is_read(self, name: str) -> bool:
+        """Return whether the values of a property are needed."""
+        return name in {"vertex": tuple("xyz"), "face": _INDICES}.get(self.name, ())
+
+    def add(self, name: str, kind: str, length_kind: str | None) -> None:
+        """Add a property; KeyError or ValueError where no mesh has such a one."""
+        whole = {length_kind, kind if self.name == "face" and self.is_read(name) else None}
+        if (any(one is not None and _TYPES[one].startswith("f") for one in whole)
+                or self.is_read(name) and (length_kind is None) != (self.name == "vertex")):
+            raise ValueError
+        self.properties.append((name, _TYPES[kind],
+                                None if length_kind is None else _TYPES[length_kind]))
+
+
+@dataclass
+class _Lists:
+    """Lists of whole numbers, one after the other."""
+
+    lengths: array = field(default_factory=lambda: array("q"))
+    values: array = field(default_factory=lambda: array("q"))
+
+    def append(self, values: tuple | list) -> None:
+        self.lengths.append(len(values))
+        self.values.extend(values)
+
 
 def read_ply(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
     """Read vertices and polygons.
@@ -49,15 +80,13 @@ def read_ply(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
         (v, 3) vertices, and an (n, k) array of vertex indices for each number of corners k.
 
     Raises:
-        BadInput: No such file, not a PLY file, truncated, or a header without vertices or faces.
+        BadInput: No such file, not a PLY file, truncated, too large, a header without vertices or
+            faces, or a number that cannot be one of a mesh.
     """
-    try:
-        if path.exists() and not path.is_file():  # reading a pipe would block
-            raise OSError(0, "it is not an ordinary file")
-        data = path.read_bytes()
-    except OSError as error:
-        raise BadInput(f"{path} cannot be read: {error.strerror}; export the mesh again") from None
+    data = read_bytes(path, "PLY mesh")
     order, elements, start = _read_header(path, data)
+    if order == "":
+        DOCUMENT_BYTES.check(len(data), f"{path} (ASCII; the binary form takes less memory)")
     columns = (_read_ascii(path, data[start:], elements) if order == "" else
                _read_binary(path, data, start, order, elements))
     try:
@@ -66,19 +95,23 @@ def read_ply(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
     except KeyError as missing:
         raise BadInput(f"{path}: the PLY header declares no vertex {missing.args[0][1]}; export "
                        "the mesh again") from None
-    polygons = columns.get(("face", "vertex_indices"), columns.get(("face", "vertex_index")))
+    polygons = next((columns["face", name] for name in _INDICES if ("face", name) in columns), None)
     if polygons is None:
         raise BadInput(f"{path}: the PLY header declares no face vertex_indices; export the mesh "
                        "with faces")
-    return vertices, _by_corners(polygons)
+    return vertices, _by_corners(path, polygons)
 
 
-def _by_corners(polygons: np.ndarray | list) -> list[np.ndarray]:
+def _by_corners(path: Path, polygons: np.ndarray | _Lists) -> list[np.ndarray]:
     if isinstance(polygons, np.ndarray):
+        CORNERS.check(polygons.shape[1], path)
         return [polygons.astype(np.int64)]
-    corners = np.array([len(polygon) for polygon in polygons])
-    return [np.array([polygons[row] for row in np.flatnonzero(corners == k)], dtype=np.int64)
-            for k in np.unique(corners)]
+    lengths, values = (np.frombuffer(numbers, dtype=np.int64) if numbers else
+                       np.zeros(0, dtype=np.int64) for numbers in (polygons.lengths,
+                                                                   polygons.values))
+    CORNERS.check(lengths.max(initial=0), path)
+    starts = np.cumsum(lengths) - lengths
+    return [values[starts[lengths == k][:, None] + np.arange(k)] for k in np.unique(lengths)]
 
 
 def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
@@ -88,7 +121,7 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
                        "the mesh again")
     start = data.find(b"\n", end) + 1 or len(data)
     order, elements = None, []
-    for number, line in enumerate(data[:end].decode("latin-1").splitlines(), start=1):
+    for number, line in enumerate(_lines(data[:end]), start=1):
         words = line.split()
         try:
             match words:
@@ -97,9 +130,9 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
                 case ["element", name, count] if int(count) >= 0:
                     elements.append(_Element(name, int(count)))
                 case ["property", "list", length_kind, kind, name]:
-                    elements[-1].properties.append((name, _TYPES[kind], _TYPES[length_kind]))
+                    elements[-1].add(name, kind, length_kind)
                 case ["property", kind, name]:
-                    elements[-1].properties.append((name, _TYPES[kind], None))
+                    elements[-1].add(name, kind, None)
                 case ["ply"] | ["comment", *_] | ["obj_info", *_] | []:
                     pass
                 case _:
@@ -109,58 +142,87 @@ def _read_header(path: Path, data: bytes) -> tuple[str, list[_Element], int]:
                            "line; export the mesh again") from None
     if order is None:
         raise BadInput(f"{path}: the PLY header has no format line; export the mesh again")
-    # Every row takes at least a byte: compare the header's counts with the file's size before any
-    # memory is reserved
-    for element in elements:
-        if element.count and not element.properties or element.count > len(data) - start:
-            raise _truncated(path, element, 0)
+    _check_elements(path, elements, len(data) - start)
     return order, elements, start
+
+
+def _check_elements(path: Path, elements: list[_Element], size: int) -> None:
+    """Compare the header's counts with the size of the rest, before any memory is reserved."""
+    COLUMNS.check(sum(len(element.properties) for element in elements), path)
+    names = [(element.name, name) for element in elements for name, *_ in element.properties]
+    if len(set(names)) < len(names) or len({element.name for element in elements}) < len(elements):
+        raise BadInput(f"{path}: the PLY header declares an element or a property twice; export "
+                       "the mesh again")
+    for element in elements:  # every row takes at least a byte
+        if element.count and not element.properties or element.count > size:
+            raise _truncated(path, element, 0)
+        if element.name in _BUDGETS:
+            _BUDGETS[element.name].check(element.count, path)
+
+
+def _lines(data: bytes) -> Iterator[str]:
+    return iter(data.decode("latin-1").splitlines())
 
 
 def _truncated(path: Path, element: _Element, row: int) -> BadInput:
     return BadInput(f"{path} is truncated: its header promises {element.count} rows of "
-                    f"'{element.name}', the file ends in row {row + 1}; copy or export the mesh "
-                    "again")
+                    f"{element.name[:60]!r}, the file ends in row {row + 1}; copy or export the "
+                    "mesh again")
 
 
 def _read_ascii(path: Path, data: bytes, elements: list[_Element]) -> dict:
-    lines = [line for line in data.decode("latin-1").splitlines() if line.strip()]
-    columns: dict[tuple[str, str], list] = {}
+    lines = [line for line in _lines(data) if line.strip()]
+    columns: dict[tuple[str, str], array | _Lists] = {}
     first = 0
     for element in elements:
-        rows = [line.split() for line in lines[first : first + element.count]]
+        rows = lines[first : first + element.count]
         first += element.count
         if len(rows) < element.count:
             raise _truncated(path, element, len(rows))
-        for name, *_ in element.properties:
-            columns[element.name, name] = []
-        for number, words in enumerate(rows):
-            at = 0
+        found = _empty(element)
+        for number, line in enumerate(rows):
+            words = line.split()
             try:
-                for name, kind, length_kind in element.properties:
-                    cast = float if kind.startswith("f") else int
-                    if length_kind is None:
-                        columns[element.name, name].append(cast(words[at]))
-                        at += 1
-                    else:
-                        length = int(words[at])
-                        values = [cast(word) for word in words[at + 1 : at + 1 + length]]
-                        if len(values) < length:
-                            raise IndexError
-                        columns[element.name, name].append(values)
-                        at += 1 + length
+                _read_words(words, element, found)
             except IndexError:
                 raise _truncated(path, element, number) from None
-            except ValueError:
-                raise BadInput(f"{path}: row {number + 1} of '{element.name}' has a text where a "
-                               f"number should be: {' '.join(words)[:60]!r}; export the mesh "
-                               "again") from None
+            except (ValueError, OverflowError):
+                raise BadInput(f"{path}: row {number + 1} of {element.name[:60]!r} has a text or "
+                               f"a number that cannot be one of a mesh where a number should be: "
+                               f"{line.strip()[:60]!r}; export the mesh again") from None
+        columns |= {(element.name, name): values for name, values in found.items()}
     return columns
+
+
+def _empty(element: _Element) -> dict[str, array | _Lists]:
+    return {name: array("d") if length_kind is None else _Lists()
+            for name, _, length_kind in element.properties if element.is_read(name)}
+
+
+def _read_words(words: list[str], element: _Element, found: dict) -> None:
+    at = 0
+    for name, kind, length_kind in element.properties:
+        cast = float if kind.startswith("f") else int
+        if length_kind is None:
+            value = cast(words[at])
+            at += 1
+            if name in found:
+                found[name].append(value)
+        else:
+            length = int(words[at])
+            if length < 0:
+                raise ValueError
+            values = [cast(word) for word in words[at + 1 : at + 1 + length]]
+            if len(values) < length:
+                raise IndexError
+            if name in found:
+                found[name].append(values)
+            at += 1 + length
 
 
 def _read_binary(path: Path, data: bytes, start: int, order: str, elements: list[_Element]
                  ) -> dict:
-    columns: dict[str, dict] = {}
+    columns: dict[tuple[str, str], np.ndarray | array | _Lists] = {}
     for element in elements:
         found, start = (_read_uniform(data, start, order, element)
                         or _read_ragged(path, data, start, order, element))
@@ -171,6 +233,8 @@ def _read_binary(path: Path, data: bytes, start: int, order: str, elements: list
 def _read_uniform(data: bytes, start: int, order: str, element: _Element
                   ) -> tuple[dict, int] | None:
     """Read all rows at once if every row's lists are as long as the first row's; else None."""
+    if element.count == 0:
+        return None
     lengths, at = {}, start
     for name, kind, length_kind in element.properties:
         size = np.dtype(kind).itemsize
@@ -183,20 +247,20 @@ def _read_uniform(data: bytes, start: int, order: str, element: _Element
             at += size
         if at > len(data) or min(lengths.values(), default=0) < 0:
             return None
-    dtype = element.dtype(order, lengths)
-    if start + dtype.itemsize * element.count > len(data):
+    if (at - start) * element.count > len(data) - start or at - start >= 2**31:
         return None
+    dtype = element.dtype(order, lengths)
     rows = np.frombuffer(data, dtype, count=element.count, offset=start)
     if any((rows[f"{name} length"] != length).any() for name, length in lengths.items()):
         return None
     end = start + dtype.itemsize * element.count
-    return {name: rows[name] for name, *_ in element.properties}, end
+    return {name: rows[name] for name, *_ in element.properties if element.is_read(name)}, end
 
 
 def _read_ragged(path: Path, data: bytes, at: int, order: str, element: _Element
                  ) -> tuple[dict, int]:
     """Read row by row."""
-    found: dict[str, list] = {name: [] for name, *_ in element.properties}
+    found = _empty(element)
     for row in range(element.count):
         try:
             for name, kind, length_kind in element.properties:
@@ -204,9 +268,14 @@ def _read_ragged(path: Path, data: bytes, at: int, order: str, element: _Element
                 if length_kind is not None:
                     (length,) = struct.unpack_from(order + _STRUCT_CODES[length_kind], data, at)
                     at += struct.calcsize(_STRUCT_CODES[length_kind])
-                values = struct.unpack_from(f"{order}{length}{_STRUCT_CODES[kind]}", data, at)
-                at += struct.calcsize(f"{order}{length}{_STRUCT_CODES[kind]}")
-                found[name].append(values if length_kind is not None else values[0])
+                size = length * struct.calcsize(_STRUCT_CODES[kind])
+                if length < 0 or at + size > len(data):
+                    raise struct.error
+                if name in found:
+                    CORNERS.check(length, path)
+                    values = struct.unpack_from(f"{order}{length}{_STRUCT_CODES[kind]}", data, at)
+                    found[name].append(values if length_kind is not None else values[0])
+                at += size
         except struct.error:
             raise _truncated(path, element, row) from None
     return found, at

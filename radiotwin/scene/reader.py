@@ -4,15 +4,19 @@ All that uses a scene's geometry goes through here. The ray tracer loads a file 
 `radiotwin.scene.writer` writes from what was read here, never the scene's own.
 """
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from radiotwin.errors import BadInput
 from radiotwin.scene.material_mapping import map_materials
-from radiotwin.scene.meshes import RawMesh, load_shape
+from radiotwin.scene.meshes import RawMesh, load_shapes
 from radiotwin.scene.mitsuba_xml import DeclaredCity, read_mitsuba_xml
-from radiotwin.scene.names import RESERVED_NAMES, safe_name, unique_name
+from radiotwin.scene.names import RESERVED_NAMES, Names, safe_name, unique_name
 from radiotwin.scene.writer import CityShape
+from radiotwin.tables import MAX_COORDINATE_M
 
 
 def read_triangles(xml_path: Path | str) -> list[RawMesh]:
@@ -53,7 +57,7 @@ def read_city(xml_path: Path | str) -> list[CityShape]:
     errors = [problem.message for problem in problems if problem.severity == "error"]
     if errors:
         raise BadInput("\n".join([f"{xml_path}: not every shape has a usable material:", *errors]))
-    taken = set(RESERVED_NAMES)
+    taken = Names(RESERVED_NAMES)
     names = [unique_name(safe_name(shape.name.removeprefix("mesh-")), taken)
              for shape in declared.shapes]
     used = sorted({material for material in materials if material is not None}, key=repr)
@@ -66,14 +70,23 @@ def read_city(xml_path: Path | str) -> list[CityShape]:
 
 
 def _declared(xml_path: Path) -> DeclaredCity:
-    if not xml_path.is_file():
+    if not os.path.lexists(xml_path):
         raise BadInput(f"{xml_path} does not exist; `radiotwin build-scene` makes a scene folder")
-    return read_mitsuba_xml(xml_path, includes=False)
+    return read_mitsuba_xml(xml_path, scene_folder=True)
 
 
 def _meshes(xml_path: Path, declared: DeclaredCity) -> list[RawMesh]:
-    meshes = [load_shape(shape) for shape in declared.shapes]
-    if not any(len(mesh.faces) for mesh in meshes) or any(mesh.polygons for mesh in meshes):
-        raise BadInput(f"{xml_path} names no meshes, or some that are not of triangles; build the "
-                       "scene with `radiotwin build-scene`")
+    meshes = []
+    for shape, mesh in zip(declared.shapes, load_shapes(declared.shapes, xml_path)):
+        farthest_m = float(np.abs(mesh.vertices).max(initial=0.0))
+        if farthest_m > MAX_COORDINATE_M:
+            raise BadInput(f"{shape.node.position}: the shape reaches {farthest_m:g} m from the "
+                           f"origin; at most {MAX_COORDINATE_M:g} m are allowed: build the scene "
+                           "with `radiotwin build-scene`, which moves it there")
+        if mesh.polygons:
+            raise BadInput(f"{shape.mesh_path}: has faces that are not of triangles; build the "
+                           "scene with `radiotwin build-scene`")
+        meshes.append(mesh)
+    if not any(len(mesh.faces) for mesh in meshes):
+        raise BadInput(f"{xml_path} names no meshes; build the scene with `radiotwin build-scene`")
     return meshes

@@ -1,23 +1,26 @@
 """The scene folder as an object."""
 
 import hashlib
-import shutil
+import os
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from radiotwin.antennas import Antenna, Pattern, read_pattern
+from radiotwin.budgets import SHAPES
 from radiotwin.errors import BadInput
-from radiotwin.inputs import require_within
+from radiotwin.inputs import open_input, read_bytes, require_within
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import DeviceConfig, SceneConfig, UavConfig, read_config
 from radiotwin.scene.lattice import Lattice
 
 if TYPE_CHECKING:
     from radiotwin.radiomap import RadioMap
+
+_BLOCK_BYTES = 2**20
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +87,9 @@ class Scene:
     @cached_property
     def device_antennas(self) -> list[Antenna | None]:
         """Antenna of each declared device; None: isotropic."""
+        pattern = cache(self._pattern)  # many devices may share a file
         return [None if device.antenna is None else
-                Antenna(self._pattern(device.antenna), device.azimuth_deg or 0.0,
-                        device.tilt_deg or 0.0)
+                Antenna(pattern(device.antenna), device.azimuth_deg or 0.0, device.tilt_deg or 0.0)
                 for device in self.config.devices]
 
     @cached_property
@@ -100,15 +103,21 @@ class Scene:
 
         Args:
             folder: The other scene folder.
+
+        Raises:
+            BadInput: A file outside the scene folder, or one that cannot be read.
         """
         ends: list[DeviceConfig | UavConfig] = [*self.config.devices, *self.config.uavs]
         for name in sorted({end.antenna for end in ends if end.antenna is not None}):
+            data = read_bytes(self._antenna_path(name), "antenna pattern")
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copyfile(self.folder / name, folder / name)
+            (folder / name).write_bytes(data)
+
+    def _antenna_path(self, name: str) -> Path:
+        return require_within(self.folder, self.folder / name, str(self.folder / "scene.toml"))
 
     def _pattern(self, name: str) -> Pattern:
-        source = str(self.folder / "scene.toml")
-        return read_pattern(require_within(self.folder, self.folder / name, source))
+        return read_pattern(self._antenna_path(name))
 
     def _check_devices(self) -> None:
         """Raise BadInput if a device is inside a building, or a UAV starts or ends in one."""
@@ -120,13 +129,15 @@ class Scene:
                     f"{path}: device {device.device!r} at ({device.x_m:g}, {device.y_m:g}, "
                     f"{device.z_m:g}) m is inside a building {top_m:.1f} m high; move it, or put "
                     f"it on the roof (z_m > {top_m:.1f})")
-        for uav in self.config.uavs:
-            for end, x_m, y_m in (("start", uav.start_x_m, uav.start_y_m),
-                                  ("terminal", uav.terminal_x_m, uav.terminal_y_m)):
-                if self.city.inside(np.array([[x_m, y_m, uav.altitude_m]]))[0]:
-                    raise BadInput(
-                        f"{path}: uav {uav.uav!r}: its {end} ({x_m:g}, {y_m:g}, "
-                        f"{uav.altitude_m:g}) m is inside a building; move it or raise altitude_m")
+        ends = [(uav, end, (x_m, y_m, uav.altitude_m)) for uav in self.config.uavs
+                for end, x_m, y_m in (("start", uav.start_x_m, uav.start_y_m),
+                                      ("terminal", uav.terminal_x_m, uav.terminal_y_m))]
+        points_m = np.array([point_m for *_, point_m in ends], dtype=float).reshape(-1, 3)
+        for (uav, end, (x_m, y_m, z_m)), bad in zip(ends, self.city.inside(points_m)):
+            if bad:
+                raise BadInput(
+                    f"{path}: uav {uav.uav!r}: its {end} ({x_m:g}, {y_m:g}, {z_m:g}) m is inside "
+                    "a building; move it or raise altitude_m")
 
     def check_map(self, radio_map: "RadioMap") -> None:
         """Raise BadInput unless a map was made for this scene as it is now, with all its devices.
@@ -134,8 +145,8 @@ class Scene:
         Args:
             radio_map: Map with the attribute `scene_hash`.
         """
-        missing = [device.device for device in self.config.devices
-                   if device.device not in radio_map.devices]
+        known = set(radio_map.devices)
+        missing = [device.device for device in self.config.devices if device.device not in known]
         if missing or not self.over_lattice(radio_map) \
                 or radio_map.dataset.attrs.get("scene_hash") != self.content_hash():
             what = (f"it lacks device {missing[0]!r}" if missing else
@@ -152,12 +163,19 @@ class Scene:
         """Return the SHA-256 of all inputs of a gain map.
 
         These are geometry, materials, frequency, sensitivity, devices and antennas.
+
+        Raises:
+            BadInput: A mesh outside the folder, or one that cannot be read.
         """
         digest = hashlib.sha256()
         meshes = sorted(path for path in self.folder.glob("meshes/*") if path.is_file())
+        SHAPES.check(len(meshes), self.folder / "meshes")
         for path in (self.xml_path, *meshes):
             require_within(self.folder, path, str(self.folder))
-            digest.update(path.name.encode() + b"\0" + path.read_bytes())
+            digest.update(os.fsencode(path.name) + b"\0")
+            with open_input(path, "mesh") as file:
+                while block := file.read(_BLOCK_BYTES):
+                    digest.update(block)
         radio = self.config.radio
         digest.update(f"{radio.frequency_hz!r},{radio.tx_power_dbm!r},"
                       f"{radio.sensitivity_dbm!r};".encode())

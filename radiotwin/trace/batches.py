@@ -1,13 +1,16 @@
 """Finished batches of a trace on disk, so that an interrupted one can be resumed."""
 
 import hashlib
+import io
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
+from radiotwin.inputs import read_bytes
 
 
 class BatchStore:
@@ -38,20 +41,30 @@ class BatchStore:
             size: Its length.
 
         Returns:
-            (size,) array; None where it is absent or damaged.
+            (size,) array; None where it is absent, damaged, or not as `put` writes it.
         """
         try:
-            array = np.load(self.folder / f"{name}.npy", allow_pickle=False)
-        except (OSError, ValueError, EOFError):
+            data = read_bytes(self.folder / f"{name}.npy", "batch of a trace")
+        except BadInput:
             return None
-        return array if array.shape == (size,) else None
+        if len(data) < 8 * size:
+            return None
+        array = np.frombuffer(data[len(data) - 8 * size:], dtype=float)
+        return array if data == _file_content(array) else None
 
     def put(self, name: str, array: np.ndarray) -> None:
         """Save an array, completely or not at all.
 
         Args:
             name: Name in the store.
-            array: One-dimensional array.
+            array: (n,) floats.
         """
         with atomic_path(self.folder / f"{name}.npy") as temporary:
-            np.save(temporary, array, allow_pickle=False)
+            temporary.write_bytes(_file_content(array))
+
+
+def _file_content(array: np.ndarray) -> bytes:
+    """Return the bytes of a `.npy` file of floats."""
+    file = io.BytesIO()
+    np.save(file, np.asarray(array, dtype=float), allow_pickle=False)
+    return file.getvalue()

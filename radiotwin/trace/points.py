@@ -7,13 +7,14 @@ import pandas as pd
 from scipy.constants import speed_of_light
 
 from radiotwin.antennas import Antenna
+from radiotwin.budgets import ROWS
 from radiotwin.cells import read_cells
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path, require_writable
 from radiotwin.geodesy import to_local
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
-from radiotwin.tables import Origin
+from radiotwin.tables import MAX_COORDINATE_M, Origin
 from radiotwin.trace.run import device_indices
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import PathGains
@@ -67,8 +68,8 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings,
         sensitivity.
 
     Raises:
-        BadInput: An unknown device, settings for another solver, or an output that cannot be
-            written.
+        BadInput: An unknown device, settings for another solver, too many links, or an output that
+            cannot be written.
         RunFailed: No usable libLLVM.
     """
     if out_path is not None:
@@ -76,6 +77,7 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings,
             raise BadInput(f"{out_path}: unknown format; allowed are .csv and .csv.gz")
         require_writable(out_path)
     index = device_indices(scene, devices)
+    ROWS.check(len(index) * len(points_m), "points times devices")
     inside = scene.city.inside(points_m)
     wavelength_m = speed_of_light / scene.config.radio.frequency_hz
     antennas = [scene.device_antennas[device] for device in index]
@@ -113,8 +115,8 @@ def read_points(path: Path | str, origin: Origin | None = None) -> np.ndarray:
         (n, 3) positions [m].
 
     Raises:
-        BadInput: No such file, a missing column, no rows, a cell that is not a finite number, or
-            latitudes where there is no origin.
+        BadInput: No such file, a missing column, no rows, a cell that is not a number or more than
+            1000 km away, or latitudes where there is no origin.
     """
     path = Path(path)
     raw = read_cells(path)
@@ -132,6 +134,12 @@ def read_points(path: Path | str, origin: Origin | None = None) -> np.ndarray:
             raise BadInput(f"{path} gives latitude and longitude, and the scene has no [origin] in "
                            "scene.toml; add one, or give x_m and y_m")
         points[:, :2] = np.column_stack(to_local(origin, points[:, 1], points[:, 0]))
+    far = ~(np.abs(points) <= MAX_COORDINATE_M).all(axis=1)
+    if far.any():
+        row = int(np.flatnonzero(far)[0])
+        position = ", ".join(f"{value:g}" for value in points[row])
+        raise BadInput(f"{path}: row {row + 2}: ({position}) m lies too far from the origin of the "
+                       f"local frame; allowed are {-MAX_COORDINATE_M:g} to {MAX_COORDINATE_M:g} m")
     return points
 
 

@@ -1,13 +1,16 @@
 """The truth map: every lattice position, every device, resumable and checked."""
 
+import math
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from radiotwin.budgets import MAP_VALUES
 from radiotwin.errors import BadInput
 from radiotwin.files import require_writable
+from radiotwin.inputs import require_within
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.trace.batches import BatchStore
@@ -42,10 +45,14 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
         RunFailed: No usable libLLVM, or gains that physics does not allow. Nothing is written then.
     """
     index = device_indices(scene, devices)
+    MAP_VALUES.check(len(index) * math.prod(scene.lattice.shape),
+                     f"{scene.folder}: lattice positions times devices")
     require_writable(out_path)
     names = [scene.config.devices[i].device for i in index]
     key = _key(scene, settings)
-    store = BatchStore(scene.folder / "cache", key)
+    cache = require_within(scene.folder, scene.folder / "cache", str(scene.folder))
+    store = BatchStore(cache, key)
+    require_within(scene.folder, store.folder, str(scene.folder))
     finished = _finished(Path(out_path), store.hash, names)
     if finished is not None:
         placed = finished.placed(scene.config.origin)  # the origin does not change the gains
@@ -125,15 +132,15 @@ def device_indices(scene: Scene, devices: list[str] | None) -> list[int]:
     Raises:
         BadInput: The scene has no devices, or not that one.
     """
-    names = [device.device for device in scene.config.devices]
+    names = {device.device: index for index, device in enumerate(scene.config.devices)}
     if not names:
         raise BadInput(f"{scene.folder / 'scene.toml'} declares no devices; add at least one to "
                        "trace from")
     for name in devices or []:
         if name not in names:
             raise BadInput(f"device {name!r} is not in {scene.folder / 'scene.toml'}; it has "
-                           f"{', '.join(names)}")
-    return [names.index(name) for name in dict.fromkeys(devices or names)]
+                           f"{', '.join(list(names)[:20])}" + ", …" * (len(names) > 20))
+    return [names[name] for name in dict.fromkeys(devices or names)]
 
 
 def _key(scene: Scene, settings: SolverSettings) -> dict[str, Any]:

@@ -1,15 +1,16 @@
 """A city in Sionna RT, with isotropic antennas, ready to be solved."""
 
 import logging
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from radiotwin import llvm
 from radiotwin.errors import BadInput
+from radiotwin.files import scratch_folder
 from radiotwin.scene.materials import permittivity, ranges_text
 from radiotwin.scene.reader import read_city
 from radiotwin.scene.writer import write_city
@@ -26,12 +27,20 @@ def library_versions() -> dict[str, str]:
 def import_sionna() -> Any:
     """Return the module `sionna.rt`, on a libLLVM that works.
 
+    Mitsuba looks for its plugins in the working directory first, which may be the folder of a
+    stranger's scene: from now on it looks for them where it is installed, and nowhere else.
+
     Raises:
         RunFailed: No usable libLLVM.
     """
     llvm.prepare()
+    import mitsuba
     import sionna.rt
 
+    own = mitsuba.FileResolver()
+    own.clear()
+    own.append(os.path.dirname(os.path.realpath(mitsuba.__file__)))
+    mitsuba.set_file_resolver(own)  # type: ignore[operator]  # as its stub says
     return sionna.rt
 
 
@@ -66,10 +75,10 @@ def load_city(xml_path: Path | str | None, frequency_hz: float) -> Any:
 
 def _load_copy(rt: Any, xml_path: Path) -> Any:
     shapes = read_city(xml_path)
-    with TemporaryDirectory(ignore_cleanup_errors=True) as folder:
+    with scratch_folder() as folder:
         write_city(folder, shapes)
         try:
-            return rt.load_scene(str(Path(folder) / "city.xml"))
+            return rt.load_scene(str(folder / "city.xml"))
         except (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OSError,
                 SyntaxError) as error:
             raise BadInput(f"{xml_path}: Sionna RT cannot read it ({str(error).strip()}); "

@@ -1,3 +1,5 @@
+import os
+
 import numpy as np
 import pytest
 
@@ -71,5 +73,30 @@ def test_broken_patterns(tmp_path, name, text, message):
 
 
 def test_no_pattern(tmp_path):
-    with pytest.raises(BadInput, match="is not a file"):
+    with pytest.raises(BadInput, match="none.msi does not exist"):
         read_pattern(tmp_path / "none.msi")
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_grid_is_counted_before_it_is_made(tmp_path):
+    """Seen: 40,000 rows, no two with a common angle, are a grid of 1.6 billion cells."""
+    rows = "\n".join(f"{i / 1000},{i / 1000 - 20},1" for i in range(40_000))
+    with pytest.raises(BadInput, match="40000 rows are no full grid of 40000 elevations and 40000 azimuths"):
+        read_pattern(write(tmp_path, "azimuth_deg,elevation_deg,gain_dbi\n" + rows, "a.csv"))
+
+
+def test_no_gain_is_higher_than_the_peak(tmp_path):
+    """Rationale: beyond a grid of elevations, a line through its last two may lead anywhere."""
+    text = "azimuth_deg,elevation_deg,gain_dbi\n" + "\n".join(
+        f"{a},{e},{g}" for a in (-1e-20, 90) for e, g in ((0, 0), (1e-6, 60)))
+    pattern = read_pattern(write(tmp_path, text, "a.csv"))
+    assert pattern.at([0, 45, 359], [90, 45, -90]).tolist() == [60, 60, 0]
+
+
+def test_pipes_and_large_files_are_refused(tmp_path, monkeypatch):
+    os.mkfifo(tmp_path / "p.msi")
+    with pytest.raises(BadInput, match="not a regular file"):
+        read_pattern(tmp_path / "p.msi")
+    monkeypatch.setenv("RADIOTWIN_MAX_DOCUMENT_BYTES", "100")
+    with pytest.raises(BadInput, match="at most 100"):
+        read_pattern(write(tmp_path, msi()))

@@ -26,3 +26,18 @@ def test_positions_and_their_indices_agree():
 def test_a_position_off_the_lattice_is_refused():
     with pytest.raises(BadInput, match="not on the lattice"):
         Lattice.over(0, 40, 0, 40, 20, [50]).index_of(np.array([[20.0, 25.0, 50.0]]))
+
+
+def test_a_lattice_has_a_budget_before_it_has_memory():
+    with pytest.raises(BadInput, match=r"1e\+18 positions; at most 10,000,000 .* RADIOTWIN_MAX_POSITIONS"):
+        Lattice.over(0, 1e6, 0, 1e6, 1e-3, [50.0])
+    with pytest.raises(BadInput, match="positions"):
+        Lattice.over(0, 1e308, -1e308, 0, 1e-9, [50.0])
+
+
+def test_index_of_many_positions_takes_little_memory():
+    lattice = Lattice.over(0, 1999, 0, 4, 1, [10.0, 20.0])
+    order = np.random.default_rng(0).permutation(len(lattice.positions_m))
+    assert (lattice.index_of(lattice.positions_m[order] + 0.009) == order).all()
+    with pytest.raises(BadInput, match="not on the lattice"):
+        lattice.index_of(np.array([[0.0, np.nan, 10.0]]))

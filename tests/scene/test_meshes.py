@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.meshes import clean, load_shape, read_obj
+from radiotwin.scene.meshes import clean, load_shape, load_shapes, read_obj
 from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
 
 
@@ -122,3 +122,53 @@ def test_clean_welds_and_drops_slivers():
     assert (
         len({tuple(sorted(pair)) for face in kept for pair in zip(face, np.roll(face, 1))}) == 5
     )  # one shared
+
+
+def triangle(vertices="0 0 0\n1 0 0\n0 1 0\n", face="3 0 1 2\n"):
+    return ("ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+            f"element face 1\nproperty list uchar int vertex_indices\nend_header\n{vertices}{face}")
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("text", "message"), [
+    (triangle(vertices="0 0 0\n1 nan 0\n0 1 0\n"), "vertex 2 is not finite"),
+    (triangle(vertices="0 0 0\n1 1e400 0\n0 1 0\n"), "vertex 2 is not finite"),
+    (triangle(vertices="0 0 0\n1 1e300 0\n0 1 0\n"), "vertex 2 is 1e[+]300 from the origin"),
+    (triangle(face="3 0 1 -1\n"), "names vertex -1, there are 3"), (triangle(face="3 0 1 3\n"), "names vertex 3"),
+])
+def test_what_no_mesh_may_say(empty_city, text, message):
+    empty_city.add("a", None, text=text)
+    with pytest.raises(BadInput, match=message):
+        load_shape(read_mitsuba_xml(empty_city.write()).shapes[0])
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(("shape", "message"), [
+    ('<shape type="cube"><transform><scale value="1e300"/></transform></shape>', "line 3, after the transform"),
+    ('<shape type="sphere"><float name="radius" value="1e308"/></shape>', "line 3: a radius of 1e[+]308"),
+    ('<shape type="sphere"><point name="center" x="east"/></shape>', "line 3: <point> has 'east'"),
+    ('<shape type="ply"><string name="filename" value="%s"/></shape>' % ("a" * 300), "leads out of|does not exist"),
+])
+def test_what_no_shape_may_say(empty_city, shape, message):
+    with pytest.raises(BadInput, match=message):
+        load_shape(only_shape(empty_city, shape))
+
+
+def test_one_mesh_named_many_times_has_one_budget(empty_city, monkeypatch):
+    for number in range(4):
+        empty_city.add(f"a{number}", None, text=triangle())
+    shapes = read_mitsuba_xml(empty_city.write()).shapes
+    assert len(list(load_shapes(shapes, empty_city.path))) == 4
+    monkeypatch.setenv("RADIOTWIN_MAX_VERTICES", "10")
+    with pytest.raises(BadInput, match="town.xml with its meshes: 12 vertices; at most 10"):
+        list(load_shapes(shapes, empty_city.path))
+    monkeypatch.setenv("RADIOTWIN_MAX_SHAPES", "3")
+    with pytest.raises(BadInput, match="4 shapes; at most 3"):
+        read_mitsuba_xml(empty_city.path)
+
+
+@pytest.mark.parametrize("text", ["v 0 0 0 \nf 1 1 " + "9" * 30, "v 0 0 0\nf 1 1 " + "9" * 5000, "f 1\nf 1 1 1/x\nf x"])
+def test_obj_indices_of_many_digits(tmp_path, text):
+    (tmp_path / "a.obj").write_text(text)
+    with pytest.raises(BadInput, match="row [23]"):
+        read_obj(tmp_path / "a.obj")

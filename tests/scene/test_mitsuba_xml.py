@@ -116,7 +116,36 @@ def test_merged_shapes_are_opened_and_cameras_passed_over(tmp_path):
     assert [shape.name for shape in read_mitsuba_xml(path).shapes] == ["a", "b"]
 
 
-def test_deeply_nested_merges(tmp_path):
-    deep = 5_000
+@pytest.mark.parametrize(("deep", "allowed"), [(90, True), (5_000, False)])
+def test_deeply_nested_merges(tmp_path, deep, allowed):
     merge = '<shape type="merge">' * deep + '<shape type="cube" id="a"/>' + "</shape>" * deep
-    assert [shape.name for shape in read_mitsuba_xml(write(tmp_path, merge)).shapes] == ["a"]
+    path = write(tmp_path, merge)
+    if allowed:
+        assert [shape.name for shape in read_mitsuba_xml(path).shapes] == ["a"]
+        return
+    with pytest.raises(BadInput, match="levels of nesting; at most 100 .* RADIOTWIN_MAX_NESTING"):
+        read_mitsuba_xml(path)
+
+
+def test_parameters_that_double(tmp_path):
+    """Seen: 60 lines stood for 10^18 characters."""
+    doubles = "".join(f'<default name="a{i}" value="{f"$a{i - 1}" * 2}"/>' for i in range(1, 60))
+    path = write(tmp_path, f'<default name="a0" value="{"x" * 1000}"/>{doubles}<shape type="cube" id="$a59"/>')
+    with pytest.raises(BadInput, match="with its parameters: .* bytes; at most 134,217,728"):
+        read_mitsuba_xml(path)
+
+
+def test_files_that_include_many_times(tmp_path, monkeypatch):
+    for depth in range(12):
+        write(tmp_path, f'<include filename="a{depth + 1}.xml"/>' * 9, f"a{depth}.xml")
+    write(tmp_path, '<shape type="cube"/>', "a12.xml")
+    assert len(read_mitsuba_xml(tmp_path / "a11.xml").shapes) == 9
+    with pytest.raises(BadInput, match="1,001 files that include each other; at most 1,000"):
+        read_mitsuba_xml(tmp_path / "a0.xml")
+
+
+def test_many_folders_and_long_names(tmp_path):
+    with pytest.raises(BadInput, match="101 folders to search; at most 100"):
+        read_mitsuba_xml(write(tmp_path, "".join(f'<path value="p{i}"/>' for i in range(200))))
+    with pytest.raises(BadInput, match="is not the name of a file: it has 5,000 characters"):
+        read_mitsuba_xml(write(tmp_path, f'<shape type="ply"><string name="filename" value="{"a" * 5000}"/></shape>'))

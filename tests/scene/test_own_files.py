@@ -10,6 +10,7 @@ from radiotwin.scene import Scene
 from radiotwin.scene.build import build_scene
 from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
 from radiotwin.scene.ply import read_ply
+from radiotwin.trace import SolverSettings, trace_map
 
 
 def with_mesh(city, name, to):
@@ -90,7 +91,7 @@ def test_no_way_leads_out_of_a_scene_folder(small_scene, tmp_path, spoil):
 
 def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "a.ply")
-    with pytest.raises(BadInput, match="not an ordinary file"):
+    with pytest.raises(BadInput, match="not a regular file"):
         read_ply(tmp_path / "a.ply")
 
 
@@ -104,3 +105,29 @@ def test_headers_that_promise_too_much(tmp_path, form, lines):
     (tmp_path / "a.ply").write_bytes(f"ply\nformat {form} 1.0\n{lines}\nend_header\n".encode() + body)
     with pytest.raises(BadInput, match="truncated|not a PLY header line|no vertex|text where a number"):
         read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("what", ["city.xml", "scene.toml", "meshes/ground.ply"])
+@pytest.mark.parametrize("spoil", ["pipe", "device", "folder"])
+def test_every_file_of_a_scene_is_a_regular_one(small_scene, tmp_path, what, spoil):
+    folder = tmp_path / "scene"
+    shutil.copytree(small_scene.folder, folder, ignore=shutil.ignore_patterns("cache"))
+    (folder / what).unlink()
+    if spoil == "pipe":
+        os.mkfifo(folder / what)
+    elif spoil == "device":
+        (folder / what).symlink_to("/dev/zero")
+    else:
+        (folder / what).mkdir()
+    with pytest.raises(BadInput, match="not a regular file|is a folder|leads out of"):
+        Scene.load(folder)
+
+
+def test_a_trace_writes_nothing_outside(small_scene, tmp_path):
+    folder = tmp_path / "scene"
+    shutil.copytree(small_scene.folder, folder, ignore=shutil.ignore_patterns("cache"))
+    (tmp_path / "elsewhere").mkdir()
+    (folder / "cache").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(BadInput, match="cache leads out of"):
+        trace_map(Scene.load(folder), SolverSettings(), tmp_path / "truth.nc")
+    assert not list((tmp_path / "elsewhere").iterdir())

@@ -1,3 +1,5 @@
+import time
+
 import numpy as np
 import pytest
 
@@ -111,3 +113,22 @@ def test_step(side_m, step_m):
 
 def test_extent_lies_on_the_lattice():
     assert choose_extent((-755.2, 655.1, -648, 480)).bounds == (-760, 660, -660, 480)
+
+
+def test_many_devices_and_uavs_take_little_time():
+    extent = Extent(x_min_m=0, x_max_m=3000, y_min_m=0, y_max_m=3000)
+    grid = BuiltGrid.over(extent, None)
+    began_s = time.monotonic()
+    devices = place_devices(2_000, grid, None, np.random.default_rng(0))
+    uavs = place_uavs(2_000, extent, LatticeConfig(altitudes_m=[50.0, 60.0]), None)
+    assert time.monotonic() - began_s < 10
+    assert len({(device.x_m, device.y_m) for device in devices}) == 2_000 and len(uavs) == 2_000
+    for call in (lambda: place_devices(10**9, grid, None, np.random.default_rng(0)),
+                 lambda: place_uavs(10**9, extent, LatticeConfig(altitudes_m=[50.0]), None)):
+        with pytest.raises(BadInput, match="1,000,000,000 .* at most"):
+            call()
+
+
+def test_an_extent_like_a_line_is_refused():
+    with pytest.raises(BadInput, match="an extent of 100000 x 0.001 m is but a line"):
+        BuiltGrid.over(Extent(x_min_m=0, x_max_m=1e5, y_min_m=0, y_max_m=1e-3), None)

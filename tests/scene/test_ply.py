@@ -87,3 +87,55 @@ def test_what_is_no_ply(tmp_path, data, message):
     (tmp_path / "a.ply").write_bytes(data)
     with pytest.raises(BadInput, match=message):
         read_ply(tmp_path / "a.ply")
+
+
+def ply(form, body, vertices=3, faces=1, indices="property list uchar int vertex_indices"):
+    return (f"ply\nformat {form} 1.0\nelement vertex {vertices}\nproperty float x\nproperty float y\n"
+            f"property float z\nelement face {faces}\n{indices}\nend_header\n").encode() + body
+
+
+CORNERS = b"0 0 0\n1 0 0\n0 1 0\n"
+
+
+@pytest.mark.parametrize(("data", "message"), [
+    (ply("ascii", CORNERS + b"nan 0 1 2\n"), "row 1 of 'face'"),
+    (ply("ascii", CORNERS + b"-1 0 1 2\n"), "row 1 of 'face'"),
+    (ply("ascii", CORNERS + b"3 0 1 " + b"9" * 30 + b"\n"), "row 1 of 'face'"),
+    (ply("ascii", CORNERS + b"3 0 1 " + b"9" * 5000 + b"\n"), "row 1 of 'face'"),
+    (ply("ascii", CORNERS + b"9" * 30 + b" 0 1 2\n"), "truncated"),
+    (ply("ascii", b"", indices="property list float int vertex_indices"), "line 8: .* not a PLY header line"),
+    (ply("ascii", b"", indices="property list uchar float vertex_indices"), "line 8: .* not a PLY header line"),
+    (ply("ascii", b"", indices="property int vertex_indices"), "line 8: .* not a PLY header line"),
+    (ply("ascii", b"", indices="property list uchar int x\nproperty list uchar int x"), "declares .* twice"),
+    (ply("binary_little_endian", b"", indices="property list float int vertex_indices"), "line 8"),
+    (ply("binary_little_endian", bytes(36) + struct.pack("<b3i", -1, 0, 1, 2),
+         indices="property list char int vertex_indices"), "truncated"),
+    (ply("binary_little_endian", bytes(36), vertices=10**12), "truncated: its header promises 1000000000000"),
+    (ply("ascii", b"", vertices="9" * 5000), "line 3"),
+])
+def test_numbers_that_no_mesh_has(tmp_path, data, message):
+    (tmp_path / "a.ply").write_bytes(data)
+    with pytest.raises(BadInput, match=message) as error:
+        read_ply(tmp_path / "a.ply")
+    assert len(str(error.value)) < 400 + len(str(tmp_path))
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary_little_endian"])
+@pytest.mark.parametrize(("variable", "message"), [
+    ("VERTICES", "3 vertices; at most 2"), ("CORNERS", "3 corners in one face; at most 2"),
+    ("FILE_BYTES", "bytes; at most 2"), ("COLUMNS", "columns; at most 2")])
+def test_budgets(tmp_path, monkeypatch, form, variable, message):
+    binary = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes() + struct.pack("<B3i", 3, 0, 1, 2)
+    (tmp_path / "a.ply").write_bytes(ply(form, CORNERS + b"3 0 1 2\n" if form == "ascii" else binary))
+    read_ply(tmp_path / "a.ply")
+    monkeypatch.setenv(f"RADIOTWIN_MAX_{variable}", "2")
+    with pytest.raises(BadInput, match=f"{message} .*RADIOTWIN_MAX_{variable}"):
+        read_ply(tmp_path / "a.ply")
+
+
+def test_a_long_ragged_face_is_refused_before_it_is_unpacked(tmp_path):
+    body = bytes(36) + struct.pack("<I3iI", 3, 0, 1, 2, 20_000) + bytes(80_000)
+    (tmp_path / "a.ply").write_bytes(ply("binary_little_endian", body, faces=2,
+                                         indices="property list uint int vertex_indices"))
+    with pytest.raises(BadInput, match="20,000 corners in one face; at most 10,000"):
+        read_ply(tmp_path / "a.ply")

@@ -14,7 +14,7 @@ from radiotwin.scene.writer import write_city
 FOREIGN = """
   <integrator type="no-such-plugin"/>
   <emitter type="envmap"><string name="filename" value="/etc/passwd"/></emitter>
-  <texture type="bitmap" id="t"><string name="filename" value="../../secret.png"/></texture>
+  <sensor type="no-such-plugin"><film type="hdrfilm"><include filename="/etc/passwd"/></film></sensor>
 </scene>"""
 
 

@@ -104,12 +104,12 @@ def test_cells_have_no_directions(with_antennas, tmp_path):
 
 
 @pytest.mark.parametrize(("old", "new", "message"), [
-    ("antennas/sector.csv", "antennas/none.csv", "none.csv is not a file"),
-    ("antennas/sector.csv", "../sector.csv", "leads out of"),
+    ("antennas/sector.csv", "antennas/none.csv", "none.csv does not exist"),
+    ("antennas/sector.csv", "../sector.csv", "below the scene folder"),
     ("antennas/sector.csv", "city.xml", "unknown format '.xml' of an antenna"),
     ('antenna = "antennas/sector.csv"\n', "", "azimuth_deg and tilt_deg belong to an antenna"),
     ("azimuth_deg = 90", "azimuth_deg = 900", "azimuth_deg = 900"),
-    ('uav = "uav0"', 'antenna = "antennas/sector.csv"\nuav = "uav0"', "not valid TOML"),
+    ('uav = "uav0"', 'antenna = "antennas/sector.csv"\nuav = "uav0"', "not readable TOML"),
     ('antenna = "antennas/dipole.csv"\nuav = "uav1"', 'uav = "uav1"', "uavs have different antennas")])
 def test_what_cannot_be_declared(with_antennas, old, new, message):
     path = with_antennas / "scene.toml"

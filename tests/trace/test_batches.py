@@ -1,5 +1,7 @@
 """Batches on disk."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -24,3 +26,28 @@ def test_damaged_file_counts_as_missing(tmp_path, content):
     store = BatchStore(tmp_path, {})
     (store.folder / "batch.npy").write_bytes(content)
     assert store.get("batch", 3) is None
+
+
+@pytest.mark.parametrize("spoil", ["zip", "pickle", "huge", "int", "short", "pipe", "folder"])
+def test_a_batch_of_a_stranger_is_no_batch(tmp_path, spoil):
+    store = BatchStore(tmp_path, {"a": 1})
+    store.put("b", np.arange(4.0))
+    path = store.folder / "b.npy"
+    data = path.read_bytes()
+    path.unlink()
+    if spoil == "zip":
+        np.savez(path.with_suffix(".npz"), np.arange(4.0))
+        path.with_suffix(".npz").rename(path)
+    elif spoil == "pickle":
+        np.save(path, np.array([{}] * 4), allow_pickle=True)
+    elif spoil == "huge":
+        path.write_bytes(data.replace(b"(4,)", b"(4000000000000,)"))
+    elif spoil == "int":
+        np.save(path, np.arange(4))
+    elif spoil == "short":
+        path.write_bytes(data[:-1])
+    elif spoil == "pipe":
+        os.mkfifo(path)
+    else:
+        path.mkdir()
+    assert store.get("b", 4) is None

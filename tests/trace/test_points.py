@@ -101,3 +101,17 @@ def test_points_in_degrees(tmp_path):
         read_points(write(tmp_path / "far.csv", "latitude_deg,longitude_deg,z_m\n1,1,1\n91,0,1\n"), origin)
     with pytest.raises(BadInput, match="column 'longitude_deg' is missing"):
         read_points(write(tmp_path / "half.csv", "latitude_deg,z_m\n1,1\n"), origin)
+
+
+@pytest.mark.parametrize("row", ["1e7,0,1", "0,-1e308,1", "0,0,1e308"])
+def test_points_that_are_too_far_away(tmp_path, row):
+    path = write(tmp_path / "far.csv", f"x_m,y_m,z_m\n0,0,0\n{row}\n")
+    with pytest.raises(BadInput, match=r"far.csv: row 3: .* too far from the origin .* -1e\+06 to 1e\+06 m"):
+        read_points(path)
+
+
+def test_links_have_a_budget(small_scene, law, monkeypatch):
+    monkeypatch.setenv("RADIOTWIN_MAX_ROWS", "5")
+    with pytest.raises(BadInput, match="points times devices: 6 rows; at most 5"):
+        trace_points(small_scene, np.ones((3, 3)), SETTINGS, devices=["d0", "d1"])
+    assert law.calls == 0
