@@ -85,3 +85,4 @@ VERTICES = Budget("VERTICES", 20_000_000, "vertices")  # of a city, as is the ne
 FACES = Budget("FACES", 40_000_000, "faces")
 SHAPES = Budget("SHAPES", 200_000, "shapes")
 DEVICES = Budget("DEVICES", 100_000, "devices")
+FIELD_PAIRS = Budget("FIELD_PAIRS", 200_000_000, "pairs of points")  # 8 bytes each

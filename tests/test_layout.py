@@ -27,7 +27,7 @@ LAYERS = (
     {"radiomap"},
     {"scene"},
     {"antennas", "measurements", "command", "doctor"},
-    {"geodesy", "llvm", "safe_xml", "cells", "console", "progress", "published"},
+    {"array_file", "geodesy", "llvm", "safe_xml", "cells", "console", "progress", "published"},
     {"files", "inputs", "plugins", "tables"},
     {"budgets"},
     {"errors"},
