@@ -86,3 +86,5 @@ FACES = Budget("FACES", 40_000_000, "faces")
 SHAPES = Budget("SHAPES", 200_000, "shapes")
 DEVICES = Budget("DEVICES", 100_000, "devices")
 FIELD_PAIRS = Budget("FIELD_PAIRS", 200_000_000, "pairs of points")  # 8 bytes each
+TRAINING_BYTES = Budget("TRAINING_BYTES", 64 * 2**30, "bytes of memory")  # of a learner
+CHECKPOINT_BYTES = Budget("CHECKPOINT_BYTES", 64 * 2**30, "bytes")

@@ -46,6 +46,21 @@ def require_within(folder: Path, path: Path, source: str) -> Path:
     return path
 
 
+def require_plain(folder: Path) -> None:
+    """Check that a folder holds nothing but regular files and folders, before it is written to.
+
+    Raises:
+        BadInput: a link, a pipe or a device is in it, or in a folder within.
+    """
+    for entry in os.scandir(folder):
+        if entry.is_dir(follow_symlinks=False):
+            require_plain(Path(entry.path))
+        elif not entry.is_file(follow_symlinks=False):
+            kind = "a symbolic link" if entry.is_symlink() else "a pipe or a device"
+            raise BadInput(f"{entry.path} is {kind}; only regular files and folders may be in "
+                           f"{folder}: remove it")
+
+
 def check_input(path: Path | str, what: str = "file", budget: Budget = FILE_BYTES) -> int:
     """Check that a library may open a file: it exists, is regular, and is not too large.
 
