@@ -104,7 +104,8 @@ def _check_table(table: Any, number: int, scene: Scene) -> None:
     config, lattice = scene.config, scene.lattice
     known = {"flight": [f"f{number}"], "receiver": [uav.uav for uav in config.uavs],
              "device": [device.device for device in config.devices]}
-    ranges = {"time_s": (0.0, np.inf), "heading_deg": (0.0, 360.0),
+    slots = max(uav.battery for uav in config.uavs) / HOVER_COST + 1
+    ranges = {"time_s": (0.0, config.mission.slot_s * slots * (number + 1)), "heading_deg": (0.0, 360.0),
               "gain_db": (-MAX_LEVEL_DB, MAX_LEVEL_DB)} | {
         f"receiver_{axis}_m": (values.min(), values.max())
         for axis, values in zip("xyz", (lattice.x_m, lattice.y_m, lattice.z_m), strict=True)}
@@ -118,9 +119,8 @@ def _check_table(table: Any, number: int, scene: Scene) -> None:
             raise Damaged(f"{name} of a measurement is none of this run")
     for name, (low, high) in ranges.items():
         column = table[name]
-        fits = column.between(low, high) & (column < np.inf)
-        if column.dtype != float or not (fits | (column.isna() if name == "gain_db"
-                                                 else False)).all():
+        blank = column.isna() & (name == "gain_db")
+        if column.dtype != float or not (column.between(low, high) | blank).all():
             raise Damaged(f"{name} of a measurement is no number from {low:g} to {high:g}")
 
 

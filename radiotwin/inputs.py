@@ -127,8 +127,11 @@ def read_bytes(path: Path | str, what: str = "file", budget: Budget = FILE_BYTES
         BadInput: as `open_input`.
     """
     with open_input(path, what, budget) as file:
-        data = _read(file, path, budget.limit + 1)  # a file may grow, or lie as those of /proc do
-    budget.check(len(data), path)
+        # Memory for as much as is asked for is taken at once, so no more than the file has.
+        data = _read(file, path, os.fstat(file.fileno()).st_size + 1)
+        while more := _read(file, path, _BLOCK_BYTES):  # it grows, or lies as those of /proc do
+            data += more
+            budget.check(len(data), path)
     return data
 
 
