@@ -83,18 +83,19 @@ def wrong(value):
         yield from (torch.full_like(value, torch.nan), value[None], value.double())
 
 
-def test_every_part_that_is_wrong_is_one_message(small_scene, stopped, tmp_path):
+def test_every_part_that_is_wrong_is_one_message(small_scene, stopped, tmp_path, monkeypatch):
     """Whatever is accepted must be what this run may have written."""
     state, known = load_checkpoint(stopped / NAME), 0
     mission = make_mission(small_scene, segmented_truth(small_scene), Known.anchors(small_scene))
     learner = make_learner(RUN, LEARNER, mission, RUN.real_episodes)
-    allowed = {("strategy", "actions"), ("strategy", "replicas"), ("blocks",)}
+    allowed = {("strategy", "actions"), ("strategy", "replicas"), ("blocks",), ("tables", 0, "gain_db")}
     for path in leaves(state):
         for new in wrong(at(state, path)) if path else ():
             try:
-                save_checkpoint(changed(state, path, new), tmp_path / NAME)
-            except (ValueError, TypeError, KeyError):
+                content = changed(state, path, new)
+            except ValueError:
                 continue  # a table of columns of different lengths
+            monkeypatch.setattr("marl.resume.load_checkpoint", lambda path, content=content: content)
             number = isinstance(at(state, path), int | float) and isinstance(new, int | float)
             try:
                 restored(tmp_path / NAME, RUN, small_scene, learner)

@@ -69,7 +69,7 @@ def check(record, channel, measured):
     try:
         twin = Twin.decode(json.dumps(record), channel, "it")
     except BadInput as error:
-        assert str(error).startswith("it") and len(str(error)) < 1000
+        assert len(str(error)) < 1000
         return "refused"
     twin.encode()
     if not twin.channel.follows_paths:
