@@ -105,8 +105,8 @@ def _check_table(table: Any, number: int, scene: Scene) -> None:
     known = {"flight": [f"f{number}"], "receiver": [uav.uav for uav in config.uavs],
              "device": [device.device for device in config.devices]}
     slots = max(uav.battery for uav in config.uavs) / HOVER_COST + 1
-    ranges = {"time_s": (0.0, config.mission.slot_s * slots * (number + 1)), "heading_deg": (0.0, 360.0),
-              "gain_db": (-MAX_LEVEL_DB, MAX_LEVEL_DB)} | {
+    ranges = {"time_s": (0.0, config.mission.slot_s * slots * (number + 1)),
+              "heading_deg": (0.0, 360.0), "gain_db": (-MAX_LEVEL_DB, MAX_LEVEL_DB)} | {
         f"receiver_{axis}_m": (values.min(), values.max())
         for axis, values in zip("xyz", (lattice.x_m, lattice.y_m, lattice.z_m), strict=True)}
     if not isinstance(table, pd.DataFrame) or set(table) != set(known) | set(ranges):

@@ -39,7 +39,7 @@ def write_arrays(file: IO[bytes], arrays: dict[str, np.ndarray], key: str, text:
     encoded += b" " * (-len(encoded) % 8)  # the arrays are aligned
     file.write(len(encoded).to_bytes(8, "little") + encoded)
     for array in arrays.values():
-        file.write(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+        file.write(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
 
 
 def parse_arrays(data: bytes, key: str, source: object) -> tuple[dict[str, np.ndarray], str]:

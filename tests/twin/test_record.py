@@ -92,9 +92,9 @@ def test_every_node_wrong_in_every_way(name, schema, measured):
     record, channel = document(name, schema)
     assert check(record, channel, measured) == "accepted"
     every = list(paths(record))
-    rng = np.random.default_rng(schema)  # a fifth of some 2,700 cases, others for each schema
+    rng = np.random.default_rng(schema)  # some of 2,700 cases, others for each schema
     found = [check(replaced(record, path, new), channel, measured)
-             for path in every for new in WRONG if rng.random() < 0.2]
+             for path in every for new in WRONG if rng.random() < 0.05]
     assert found.count("refused") > 4 * found.count("accepted") > 0
 
 
@@ -105,8 +105,9 @@ def test_parameters_of_every_effect_wrong_in_every_way(number, measured):
     part = {name: value for name, value in EFFECTS[number].items() if name != "over"}
     record["effects"] |= {"parts": [part], "shadowing": None}
     assert check(record, channel, measured) == "accepted"
+    rng = np.random.default_rng(number)
     for path in paths(part):
-        for new in WRONG:
+        for new in rng.permutation(np.array(WRONG, dtype=object))[:5]:
             record["effects"]["parts"] = [replaced(part, path, new)]
             check(record, channel, measured)
 
