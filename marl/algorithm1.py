@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from marl.checkpoint import folder_content, load_checkpoint, restore_folder, save_checkpoint
+from marl.checkpoint import NAME, save_checkpoint
 from marl.environment import Environment
 from marl.flights import Flights, Policy, evaluate, fly
 from marl.heuristics import HeuristicPolicy, waypoint_actions
@@ -16,6 +16,7 @@ from marl.learner import Learner, make_learner
 from marl.mission import Known, Mission, make_mission
 from marl.planner import PlanPolicy
 from marl.randomness import stream
+from marl.resume import has_checkpoint, restored
 from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
@@ -83,17 +84,14 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
     known = Known.truth(scene) if true_positions else Known.anchors(scene)
     learner = make_learner(run, learner_settings, reality.mission(known), run.real_episodes,
                            device)
-    checkpoint = folder / "checkpoint.pt" if folder else None
+    checkpoint = folder / NAME if folder else None
     rows, blocks, twin = [], [], None
     try:
         # A run that was stopped before its first checkpoint starts again.
-        if resume and folder and checkpoint and checkpoint.is_file():
-            state = load_checkpoint(checkpoint)
-            rows, blocks, reality.tables = state["rows"], state["blocks"], state["tables"]
-            learner.load_state(state["strategy"])
-            if run.twin != "truth":
-                restore_folder(state["twin"], folder / "twin")
-                twin = Twin.load(folder / "twin")
+        if resume and folder and has_checkpoint(folder):
+            rows, blocks, reality.tables, twin = restored(folder / NAME, run, scene, learner)
+            if twin is not None:
+                twin.save(folder / "twin")
                 known = known if true_positions else Known.of(twin.devices)
             on_progress(run.episodes * len(rows), _summary(rows[-1], run))
             # The run may have been stopped between the checkpoint and the log.
@@ -131,7 +129,9 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
                          "strategy": learner.state(last=number + 1 == run.real_episodes)}
                 if twin is not None:
                     twin.save(folder / "twin")
-                    state["twin"] = folder_content(folder / "twin")
+                    record, channel = twin.encode()
+                    state["twin"] = {"record": record,
+                                     "channel": np.frombuffer(channel, np.uint8)}
                 save_checkpoint(state, checkpoint)
             on_round(rows, blocks)
         real = reality.mission(known)

@@ -1,11 +1,13 @@
 """The mission as arrays: the map, the data to collect, and the knowledge of the UAVs."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from radiotwin.budgets import MAP_VALUES
 from radiotwin.errors import BadInput
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
@@ -19,6 +21,9 @@ MOVES = np.array([(0, 0), (1, 0), (0, -1), (-1, 0), (0, 1), (0, 0)], dtype=np.in
 COSTS = np.array([1, *[round(MOVE_COST / HOVER_COST)] * 4, 0], dtype=np.int64)
 """Battery cost of each action, in whole hovers, so that the battery is counted exactly."""
 MAX_HOVERS = 20_000  # of a battery, which is counted in 16 bits
+# Of what is plausible: beyond it, sums in single precision are no numbers.
+MAX_SNR_DB, MAX_GAIN_DB, MAX_SIGMA_DB = 1e4, 1e3, 100.0
+MAX_UNITS, MAX_SLOT_S = 1e9, 1e6
 
 
 class Mission(NamedTuple):
@@ -132,15 +137,19 @@ def make_mission(scene: Scene, radio_map: RadioMap, known: Known,
     levels = [int(np.abs(lattice.z_m - uav.altitude_m).argmin()) for uav in config.uavs]
     to_snr_db = config.radio.tx_power_dbm - config.radio.noise_dbm
     shape = (len(config.uavs), len(config.devices), *lattice.shape[1:])
+    MAP_VALUES.check(math.prod(shape), f"{scene.folder / 'scene.toml'}: the mission's map")
     snr_db, sigma_db = np.full(shape, -np.inf, np.float32), np.zeros(shape, np.float32)
     for k, device in enumerate(config.devices):
         if device.device not in radio_map.devices:
             continue
         row = radio_map.devices.index(device.device)
         gain_db = radio_map.gain_db[row, levels]
+        _check_values(device.device, "gain_db", gain_db, -MAX_GAIN_DB, MAX_GAIN_DB)
         snr_db[:, k] = np.where(np.isnan(gain_db), -np.inf, gain_db + to_snr_db)
         if "sigma_db" in radio_map.dataset:
-            sigma_db[:, k] = np.nan_to_num(radio_map.dataset["sigma_db"].values[row, levels])
+            own_db = radio_map.dataset["sigma_db"].values[row, levels]
+            _check_values(device.device, "sigma_db", own_db, 0.0, MAX_SIGMA_DB)
+            sigma_db[:, k] = np.nan_to_num(own_db)
     starts, homes = zip(*(_ends(scene, uav, level) for uav, level in zip(config.uavs, levels)))
     origin_m = np.array([lattice.x_m[0], lattice.y_m[0]])
     known_m = np.array([known.position_m.get(d.device, (np.nan, np.nan)) for d in config.devices])
@@ -175,6 +184,13 @@ def _check(scene: Scene, radio_map: RadioMap, assignment: str) -> None:
         if not 1 <= uav.battery / HOVER_COST <= MAX_HOVERS:
             raise BadInput(f"{path}: uav {uav.uav!r}: battery = {uav.battery:g}; a mission allows "
                            f"{HOVER_COST:g} to {MAX_HOVERS * HOVER_COST:g}")
+    mission = config.mission
+    for name, high in (("data_units", MAX_UNITS), ("rate_scale", MAX_UNITS),
+                       ("slot_s", MAX_SLOT_S)):
+        value = getattr(mission, name)
+        if not 1e-6 <= value <= high:
+            raise BadInput(f"{path}: mission.{name} = {value:g}; a mission allows 1e-06 to "
+                           f"{high:g}")
     attributes = radio_map.dataset.attrs
     share, length_m = (attributes.get(name, 1.0)
                        for name in ("shadowing_share", "shadowing_length_m"))
@@ -182,6 +198,14 @@ def _check(scene: Scene, radio_map: RadioMap, assignment: str) -> None:
         raise BadInput(f"the radio map's attributes shadowing_share = {share}, shadowing_length_m "
                        f"= {length_m}: allowed are a share from 0 to 1 and a length above 0; make "
                        "the map again")
+
+
+def _check_values(device: str, name: str, values: np.ndarray, low: float, high: float) -> None:
+    """Refuse values of a device's map that no radio has; NaN is none."""
+    wrong = values[~(np.isnan(values) | ((values >= low) & (values <= high)))]
+    if len(wrong):
+        raise BadInput(f"the radio map's {name} of {device} is {wrong[0]:g} somewhere; allowed are "
+                       f"{low:g} to {high:g} dB; make the map again")
 
 
 def _number(value: object) -> bool:

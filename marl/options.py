@@ -60,8 +60,8 @@ def checked(given: Mapping[str, str], defaults: Settings) -> Settings:
         first = error.errors()[0]
         name = str(first["loc"][0])
         allowed = _allowed(type(defaults).model_fields[name])
-        raise BadInput(f"{_flag(name)} {first['input']}: {first['msg']}; allowed: {allowed}"
-                       ) from None
+        raise BadInput(f"{_flag(name)} {str(first['input'])[:60]}: {first['msg']}; "
+                       f"allowed: {allowed}") from None
 
 
 def settings_of(given: Mapping[str, str]) -> tuple[RunSettings, LearnerSettings]:

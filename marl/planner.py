@@ -17,6 +17,7 @@ from marl.flights import Policy
 from marl.learner import Learner, Setup
 from marl.mission import COSTS, EAST, HOVER, MOVES, NO_OP, NORTH, SOUTH, WEST, Mission
 from marl.randomness import stream
+from marl.stored import require_fields, require_plan
 from radiotwin.progress import progress
 
 MAX_WAYPOINTS = 8  # of a UAV
@@ -107,7 +108,8 @@ class Planner(Learner):
 
     @override
     def load_state(self, state: dict) -> None:
-        self._actions = state["actions"]
+        require_fields(state, ("actions",))
+        self._actions = require_plan(state["actions"], self.setup.mission)
 
 
 def plan(mission: Mission, iterations: int, seed: int) -> Plan:

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 from typing_extensions import override
 
+from marl.checkpoint import Damaged
 from marl.environment import ACTION_COUNT, Frame
 from marl.features import global_state, observation_size, observe, state_size
 from marl.flights import Flights, Policy, evaluate
@@ -23,6 +24,7 @@ from marl.planner import PlanPolicy, plan
 from marl.randomness import stream
 from marl.replicas import Replicas
 from marl.settings import LearnerSettings
+from marl.stored import require_count, require_fields, require_plan, require_tensors
 from marl.training import AgentPolicy
 from radiotwin.channel.adam import Adam
 
@@ -235,11 +237,19 @@ class QNetworks:
 
     def load_state(self, state: dict) -> None:
         """Go on from a checkpoint."""
-        self.updates = state["updates"]
-        self.optimiser.load_state_dict(state["optimiser"])
-        for name in self.modules:
-            self.modules[name].load_state_dict(state[name])
-            self.targets[name].load_state_dict(state[f"target_{name}"])
+        targets = {f"target_{name}": module for name, module in self.targets.items()}
+        modules = self.modules | targets
+        require_fields(state, ("updates", "optimiser", *modules))
+        self.updates = require_count(state["updates"])
+        moments = require_fields(state["optimiser"], ("count", "mean", "square"))
+        require_count(moments["count"])
+        for name in ("mean", "square"):
+            like = getattr(self.optimiser, name)
+            given = {str(number): tensor for number, tensor in enumerate(moments[name])}
+            require_tensors(given, {str(number): tensor for number, tensor in enumerate(like)})
+        self.optimiser.load_state_dict(moments)
+        for name, module in modules.items():
+            module.load_state_dict(require_tensors(state[name], module.state_dict()))
 
 
 def td_lambda_targets(reward: Tensor, best: Tensor, valid: Tensor, discount: float,
@@ -354,11 +364,17 @@ class QMIX(Learner):
 
     @override
     def load_state(self, state: dict) -> None:
-        self._episodes, self._actions = state["episodes"], state["actions"]
-        self.selection_flights = state["selection_flights"]
-        self._best.load_state_dict(state["best"])
-        if state["replicas"] is not None:
-            self._trainers.call("load_state", each=state["replicas"])
+        require_fields(state, ("episodes", "best", "actions", "selection_flights", "replicas"))
+        self._episodes = require_count(state["episodes"])
+        self.selection_flights = require_count(state["selection_flights"])
+        self._best.load_state_dict(require_tensors(state["best"], self._best.state_dict()))
+        if state["actions"] is not None:
+            self._actions = require_plan(state["actions"], self.setup.mission)
+        replicas = state["replicas"]
+        if replicas is not None:
+            if not isinstance(replicas, list) or len(replicas) != self.replicas:
+                raise Damaged(f"{self.replicas} replicas are needed")
+            self._trainers.call("load_state", each=replicas)
 
     @override
     def close(self) -> None:

@@ -1,14 +1,18 @@
 """Replicas of a trainer that train side by side, each in a process of its own."""
 
 import multiprocessing
+import os
 import pickle
+import signal
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
 
-from marl.threads import keep_memory, limit_threads, usable_cores
+from marl.checkpoint import Damaged
+from marl.threads import die_with_parent, keep_memory, limit_threads, usable_cores
 from marl.training import Trainer
 from radiotwin.errors import RunFailed
 
@@ -25,10 +29,16 @@ class Replicas:
 
     def __init__(self, arguments: Sequence[tuple]) -> None:
         here = len(arguments) == 1 or usable_cores() == 1
-        kind = _Local if here else _Remote
-        self._replicas: list[Any] = [kind(*each) for each in arguments]
-        # The threads only wait for the processes.
-        self._pool = None if here else ThreadPoolExecutor(len(arguments))
+        self._replicas: list[Any] = []
+        self._pool: ThreadPoolExecutor | None = None
+        try:
+            for each in arguments:
+                self._replicas.append(_Local(*each) if here else _Remote(*each))
+            if not here:  # the threads only wait for the processes
+                self._pool = ThreadPoolExecutor(len(arguments))
+        except BaseException:  # interrupted, too
+            self.close()
+            raise
 
     def call(self, method: str, *arguments: Any, each: list | None = None) -> list:
         """Call a method of all trainers at once.
@@ -53,11 +63,13 @@ class Replicas:
         return [call.result() for call in calls]
 
     def close(self) -> None:
-        """End the processes."""
+        """End the processes, whatever they do."""
         for replica in self._replicas:
-            replica.close()
+            replica.kill()
         if self._pool is not None:
             self._pool.shutdown()
+        for replica in self._replicas:
+            replica.close()
 
 
 class _Local:
@@ -66,6 +78,9 @@ class _Local:
 
     def call(self, method: str, *arguments: Any) -> Any:
         return getattr(self._trainer, method)(*arguments)
+
+    def kill(self) -> None:
+        pass
 
     def close(self) -> None:
         pass
@@ -76,8 +91,11 @@ class _Remote:
         # A forked process would inherit the locks of threads that it does not have.
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
-        self._process = context.Process(target=_serve, args=(other, arguments), daemon=True)
-        self._process.start()
+        self._process = context.Process(target=_serve, args=(other, os.getpid(), arguments),
+                                        daemon=True)
+        # Ctrl-C reaches all processes of a terminal; this one alone answers it.
+        with _without_interrupts():
+            self._process.start()
         other.close()
 
     def call(self, method: str, *arguments: Any) -> Any:
@@ -85,21 +103,43 @@ class _Remote:
             _send(self._pipe, (method, arguments))
             done, result = _receive(self._pipe)
         except (EOFError, OSError):
+            self._process.join(timeout=1)
+            if self._process.exitcode == -signal.SIGTERM:  # sent to all, and to this one as well
+                raise SystemExit(128 + signal.SIGTERM) from None
             raise RunFailed("a process that trains a replica has ended, perhaps for lack of "
                             "memory; start the same command with --resume to go on from the last "
                             "checkpoint") from None
+        if isinstance(result, Damaged):
+            raise result
         if not done:
             raise RuntimeError(f"in a replica's process:\n{result}")
         return result
 
+    def kill(self) -> None:
+        if self._process.pid is not None:
+            self._process.kill()
+            self._process.join()
+
     def close(self) -> None:
         self._pipe.close()
-        self._process.join(timeout=10)
-        self._process.kill()
 
 
-def _serve(pipe: Connection, arguments: tuple) -> None:
-    """Answer calls until the other end of the pipe closes."""
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Block Ctrl-C, which a process that is started meanwhile inherits; this one gets it later."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _serve(pipe: Connection, parent: int, arguments: tuple) -> None:
+    """Answer calls until the other end of the pipe closes, or the parent dies."""
+    die_with_parent(parent)
     limit_threads(1)
     keep_memory()
     trainer = Trainer(*arguments)
@@ -108,6 +148,8 @@ def _serve(pipe: Connection, arguments: tuple) -> None:
             method, call = _receive(pipe)
             try:
                 answer = True, getattr(trainer, method)(*call)
+            except Damaged as error:
+                answer = False, error
             except Exception:
                 answer = False, traceback.format_exc()
             _send(pipe, answer)

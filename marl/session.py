@@ -18,10 +18,12 @@ from marl.mission import Known, Mission, make_mission
 from marl.randomness import stream
 from marl.registry import learner_class
 from marl.settings import LearnerSettings, RunSettings
+from marl.sizes import check_sizes
 from marl.threads import keep_memory, limit_threads, torch_device
 from radiotwin.console import print_rows
-from radiotwin.errors import BadInput
-from radiotwin.files import atomic_path
+from radiotwin.errors import BadInput, RunFailed
+from radiotwin.files import atomic_file, atomic_path, is_temporary
+from radiotwin.inputs import read_bytes, read_json, require_plain
 from radiotwin.progress import progress
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
@@ -61,7 +63,8 @@ class Session:
         truth = read_truth(scene, self.run.truth)
         scene.check_map(truth)
         # Complain before anything is written.
-        make_mission(scene, truth, Known.truth(scene), self.run.assignment)
+        mission = make_mission(scene, truth, Known.truth(scene), self.run.assignment)
+        check_sizes(self.run, self.learner, mission)
         device = torch_device(self.run.device)
         self._claim_folder(_world(scene, truth))
         runs: dict[str, RunSettings] = {self.run.twin: self.run}
@@ -84,27 +87,32 @@ class Session:
         path, config = self.out / "config.json", self._config() | {"world": world}
         if self.resume:
             try:
-                before = json.loads(path.read_text(encoding="utf-8"))
-            except (OSError, ValueError):
+                before = read_json(path)
+                if not isinstance(before, dict) or not all(
+                        isinstance(before.get(group), dict) for group in config):
+                    raise BadInput("a part is missing")
+            except BadInput:
                 raise BadInput(f"{path} is not there or damaged, so there is nothing to resume in "
                                f"{self.out}; start the run without --resume") from None
             for group in config:
                 for name, value in config[group].items():
-                    if before.get(group, {}).get(name) == value:
+                    if before[group].get(name) == value:
                         continue
                     if group == "world":
                         raise BadInput(f"the {name} has changed since the run in {self.out} was "
                                        "started; put it back, or give another --out")
                     raise BadInput(
                         f"--{name.replace('_', '-')} {value}: the run in {self.out} was started "
-                        f"with {before.get(group, {}).get(name)}; resume it with the options that "
-                        "it was started with, or give another --out")
+                        f"with {str(before[group].get(name))[:200]}; resume it with the options "
+                        "that it was started with, or give another --out")
+            require_plain(self.out)
             return
-        if self.out.exists() and (not self.out.is_dir() or any(self.out.iterdir())):
+        if self.out.exists() and (not self.out.is_dir() or any(
+                not is_temporary(each) for each in self.out.iterdir())):
             raise BadInput(f"{self.out} exists and is not an empty folder; --resume goes on with "
                            "the run in it, --out names another folder")
-        with atomic_path(path) as temporary:
-            temporary.write_text(json.dumps(config, indent=1), encoding="utf-8")
+        with atomic_file(path) as file:
+            file.write(json.dumps(config, indent=1).encode())
 
     def _config(self) -> dict:
         return {"run": self.run.model_dump(mode="json"),
@@ -165,7 +173,7 @@ def _entry(method: str, twin: str, row: dict) -> dict:
 
 def _world(scene: Scene, truth: RadioMap) -> dict[str, str]:
     """Return hashes of what must not change before a run is resumed."""
-    declared = hashlib.sha256((scene.folder / "scene.toml").read_bytes()).hexdigest()
+    declared = hashlib.sha256(read_bytes(scene.folder / "scene.toml")).hexdigest()
     measured = hashlib.sha256(np.ascontiguousarray(truth.gain_db).tobytes()).hexdigest()
     return {"city": scene.content_hash(), "scene.toml": declared, "truth": measured}
 
@@ -180,6 +188,15 @@ class _Log:
     def __call__(self, rows: list[dict], blocks: list[dict]) -> None:
         with atomic_path(self._folder / "metrics.csv") as temporary:
             pd.DataFrame(rows).to_csv(temporary, index=False)
+        try:
+            self._log(rows, blocks)
+        except OSError as error:
+            raise RunFailed(f"cannot write {self._folder / 'tensorboard'}: "
+                            f"{error.strerror or error}; the finished rounds are kept: make room, "
+                            "and go on with --resume") from error
+
+    def _log(self, rows: list[dict], blocks: list[dict]) -> None:
+        """Add to the TensorBoard events."""
         if self._writer is None:
             from torch.utils.tensorboard import SummaryWriter
 

@@ -30,7 +30,8 @@ class LearnerSettings(BaseModel):
         True, description="choose the target's action with the online network")
     batch: int = Field(32, ge=1, le=10_000, description="flights in an update")
     replay: int = Field(2000, ge=1, le=1_000_000, description="flights in the replay memory")
-    target_every: int = Field(50, ge=1, description="updates between copies to the target network")
+    target_every: int = Field(
+        50, ge=1, le=10**9, description="updates between copies to the target network")
     episodes_per_update: int = Field(4, ge=1, le=10_000, description="flights between updates")
     parallel: int = Field(20, ge=1, le=10_000, description="flights flown side by side")
     first_epsilon: float = Field(
@@ -39,16 +40,17 @@ class LearnerSettings(BaseModel):
     excursion_slots: float = Field(
         4.0, ge=1, le=1000, description="mean slots that exploration keeps a random action")
     epsilon_slots: int = Field(
-        175_000, ge=0, description="slots over which the share falls linearly")
+        175_000, ge=0, le=10**12, description="slots over which the share falls linearly")
     federate_every: int = Field(
-        100, ge=1, description="episodes of a replica between averages (fedqmix), and between "
-        "evaluations of the policy")
+        100, ge=1, le=10**9, description="episodes of a replica between averages (fedqmix), and "
+        "between evaluations of the policy")
     selection_flights: int = Field(
         64, ge=0, le=100_000, description="flights of such an evaluation, in the map that is "
         "trained in; the best policy of a round flies. 0: the last one flies")
     federate_all: bool = Field(
         True, description="average target networks and the optimiser's moments, too (fedqmix)")
-    reward_scale: float = Field(1000.0, gt=0, description="data units that make a reward of 1")
+    reward_scale: float = Field(
+        1000.0, ge=1e-6, le=1e12, description="data units that make a reward of 1")
 
 
 PRESETS = {

@@ -6,12 +6,13 @@ from typing import Any, Protocol
 import numpy as np
 import torch
 
-from marl.environment import Environment, Frame, empty_frame
+from marl.environment import ACTION_COUNT, Environment, Frame, empty_frame
 from marl.features import observe
 from marl.flights import Flights, fly
-from marl.mission import Mission
+from marl.mission import MAX_SNR_DB, Mission
 from marl.randomness import stream
 from marl.settings import LearnerSettings
+from marl.stored import require_array, require_count, require_fields, require_generator
 
 GUIDED_SHARE = 0.25  # of the training flights, with the planner's help
 
@@ -144,8 +145,10 @@ class Trainer:
 
     def load_state(self, state: dict) -> None:
         """Go on from a checkpoint."""
-        self.episodes, self.slots = state["episodes"], state["slots"]
-        self._rng.bit_generator.state = state["rng"]
+        require_fields(state, ("episodes", "slots", "rng", "learner", "replay"))
+        self.episodes = require_count(state["episodes"])
+        self.slots = require_count(state["slots"])
+        self._rng.bit_generator.state = require_generator(state["rng"])
         self.networks.load_state(state["learner"])
         self.replay.load_state(state["replay"])
 
@@ -263,6 +266,14 @@ class Replay:
         self._flights = Flights(
             empty_frame(shape, mission), np.zeros((*shape, mission.uavs), np.int8),
             np.zeros((*shape, mission.uavs), np.float32), np.zeros(capacity, np.int32))
+        waiting = mission.data_units.astype(np.float32)
+        # Of what may be read from a checkpoint.
+        self._ranges = {
+            "cell": (0, np.array(mission.steps_home.shape[1:]) - 1),
+            "battery": (0, mission.battery), "snr_db": (-np.inf, MAX_SNR_DB),
+            "data_units": (0, waiting), "assigned": (-1, mission.devices - 1),
+            "action": (0, ACTION_COUNT - 1), "collected": (0, waiting.max()),
+            "length": (1, mission.longest)}
 
     def add(self, flights: Flights) -> None:
         """Replace the oldest flights by new ones."""
@@ -291,9 +302,12 @@ class Replay:
 
     def load_state(self, state: dict) -> None:
         """Go on from a checkpoint."""
-        self._next, self.size = int(state["next"]), int(state["size"])
-        for name, array in _arrays(self._flights).items():
-            array[:self.size] = state[name]
+        arrays = _arrays(self._flights)
+        require_fields(state, ("next", "size", *arrays))
+        size = require_count(state["size"], self.capacity)
+        for name, array in arrays.items():
+            array[:size] = require_array(state[name], array[:size], *self._ranges[name])
+        self._next, self.size = require_count(state["next"], self.capacity - 1), size
 
 
 def _arrays(flights: Flights) -> dict[str, np.ndarray]:

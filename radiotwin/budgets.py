@@ -98,3 +98,6 @@ TAG_BYTES = Budget("TAG_BYTES", 8 * 2**20, "bytes in one tag")  # of XML
 FILES = Budget("FILES", 1_000, "files that include each other")  # of a Mitsuba file
 SEARCH_FOLDERS = Budget("SEARCH_FOLDERS", 100, "folders to search")  # of a Mitsuba file
 CORNERS = Budget("CORNERS", 10_000, "corners in one face")  # cutting it takes their square
+FIELD_PAIRS = Budget("FIELD_PAIRS", 200_000_000, "pairs of points")  # 8 bytes each
+TRAINING_BYTES = Budget("TRAINING_BYTES", 64 * 2**30, "bytes of memory")  # of a learner
+CHECKPOINT_BYTES = Budget("CHECKPOINT_BYTES", 64 * 2**30, "bytes")

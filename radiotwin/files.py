@@ -28,6 +28,11 @@ _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 _TEMPORARY = re.compile(r"\.radiotwin-[a-z0-9_]{8}(?P<aside>-aside)?")
 
 
+def is_temporary(path: Path) -> bool:
+    """Return whether a path has the name of a temporary, which a killed process may have left."""
+    return _TEMPORARY.fullmatch(path.name) is not None
+
+
 def require_writable(path: Path | str) -> None:
     """Check that a file can be written; call it before long work.
 

@@ -46,6 +46,21 @@ def require_within(folder: Path, path: Path, source: str) -> Path:
     return path
 
 
+def require_plain(folder: Path) -> None:
+    """Check that a folder holds nothing but regular files and folders, before it is written to.
+
+    Raises:
+        BadInput: a link, a pipe or a device is in it, or in a folder within.
+    """
+    for entry in os.scandir(folder):
+        if entry.is_dir(follow_symlinks=False):
+            require_plain(Path(entry.path))
+        elif not entry.is_file(follow_symlinks=False):
+            kind = "a symbolic link" if entry.is_symlink() else "a pipe or a device"
+            raise BadInput(f"{entry.path} is {kind}; only regular files and folders may be in "
+                           f"{folder}: remove it")
+
+
 def check_input(path: Path | str, what: str = "file", budget: Budget = FILE_BYTES) -> int:
     """Check that a library may open a file: it exists, is regular, and is not too large.
 
@@ -112,8 +127,11 @@ def read_bytes(path: Path | str, what: str = "file", budget: Budget = FILE_BYTES
         BadInput: as `open_input`.
     """
     with open_input(path, what, budget) as file:
-        data = _read(file, path, budget.limit + 1)  # a file may grow, or lie as those of /proc do
-    budget.check(len(data), path)
+        # Memory for as much as is asked for is taken at once, so no more than the file has.
+        data = _read(file, path, os.fstat(file.fileno()).st_size + 1)
+        while more := _read(file, path, _BLOCK_BYTES):  # it grows, or lies as those of /proc do
+            data += more
+            budget.check(len(data), path)
     return data
 
 

@@ -27,7 +27,7 @@ LAYERS = (
     {"radiomap"},
     {"scene"},
     {"antennas", "measurements", "command", "doctor"},
-    {"geodesy", "llvm", "safe_xml", "cells", "console", "progress", "published", "records"},
+    {"array_file", "geodesy", "llvm", "safe_xml", "cells", "console", "progress", "published", "records"},
     {"files", "inputs", "plugins", "tables"},
     {"budgets"},
     {"errors"},

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.constants import speed_of_light
 
+from radiotwin.errors import BadInput
 from radiotwin.links import LinkData, LinkGeometry
 from radiotwin.scene.citymap import CityMap
 
@@ -100,7 +101,9 @@ _remembered: OrderedDict[
 def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, np.ndarray]]:
     """Yield of each device: its links, what was followed, and each link's row of that."""
     city = geometry.city
-    assert city is not None  # paths are followed over a map
+    if city is None:
+        raise BadInput("the channel image_paths follows paths over a 3D map, and none is given; "
+                       "give it with --scene")
     for device in np.unique(geometry.device):
         rows = np.flatnonzero(geometry.device == device)
         position_m = geometry.device_m[rows[0]]

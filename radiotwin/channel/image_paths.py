@@ -11,6 +11,7 @@ from typing_extensions import override
 from radiotwin.channel.base import ANY_LEVEL_SD_DB, ChannelModel
 from radiotwin.channel.followed_paths import path_gains
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
+from radiotwin.channel.stored import require_names, require_number
 from radiotwin.links import LinkGeometry
 
 MIN_NLOS = 30  # links without line of sight that the diffuse power is fitted to
@@ -119,11 +120,23 @@ class ImagePaths(ChannelModel):
     @classmethod
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        require_names("settings", settings, ["law", "law_settings", "diffuse"])
         if settings["law"] != SegmentedLogDistance.name:
-            raise ValueError(f"law is {settings['law']!r}, not {SegmentedLogDistance.name!r}")
-        gain_db, exponent = map(float, settings["diffuse"])
+            raise ValueError(f"law is not {SegmentedLogDistance.name!r}")
         return cls(SegmentedLogDistance.from_state(arrays, settings["law_settings"]),
-                   (gain_db, exponent))
+                   stored_diffuse(settings["diffuse"]))
+
+
+def stored_diffuse(value: Any) -> tuple[float, float]:
+    """Return the diffuse power that a file has: gain at 100 m [dB], and exponent.
+
+    Raises:
+        ValueError: it is none.
+    """
+    if not isinstance(value, list) or len(value) != 2:
+        raise ValueError("the diffuse power is not a gain and an exponent")
+    named = dict(zip(("gain", "exponent"), value, strict=True))
+    return require_number(named, "gain", -300.0, 100.0), require_number(named, "exponent", 0, 20)
 
 
 def with_diffuse_db(power: np.ndarray, distance_m: np.ndarray, gain_db: float,

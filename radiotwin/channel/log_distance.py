@@ -8,6 +8,7 @@ import numpy as np
 from typing_extensions import override
 
 from radiotwin.channel.base import ChannelModel, drop_uninformative
+from radiotwin.channel.stored import MAX_DB, require_array, require_lines, require_names
 from radiotwin.inference.censored_line import LogDistanceLine, fit_line
 from radiotwin.links import LinkGeometry
 
@@ -40,4 +41,7 @@ class LogDistance(ChannelModel):
     @classmethod
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
-        return cls(LogDistanceLine(*map(float, arrays["line"])))
+        require_names("settings", settings, [])
+        require_names("arrays", arrays, ["line"])
+        line = require_lines(require_array(arrays, "line", (3,), -MAX_DB, MAX_DB))
+        return cls(LogDistanceLine(*map(float, line)))

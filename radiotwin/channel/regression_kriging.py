@@ -64,6 +64,9 @@ class RegressionKriging(ChannelModel):
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
         model = cls()
-        model.law = SegmentedLogDistance.from_state(arrays, settings)
-        model.field = ResidualField.from_state(arrays, settings)
+        law = {"lines": arrays["lines"]}
+        model.law = SegmentedLogDistance.from_state(law, {"borrowed": settings["borrowed"]})
+        model.field = ResidualField.from_state(
+            {name: array for name, array in arrays.items() if name not in law},
+            {name: value for name, value in settings.items() if name != "borrowed"})
         return model

@@ -10,6 +10,16 @@ from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
+from radiotwin.budgets import FIELD_PAIRS, ROWS
+from radiotwin.channel.stored import (
+    MAX_DB,
+    MAX_POSITION_M,
+    require_array,
+    require_names,
+    require_number,
+)
+
+MIN_LENGTH_M = 1e-3  # of a correlation that is read
 MAX_PAIRS = 36e6  # points squared, over all series: their matrices take 8 bytes a pair
 MAX_POINTS, MIN_POINTS = 2500, 30  # range of the number of points that is kept of a longer series
 MAX_POINTS_TO_FIT, MAX_SERIES_TO_FIT = 300, 400  # for the correlation; at most MAX_PAIRS again
@@ -131,11 +141,19 @@ class ResidualField:
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
         """Return the field that `state` described."""
         field = cls()
-        field.share, field.kind_share = settings["share"], settings["kind_share"]
-        field.length_m = settings["length_m"]
-        field.fields = {number: _Field(*(arrays[f"{name}/{number}"] for name in
-                                         ("position_m", "residual", "kind", "count")))
-                        for number in settings["devices"]}
+        require_names("settings", settings, ["devices", "share", "kind_share", "length_m"])
+        numbers = settings["devices"]
+        if not isinstance(numbers, list) or len(set(numbers)) < len(numbers) or any(
+                type(number) is not int or number < 0 for number in numbers):
+            raise ValueError("devices are not different whole numbers")
+        require_names("arrays", arrays, [f"{name}/{number}" for number in numbers
+                                         for name in ("position_m", "residual", "kind", "count")])
+        field.share = require_number(settings, "share", 0, 1)
+        field.kind_share = require_number(settings, "kind_share", 0, 1 - field.share + 1e-9)
+        field.length_m = require_number(settings, "length_m", MIN_LENGTH_M, MAX_POSITION_M)
+        field.fields = {number: _stored(arrays, number) for number in numbers}
+        points = [len(each.residual) for each in field.fields.values()]
+        FIELD_PAIRS.check(sum(count**2 for count in points), "the interpolated residual")
         field._factor()
         return field
 
@@ -190,6 +208,17 @@ class ResidualField:
             distance_m = cdist(field.position_m, field.position_m)
             factor = cholesky(self._covariance(field, distance_m), lower=True)
             self._solved[number] = factor, cho_solve((factor, True), field.residual)
+
+
+def _stored(arrays: dict[str, np.ndarray], number: int) -> _Field:
+    """Return the points of one series of a file after a check."""
+    residual = require_array(arrays, f"residual/{number}", (None,), -MAX_DB, MAX_DB)
+    points, most = len(residual), float(ROWS.limit)
+    return _Field(
+        require_array(arrays, f"position_m/{number}", (points, 3), -MAX_POSITION_M,
+                      MAX_POSITION_M),
+        residual, require_array(arrays, f"kind/{number}", (points,), 0, most),
+        require_array(arrays, f"count/{number}", (points,), 1, most))
 
 
 def _merged(position_m: np.ndarray, residual: np.ndarray, kind: np.ndarray,

@@ -10,6 +10,7 @@ import numpy as np
 from typing_extensions import override
 
 from radiotwin.channel.base import MIN_DETECTED, ChannelModel, drop_uninformative
+from radiotwin.channel.stored import MAX_DB, require_array, require_lines, require_names
 from radiotwin.inference.censored_line import LogDistanceLine, fit_line, shift_line
 from radiotwin.links import LinkGeometry
 
@@ -83,5 +84,10 @@ class SegmentedLogDistance(ChannelModel):
     @classmethod
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
-        nlos, los = (LogDistanceLine(*map(float, row)) for row in arrays["lines"])
+        require_names("settings", settings, ["borrowed"])
+        require_names("arrays", arrays, ["lines"])
+        lines = require_lines(require_array(arrays, "lines", (2, 3), -MAX_DB, MAX_DB))
+        if settings["borrowed"] not in (None, "los", "nlos"):
+            raise ValueError("borrowed is none of null, los, nlos")
+        nlos, los = (LogDistanceLine(*map(float, row)) for row in lines)
         return cls(los, nlos, settings["borrowed"])

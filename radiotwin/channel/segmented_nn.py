@@ -9,14 +9,30 @@ import torch
 from typing_extensions import override
 
 from radiotwin.channel.base import ChannelModel, drop_uninformative
-from radiotwin.channel.ensemble import MEMBERS, WEIGHTS, TrainingData, forward, one_thread, train
+from radiotwin.channel.ensemble import (
+    INPUTS,
+    MEMBERS,
+    WEIGHTS,
+    TrainingData,
+    forward,
+    one_thread,
+    train,
+)
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
+from radiotwin.channel.stored import (
+    MAX_DB,
+    MAX_POSITION_M,
+    MAX_SD_DB,
+    require_array,
+    require_names,
+)
 from radiotwin.inference.censored_line import fit_sd_db
 from radiotwin.links import LinkGeometry
 
 BLOCK_M = 100.0  # side of a block on the ground that is held out as a whole
 TABLE = 129  # nodes on each axis of the table
 TRIM = 0.005  # share of the links at each end that the box of the data leaves out
+MAX_HIDDEN, MAX_WEIGHT, MAX_DECADES = 4096, 1e6, 20.0  # of networks that are read
 MIN_SPAN = np.array([0.1, 10.0])  # least range that scales log-distance, height difference [m]
 
 
@@ -142,12 +158,36 @@ class SegmentedNN(ChannelModel):
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
         model = cls()
-        model.law = SegmentedLogDistance.from_state(arrays, settings)
-        model.low, model.high = arrays["low"], arrays["high"]
-        model.residual_db, model.sd_db = arrays["residual_db"], arrays["sigma_db"]
-        model.weights = {name: arrays[name] for name in WEIGHTS}
+        model.law = SegmentedLogDistance.from_state({"lines": arrays["lines"]}, settings)
+        require_names("arrays", arrays, ["lines", "low", "high", "residual_db", "sigma_db",
+                                         *WEIGHTS])
+        model.low, model.high = (
+            np.column_stack([
+                require_array({name: arrays[name][:, 0]}, name, (2,), -MAX_DECADES, MAX_DECADES),
+                require_array({name: arrays[name][:, 1]}, name, (2,), -MAX_POSITION_M,
+                              MAX_POSITION_M)])
+            for name in ("low", "high"))
+        model.residual_db = require_array(arrays, "residual_db", (2, 2), -MAX_DB, MAX_DB)
+        model.sd_db = require_array(arrays, "sigma_db", (2,), np.finfo(float).tiny, MAX_SD_DB)
+        if (model.low > model.high).any() or (np.diff(model.residual_db) < 0).any():
+            raise ValueError("a least value is above the greatest")
+        model.weights = _weights(arrays)
         model._tabulate()
         return model
+
+
+def _weights(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the weights of the ensemble after a check of their shapes against each other."""
+    hidden = arrays["b1"].shape[-1]
+    if hidden > MAX_HIDDEN:
+        raise ValueError(f"{hidden} units in a layer; allowed are {MAX_HIDDEN}")
+    shapes = {"w1": (INPUTS, hidden), "b1": (1, hidden), "w2": (hidden, hidden),
+              "b2": (1, hidden), "w3": (hidden, 1), "b3": (1, 1)}
+    weights = {name: require_array(arrays, name, (MEMBERS, *shapes[name]), -MAX_WEIGHT, MAX_WEIGHT)
+               for name in WEIGHTS}
+    if any(array.dtype != np.float32 for array in weights.values()):
+        raise ValueError("weights are not in single precision")
+    return weights
 
 
 def _coordinates(links: LinkGeometry) -> np.ndarray:

@@ -6,13 +6,18 @@ import json
 from pathlib import Path
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
+from radiotwin.array_file import parse_arrays
 from radiotwin.channel.base import ChannelModel
-from radiotwin.channel.registry import channel_models
+from radiotwin.channel.registry import BUILT_IN, channel_models
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_path
+from radiotwin.files import atomic_file
+from radiotwin.inputs import parse_json, read_bytes
+from radiotwin.links import LinkGeometry
+
+# Distances and heights [m] at which a model that is read must predict numbers.
+_TRIED_M = np.array([(1.0, 0.0), (30.0, 10.0), (300.0, -50.0), (3e3, 100.0), (1e5, 3e3)])
 
 
 def save_channel(model: ChannelModel, path: str | Path) -> None:
@@ -22,12 +27,8 @@ def save_channel(model: ChannelModel, path: str | Path) -> None:
         model: fitted.
         path: file to write; replaced if it is there.
     """
-    arrays, settings = model.state()
-    # One key, because safetensors writes several in an order that changes from run to run.
-    header = {"channel": json.dumps({"model": model.name, "settings": settings}, sort_keys=True)}
-    with atomic_path(Path(path)) as temporary:
-        save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary,
-                  header)
+    with atomic_file(path) as file:
+        file.write(encode_channel(model))
 
 
 def load_channel(path: str | Path) -> ChannelModel:
@@ -43,17 +44,54 @@ def load_channel(path: str | Path) -> ChannelModel:
         BadInput: the file is missing, damaged, of a model that is not installed, or of something
             else.
     """
+    return decode_channel(read_bytes(path, "channel model"), path)
+
+
+def encode_channel(model: ChannelModel) -> bytes:
+    """Return a fitted model as the content of a safetensors file."""
+    arrays, settings = model.state()
+    # One key, because safetensors writes several in an order that changes from run to run.
+    header = {"channel": json.dumps({"model": model.name, "settings": settings}, sort_keys=True)}
+    return save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, header)
+
+
+def decode_channel(data: bytes, source: object) -> ChannelModel:
+    """Return the model that `encode_channel` described.
+
+    Args:
+        data: content of the file.
+        source: where it is from, for the message.
+
+    Raises:
+        BadInput: as `load_channel`.
+    """
     models = channel_models()
     try:
-        with safe_open(path, framework="numpy") as file:
-            header = json.loads(file.metadata()["channel"])
-            arrays = {name: file.get_tensor(name) for name in sorted(file.keys())}
+        arrays, text = parse_arrays(data, "channel", source)
+        header = parse_json(text, source)
         bad = [name for name, array in arrays.items() if not np.isfinite(array).all()]
         if bad:
             raise ValueError(f"{', '.join(bad)} holds values that are not finite")
-        return models[header["model"]].from_state(arrays, header["settings"])
-    except (OSError, SafetensorError, KeyError, ValueError, TypeError, IndexError,
+        # A model may keep its arrays and change them.
+        model = models[header["model"]].from_state(
+            {name: array.copy() for name, array in arrays.items()}, header["settings"])
+        if type(model) in BUILT_IN:  # one of a package's own may need a map
+            _try_to_predict(model)
+        return model
+    except (BadInput, LookupError, ValueError, TypeError, AttributeError, ArithmeticError,
             RuntimeError) as error:
-        raise BadInput(
-            f"{path}: not a whole channel model of one of {', '.join(models)} "
-            f"({type(error).__name__}: {error}); run `radiotwin fit` again") from error
+        raise BadInput(f"{source}: not a whole channel model of one of {', '.join(models)} "
+                       f"({type(error).__name__}: {str(error)[:300]}); run `radiotwin fit` "
+                       "again") from error
+
+
+def _try_to_predict(model: ChannelModel) -> None:
+    """Raise ValueError where links without a map get a level that is no number."""
+    horizontal_m, rise_m = np.tile(_TRIED_M, (2, 1)).T
+    count, zero = len(rise_m), np.zeros(len(rise_m))
+    links = LinkGeometry(np.zeros((count, 3)), np.column_stack([horizontal_m, zero, rise_m]),
+                         np.arange(count) % 2 == 1, np.zeros(count, dtype=int))
+    with np.errstate(all="ignore"):
+        mean_db, sd_db = model.quick.predict(links)
+    if not (np.isfinite(mean_db).all() and np.isfinite(sd_db).all() and (sd_db >= 0).all()):
+        raise ValueError("it predicts levels that are no numbers")

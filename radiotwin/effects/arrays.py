@@ -6,7 +6,9 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from radiotwin.errors import BadInput
 from radiotwin.links import LinkData
+from radiotwin.scene.citymap import CityMap
 
 
 class LinkCache:
@@ -21,6 +23,18 @@ class LinkCache:
         if key not in known:
             known[key] = derive()
         return known[key]
+
+
+def city_of(links: LinkData, effect: str) -> CityMap:
+    """Return the 3D map that an effect needs.
+
+    Raises:
+        BadInput: there is none.
+    """
+    if links.city is None:
+        raise BadInput(f"the effect {effect} needs a 3D map, and none is given; give it with "
+                       "--scene")
+    return links.city
 
 
 def subsample(rows: np.ndarray, maximum: int) -> np.ndarray:

@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.params import EffectParams, Estimate, Parameter
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, Unique
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.effects.tilted_dipole import TiltedDipole
 from radiotwin.links import LinkData
@@ -31,7 +31,7 @@ class BodyShadowing(GainEffect):
     class Params(EffectParams):
         """Receivers whose bodies shadow."""
 
-        members: list[int] = Field(description="Indices of the receivers.")
+        members: Unique[ReceiverIndex] = Field(description="Indices of the receivers.")
 
     @override
     def unavailable(self, links: LinkData) -> str | None:

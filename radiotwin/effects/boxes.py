@@ -1,8 +1,11 @@
 """Boxes that obstruct links, and where in a city they would explain missing power."""
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
+from pydantic import Field
+
+from radiotwin.effects.params import Length, Metres
 
 SAMPLE_M = 5.0  # between points on a link, while it is back-projected
 CELL_M = 12.5  # side of a cell of the back-projection
@@ -22,12 +25,12 @@ class Box(NamedTuple):
         turn_deg: angle of the length, counter-clockwise from east [deg].
     """
 
-    x_m: float
-    y_m: float
-    length_m: float
-    width_m: float
-    height_m: float
-    turn_deg: float
+    x_m: Metres
+    y_m: Metres
+    length_m: Length
+    width_m: Length
+    height_m: Length
+    turn_deg: Annotated[float, Field(ge=-3600, le=3600)]
 
 
 class Crossing(NamedTuple):

@@ -14,7 +14,14 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels, subsample
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import (
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Seconds,
+    Variation,
+)
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.links import LinkData
 
@@ -39,11 +46,12 @@ class ReceiverClockOffset(GainEffect):
     class Params(EffectParams):
         """A receiver and the offset of its clocks."""
 
-        receiver: int = Field(description="Index of the receiver.")
-        offset_s: float = Field(
+        receiver: ReceiverIndex = Field(description="Index of the receiver.")
+        offset_s: Seconds = Field(
             description="A level belongs to the position at its row's time plus this [s].")
         speed_m_s: float = Field(
-            gt=0, description="Mean while it moves; scales steps and bounds of the search [m/s].")
+            ge=1e-6, le=1e9,
+            description="Mean while it moves; scales steps and bounds of the search [m/s].")
         exact: bool = Field(False, description="Whether paths are followed to those positions.")
 
     @override

@@ -10,9 +10,10 @@ stand for.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from radiotwin.channel.residual_field import ResidualField
 from radiotwin.effects.fold_model import FoldModel
@@ -21,6 +22,18 @@ from radiotwin.links import LinkData
 
 NAME = "correlated_shadowing"
 MAX_Z = 6.0  # an outlier counts as this many scales
+
+
+class _State(BaseModel):
+    """What `CorrelatedShadowing.state` returns; arrays are checked by the field."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+
+    relative_sd: Annotated[float, Field(gt=0, le=1000)]
+    receivers_move: bool
+    certain: bool
+    settings: dict[str, Any]
+    arrays: dict[str, list[float] | list[list[float]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +78,16 @@ class CorrelatedShadowing:
 
     @classmethod
     def from_state(cls, state: dict[str, Any]) -> CorrelatedShadowing:
-        """Return what `state` described."""
-        arrays = {name: np.array(array, dtype=float) for name, array in state["arrays"].items()}
-        field = ResidualField.from_state(arrays, state["settings"])
-        return cls(field, state["relative_sd"], state["receivers_move"], state["certain"])
+        """Return what `state` described.
+
+        Raises:
+            ValueError: it is damaged.
+            KeyError: a part is missing.
+        """
+        record = _State.model_validate(state)
+        arrays = {name: np.array(array, dtype=float) for name, array in record.arrays.items()}
+        field = ResidualField.from_state(arrays, record.settings)
+        return cls(field, record.relative_sd, record.receivers_move, record.certain)
 
     def _points(self, links: LinkData) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Return series, position and kind of links.

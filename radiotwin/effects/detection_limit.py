@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels
 from radiotwin.effects.base import LimitEffect
-from radiotwin.effects.params import EffectParams, Estimate, Parameter
+from radiotwin.effects.params import Decibels, EffectParams, Estimate, Parameter, ReceiverIndex
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
 
@@ -34,7 +34,7 @@ class DetectionLimit(LimitEffect):
     class Params(EffectParams):
         """Limits of receivers."""
 
-        receivers: dict[int, float] = Field(
+        receivers: dict[ReceiverIndex, Decibels] = Field(
             description="Limit of detection of each receiver, by index [dB].")
 
     @override

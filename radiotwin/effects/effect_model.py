@@ -9,6 +9,7 @@ import numpy as np
 from radiotwin.channel import ChannelModel
 from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
 from radiotwin.effects.fold_model import FittedEffect, FoldModel
+from radiotwin.errors import BadInput
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.student import detection_probability
 from radiotwin.links import LinkData
@@ -77,6 +78,11 @@ class EffectModel:
         model = FoldModel.build(links, self.channel, self.dof)
         model = model.with_effects([model.apply(each.effect, each.params) for each in effects])
         coefficients = [self.level_coefficients, *(each.coefficients for each in effects)]
+        needed = [model.level_columns, *(each.term.columns for each in model.effects)]
+        for own, columns in zip(coefficients, needed, strict=True):
+            if len(own) != columns.shape[1]:
+                raise BadInput(f"the twin has {len(own)} coefficients where {columns.shape[1]} are "
+                               "needed for these links; run `radiotwin fit` again")
         return model, FitResult(np.concatenate(coefficients), self.scale_db, np.nan)
 
     def predict(self, links: LinkData) -> Prediction:

@@ -28,7 +28,7 @@ class ExcessAttenuation(GainEffect):
         """Profile of the density over height."""
 
         scale_height_m: float = Field(
-            gt=0, description="Height over which the density falls to 1/e [m].")
+            ge=1e-3, le=1e9, description="Height over which the density falls to 1/e [m].")
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:

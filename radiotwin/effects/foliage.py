@@ -5,7 +5,7 @@ is located by back-projection. A grove that only links of one device pass cannot
 these links: the box then gives the direction in which it lies.
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -41,8 +41,8 @@ class VegetationLoss(NamedTuple):
         max_db: greatest loss A_m [dB].
     """
 
-    specific_db_m: float = 0.6
-    max_db: float = 15.0
+    specific_db_m: Annotated[float, Field(gt=0, le=1000)] = 0.6
+    max_db: Annotated[float, Field(ge=1e-6, le=1000)] = 15.0
 
 
 class Foliage(GainEffect):

@@ -7,15 +7,23 @@ variables', Biometrika 57).
 """
 
 from collections.abc import Iterator
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import (
+    DeviceIndex,
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Seconds,
+    Variation,
+)
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.links import LinkData
 
@@ -28,6 +36,7 @@ MIN_GAP_SD = 3.0  # of a step's size, in standard deviations from flight to flig
 MAX_PROPOSALS = 2  # members: how much a drift explains shows once all else is fitted again
 PRIOR_SD_DB = 10.0
 TIME_CONSTANTS_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
+MIN_CONSTANT_S = 1e-3  # of a warm-up that is read
 WARM_UPS = ("warm_up", "warm_up_each_flight")
 
 
@@ -40,11 +49,17 @@ class Drift(NamedTuple):
     """
 
     form: Literal["warm_up", "warm_up_each_flight", "ageing", "step"]
-    number: float
+    number: Seconds
+
+
+def _possible(drifts: dict[int, Drift]) -> dict[int, Drift]:
+    if any(drift.form in WARM_UPS and drift.number < MIN_CONSTANT_S for drift in drifts.values()):
+        raise ValueError(f"a warm-up takes {MIN_CONSTANT_S:g} s or more")
+    return drifts
 
 
 class _DriftParams(EffectParams):
-    span_s: tuple[float, float] | None = Field(
+    span_s: tuple[Seconds, Seconds] | None = Field(
         None, description="First and last time that was learnt from [s]; ageing is relative to it.")
 
 
@@ -164,7 +179,8 @@ class ReceiverDrift(_GainDrift):
     class Params(_DriftParams):
         """Drifts of receivers."""
 
-        receivers: dict[int, Drift] = Field(description="Drift of each receiver, by index.")
+        receivers: Annotated[dict[ReceiverIndex, Drift], AfterValidator(_possible)] = Field(
+            min_length=1, description="Drift of each receiver, by index.")
 
 
 class DeviceDrift(_GainDrift):
@@ -178,7 +194,8 @@ class DeviceDrift(_GainDrift):
     class Params(_DriftParams):
         """Drifts of devices."""
 
-        devices: dict[int, Drift] = Field(description="Drift of each device, by index.")
+        devices: Annotated[dict[DeviceIndex, Drift], AfterValidator(_possible)] = Field(
+            min_length=1, description="Drift of each device, by index.")
 
     @override
     def _members(self, links: LinkData) -> list[int]:

@@ -13,7 +13,14 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels, one_hot
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.params import EffectParams, Estimate, Parameter
+from radiotwin.effects.params import (
+    DeviceIndex,
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Unique,
+)
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.links import LinkData
 
@@ -32,8 +39,9 @@ class _GainOffset(GainEffect):
     class Params(EffectParams):
         """Who has an offset."""
 
-        members: list[int] = Field(description="Indices of those with an offset.")
+        members: Unique[int] = Field(description="Indices of those with an offset.")
         offsets_sd_db: float = Field(validation_alias=AliasChoices("offsets_sd_db", "spread_db"),
+                                     ge=0, le=1000,
                                      description="Standard deviation of the offsets [dB].")
 
     def _names(self, links: LinkData) -> list[str]:
@@ -98,6 +106,11 @@ class DeviceGainOffset(_GainOffset):
     end = "device"
     confused_with = ("antenna_pattern", "device_position_error")
 
+    class Params(_GainOffset.Params):
+        """Devices with an offset."""
+
+        members: Unique[DeviceIndex] = Field(description="Indices of those with an offset.")
+
 
 class ReceiverGainOffset(_GainOffset):
     """Receivers that read more or less than the others do."""
@@ -106,3 +119,8 @@ class ReceiverGainOffset(_GainOffset):
     end = "receiver"
     of_receiver = True
     confused_with = ("receiver_drift", "antenna_pattern")
+
+    class Params(_GainOffset.Params):
+        """Receivers with an offset."""
+
+        members: Unique[ReceiverIndex] = Field(description="Indices of those with an offset.")

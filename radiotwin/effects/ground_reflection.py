@@ -15,7 +15,7 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import LinkCache, subsample
 from radiotwin.effects.base import GainEffect
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import EffectParams, Estimate, Metres, Parameter, Variation
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
 from radiotwin.scene.materials import permittivity
@@ -45,12 +45,12 @@ class GroundReflection(GainEffect):
         """A plane ground."""
 
         strength: float = Field(
-            description="Of the reflection, relative to smooth medium dry ground.")
+            ge=-100, le=100, description="Of the reflection, relative to smooth medium dry ground.")
         roughness_m: float = Field(
-            description="Standard deviation of the surface's height [m].")
-        ground_m: float = Field(description="Height of the plane [m].")
+            ge=0, le=1000, description="Standard deviation of the surface's height [m].")
+        ground_m: Metres = Field(description="Height of the plane [m].")
         wavelength_m: float = Field(
-            gt=0, description="Of the radio; scales steps and bounds of the search [m].")
+            gt=0, le=1000, description="Of the radio; scales steps and bounds of the search [m].")
 
     def __init__(self) -> None:
         self._bounces = LinkCache()

@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import subsample
 from radiotwin.effects.base import ReceiverEffect
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import Decibels, EffectParams, Estimate, Metres, Parameter, Variation
 from radiotwin.effects.power import NEPERS, add_power
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
@@ -40,9 +40,9 @@ class Interference(ReceiverEffect):
     class Params(EffectParams):
         """Position and level of the emitter."""
 
-        place_m: tuple[float, float] = Field(description="x and y of the emitter [m].")
-        level_db: float = Field(description="Its level at a distance of 100 m [dB].")
-        within_m: tuple[float, float, float, float] = Field(
+        place_m: tuple[Metres, Metres] = Field(description="x and y of the emitter [m].")
+        level_db: Decibels = Field(description="Its level at a distance of 100 m [dB].")
+        within_m: tuple[Metres, Metres, Metres, Metres] = Field(
             description="Least x and y, and greatest x and y, of the searched area [m].")
 
     @override

@@ -6,6 +6,8 @@ A blank is then either too weak or lost, P(blank) = p + (1 - p) F (the p-tobit o
 neighbouring links are lost together widens the interval.
 """
 
+from typing import Annotated
+
 import numpy as np
 from pydantic import Field
 from scipy.special import expit, logit, stdtr
@@ -13,7 +15,14 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels
 from radiotwin.effects.base import DetectionEffect
-from radiotwin.effects.params import QUANTILE_90, EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import (
+    QUANTILE_90,
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Variation,
+)
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
 
@@ -38,7 +47,7 @@ class LockLoss(DetectionEffect):
     class Params(EffectParams):
         """Dropout probabilities of receivers."""
 
-        receivers: dict[int, float] = Field(
+        receivers: dict[ReceiverIndex, Annotated[float, Field(ge=0, lt=1)]] = Field(
             description="Dropout probability of each receiver, by index.")
 
     @override

@@ -13,6 +13,7 @@ from pydantic import Field
 from scipy.constants import speed_of_light
 from typing_extensions import override
 
+from radiotwin.effects.arrays import city_of
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.boxes import (
     CELL_M,
@@ -27,7 +28,14 @@ from radiotwin.effects.boxes import (
     obstruction_nats,
     two_edges_db,
 )
-from radiotwin.effects.params import QUANTILE_90, EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import (
+    QUANTILE_90,
+    Decibels,
+    EffectParams,
+    Estimate,
+    Parameter,
+    Variation,
+)
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.links import LinkData
 from radiotwin.scene.citymap import CityMap
@@ -52,7 +60,7 @@ class MissingObstacle(GainEffect):
         """A box, and what reaches its shadow."""
 
         box: Box = Field(description="In place of the building.")
-        scattered_db: float = Field(
+        scattered_db: Decibels = Field(
             0.0, description="Power in the shadow, relative to the channel without line of sight.")
         exact: bool = Field(False, description="Whether paths are followed over a map with it.")
 
@@ -81,11 +89,11 @@ class MissingObstacle(GainEffect):
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
         offset_db = np.zeros(len(links))
         if params.exact:
-            assert links.city is not None  # paths are followed over a map
+            city = city_of(links, self.name)
             rows = np.flatnonzero(near_box(params.box, links.device_m[links.device],
                                            links.receiver_m, NEAR_M))
             mine = links.select(rows)
-            with_box = mine.with_city(_with_box(links.city, params.box))
+            with_box = mine.with_city(_with_box(city, params.box))
             offset_db[rows] = level_at(with_box, True) - level_at(mine, True)
             return Term.of_offset(offset_db)
         rows = np.flatnonzero(links.los)

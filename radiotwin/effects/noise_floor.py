@@ -11,7 +11,14 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels
 from radiotwin.effects.base import ReceiverEffect
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import (
+    Decibels,
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Variation,
+)
 from radiotwin.effects.power import NEPERS, add_power
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
@@ -31,7 +38,8 @@ class NoiseFloor(ReceiverEffect):
     class Params(EffectParams):
         """Floors of receivers."""
 
-        receivers: dict[int, float] = Field(description="Floor of each receiver, by index [dB].")
+        receivers: dict[ReceiverIndex, Decibels] = Field(
+            description="Floor of each receiver, by index [dB].")
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:

@@ -2,12 +2,39 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
 
 QUANTILE_90 = 1.645  # standard deviations to each side of a normal distribution's 90 % interval
+
+
+def _within(end: str) -> AfterValidator:
+    """Check an index against the number of devices or receivers that a twin's file has."""
+    def check(index: int, info: ValidationInfo) -> int:
+        if info.context and index >= info.context[end]:
+            raise ValueError(f"there is no {end} of index {index}")
+        return index
+    return AfterValidator(check)
+
+
+def _different(values: list[Any]) -> list[Any]:
+    if len(set(values)) < len(values):
+        raise ValueError("a value is listed twice")
+    return values
+
+
+# Types of parameters. Their bounds are far beyond what is measured: within them, what an effect
+# does is a finite number.
+Decibels = Annotated[float, Field(ge=-1000, le=1000)]
+Metres = Annotated[float, Field(ge=-1e8, le=1e8)]
+Length = Annotated[float, Field(ge=0, le=1e6)]
+Seconds = Annotated[float, Field(ge=-1e15, le=1e15)]
+DeviceIndex = Annotated[int, Field(ge=0), _within("device")]
+ReceiverIndex = Annotated[int, Field(ge=0), _within("receiver")]
+Item = TypeVar("Item")
+Unique = Annotated[list[Item], Field(min_length=1), AfterValidator(_different)]
 
 
 class EffectParams(BaseModel):

@@ -13,8 +13,9 @@ from scipy.constants import speed_of_light
 from typing_extensions import override
 
 from radiotwin.channel.followed_paths import paths_of
+from radiotwin.effects.arrays import city_of
 from radiotwin.effects.base import PathEffect
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import Decibels, EffectParams, Estimate, Parameter, Variation
 from radiotwin.effects.power import NEPERS, add_power
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
@@ -33,8 +34,8 @@ class _Paths(PathEffect):
     class Params(EffectParams):
         """Strength of the paths."""
 
-        strength_db: float = Field(description="Level of a path whose power gain is 1 [dB].")
-        level_db: float = Field(description="Level that a gain of 0 dB is measured as [dB].")
+        strength_db: Decibels = Field(description="Level of a path whose power gain is 1 [dB].")
+        level_db: Decibels = Field(description="Level that a gain of 0 dB is measured as [dB].")
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
@@ -58,6 +59,7 @@ class _Paths(PathEffect):
 
     @override
     def inputs(self, links: LinkData, params: Params) -> np.ndarray:
+        city_of(links, self.name)
         return paths_of(links, self.kinds)
 
     @override

@@ -11,7 +11,15 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels, subsample
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import (
+    DeviceIndex,
+    EffectParams,
+    Estimate,
+    Metres,
+    Parameter,
+    ReceiverIndex,
+    Variation,
+)
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.links import LinkData, site_of
 
@@ -40,8 +48,9 @@ class DevicePositionError(GainEffect):
     class Params(EffectParams):
         """An anchor and its move."""
 
-        device: int = Field(description="Index of the anchor, or of one of those on its mast.")
-        move_m: tuple[float, float] = Field(
+        device: DeviceIndex = Field(
+            description="Index of the anchor, or of one of those on its mast.")
+        move_m: tuple[Metres, Metres] = Field(
             description="True minus declared position, east and north [m].")
         exact: bool = Field(False, description="Whether paths are followed to the new position.")
 
@@ -118,8 +127,8 @@ class ReceiverPositionError(GainEffect):
     class Params(EffectParams):
         """A receiver and its move."""
 
-        receiver: int = Field(description="Index of the receiver.")
-        move_m: tuple[float, float, float] = Field(
+        receiver: ReceiverIndex = Field(description="Index of the receiver.")
+        move_m: tuple[Metres, Metres, Metres] = Field(
             description="True minus given position, east, north and up [m].")
 
     @override

@@ -5,7 +5,7 @@ signal'): output = input / (1 + (input / saturation)^(2p))^(1 / 2p), in amplitud
 decibels.
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -13,7 +13,14 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels
 from radiotwin.effects.base import ReceiverEffect
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import (
+    Decibels,
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Variation,
+)
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
 
@@ -32,8 +39,8 @@ class Compression(NamedTuple):
         smoothness: p; the higher, the sharper the knee.
     """
 
-    level_db: float
-    smoothness: float
+    level_db: Decibels
+    smoothness: Annotated[float, Field(ge=1e-3, le=1000)]
 
 
 class ReceiverSaturation(ReceiverEffect):
@@ -45,7 +52,8 @@ class ReceiverSaturation(ReceiverEffect):
     class Params(EffectParams):
         """Compression of receivers."""
 
-        receivers: dict[int, Compression] = Field(description="Of each receiver, by index.")
+        receivers: dict[ReceiverIndex, Compression] = Field(
+            description="Of each receiver, by index.")
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:

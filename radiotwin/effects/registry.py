@@ -74,6 +74,6 @@ def effect_named(name: str, variant: str) -> Effect:
         if (effect.name, effect.variant) == (name, variant):
             return effect()
     known = ", ".join(sorted({effect.name for effect in catalogue()}))
-    raise BadInput(f"the twin has the effect {name!r} ({variant}), which this version of radiotwin "
-                   f"does not know; it knows {known}; an effect of a package's own needs that "
-                   "package to be installed")
+    raise BadInput(f"the twin has the effect {name[:60]!r} ({variant[:60]!r}), which this version "
+                   f"of radiotwin does not know; it knows {known}; an effect of a package's own "
+                   "needs that package to be installed")

@@ -12,10 +12,12 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from typing_extensions import override
 
+from radiotwin.effects.arrays import city_of
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.boxes import Box, near_box
-from radiotwin.effects.params import EffectParams, Estimate, Parameter
+from radiotwin.effects.params import EffectParams, Estimate, Metres, Parameter
 from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.errors import BadInput
 from radiotwin.links import LinkData
 from radiotwin.scene.citymap import CityMap
 
@@ -37,8 +39,8 @@ class RemovedObstacle(GainEffect):
     class Params(EffectParams):
         """A building of the map."""
 
-        building: int = Field(description="Index, as `buildings` numbers them.")
-        centre_m: tuple[float, float, float] = Field(description="Centre x, y, and height [m].")
+        building: int = Field(ge=0, description="Index, as `buildings` numbers them.")
+        centre_m: tuple[Metres, Metres, Metres] = Field(description="Centre x, y, and height [m].")
         exact: bool = Field(False, description="Whether paths are followed over a map without it.")
 
     @override
@@ -65,10 +67,9 @@ class RemovedObstacle(GainEffect):
 
     @override
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
-        assert links.city is not None
-        offset_db = np.zeros(len(links))
+        offset_db, with_it = np.zeros(len(links)), city_of(links, self.name)
         if params.exact:
-            city, box = _without(links.city, params.building)
+            city, box = _without(with_it, params.building)
             rows = np.flatnonzero(near_box(box, links.device_m[links.device], links.receiver_m,
                                            NEAR_M))
             mine = links.select(rows)
@@ -137,7 +138,11 @@ def buildings(city: CityMap) -> tuple[np.ndarray, np.ndarray]:
 @lru_cache(maxsize=32)
 def _without(city: CityMap, building: int) -> tuple[CityMap, Box]:
     """Return a map without a building, and the box around that building."""
-    mine = buildings(city)[0] == building
+    label, centres_m = buildings(city)
+    if building >= len(centres_m):
+        raise BadInput(f"the effect removed_obstacle removes building {building}, but the map has "
+                       f"{len(centres_m)}; give the scene that the twin was made with")
+    mine = label == building
     corners_m = city.vertices[city.faces[mine]].reshape(-1, 3)
     low_m, high_m = corners_m.min(axis=0), corners_m.max(axis=0)
     (x_m, y_m, _), (length_m, width_m, _) = (low_m + high_m) / 2, high_m - low_m

@@ -19,7 +19,14 @@ from radiotwin.channel.followed_paths import free_space, rays_of, through_antenn
 from radiotwin.effects.antenna_params import AntennaParams, report_pattern, vary_patterns
 from radiotwin.effects.arrays import LinkCache, frequent_labels, one_hot, subsample
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation, quantity
+from radiotwin.effects.params import (
+    DeviceIndex,
+    EffectParams,
+    Estimate,
+    Parameter,
+    Variation,
+    quantity,
+)
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.links import LinkData, site_of
 
@@ -88,7 +95,8 @@ class SectorAntenna(GainEffect):
     class Params(EffectParams):
         """Antennas of devices."""
 
-        devices: dict[int, SectorPattern] = Field(description="Pattern of each device, by index.")
+        devices: dict[DeviceIndex, SectorPattern] = Field(
+            description="Pattern of each device, by index.")
 
     def __init__(self) -> None:
         self._rays = LinkCache()

@@ -18,7 +18,14 @@ from radiotwin.channel.followed_paths import free_space, rays_of, through_antenn
 from radiotwin.effects.antenna_params import AntennaParams, report_pattern, vary_patterns
 from radiotwin.effects.arrays import LinkCache, frequent_labels
 from radiotwin.effects.base import GainEffect
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation, quantity
+from radiotwin.effects.params import (
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Variation,
+    quantity,
+)
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
 
@@ -73,7 +80,7 @@ class TiltedDipole(GainEffect):
     class Params(EffectParams):
         """Dipoles of receivers."""
 
-        receivers: dict[int, DipoleParams] = Field(
+        receivers: dict[ReceiverIndex, DipoleParams] = Field(
             description="Dipole of each receiver, by index.")
 
     def __init__(self) -> None:

@@ -4,84 +4,39 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from radiotwin.channel import ChannelModel, load_channel, save_channel
-from radiotwin.channel.image_paths import ImagePaths
+from radiotwin.channel import ChannelModel
+from radiotwin.channel.image_paths import ImagePaths, stored_diffuse
+from radiotwin.channel.registry import BUILT_IN
+from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
+from radiotwin.channel.store import decode_channel, encode_channel
 from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.fold_model import FittedEffect
 from radiotwin.effects.registry import effect_named
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, require_writable
+from radiotwin.inputs import parse_json, read_bytes, read_text
+from radiotwin.links import LinkData
 from radiotwin.localize import TwinDevice
+from radiotwin.twin.record import (
+    CHANNEL_FILE,
+    SCHEMA,
+    SCHEMA_1,
+    DeviceRecord,
+    FittedRecord,
+    TwinRecord,
+)
 
-SCHEMA, SCHEMA_1 = "radiotwin.twin/2", "radiotwin.twin/1"
-CHANNEL_FILE = "channel.safetensors"
-TWIN_FILES = {"twin.json", CHANNEL_FILE, "report.html"}  # the last is what `radiotwin report` makes
-
-
-class _Strict(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
-
-
-class _DeviceRecord(_Strict):
-    """A device; null where a position or a radius is not known."""
-
-    device: str
-    x_m: float | None
-    y_m: float | None
-    z_m: float | None
-    role: Literal["anchor", "unknown"]
-    located: bool
-    credible_radius_m: float | None
-    second_mode: Annotated[list[float], Field(min_length=3, max_length=3)] | None
+TWIN_FILE = "twin.json"
+TWIN_FILES = {TWIN_FILE, CHANNEL_FILE, "report.html"}  # the last is what `radiotwin report` makes
 
 
-class _EffectRecord(_Strict):
-    """A fitted effect; `params` are checked by the effect's own `Params`."""
-
-    name: str
-    variant: str
-    params: dict[str, Any]
-    coefficients: list[float]
-
-
-class _FittedRecord(_Strict):
-    """Levels, effects and errors fitted upon the channel."""
-
-    level_coefficients: Annotated[list[float], Field(min_length=2, max_length=4)]
-    scale_db: Annotated[list[Annotated[float, Field(gt=0)]], Field(min_length=1, max_length=2)]
-    dof: Annotated[float, Field(gt=2)]
-    effects: list[_EffectRecord]
-    receivers: list[str]
-    first_s: float | None
-    device_sd_db: Annotated[float, Field(ge=0)]
-    likelihood_power: Annotated[float, Field(gt=0, le=1)]
-    shadowing: dict[str, Any] | None
-
-
-class _TwinRecord(BaseModel):
-    """Content of `twin.json`."""
-
-    model_config = ConfigDict(strict=True, allow_inf_nan=False)
-
-    devices: Annotated[list[_DeviceRecord], Field(min_length=1)]
-    level: Literal["gain_db", "rssi_dbm"]
-    limit_db: float | None
-    provenance: dict
-    fitted: _FittedRecord | None = None
-
-    @field_validator("devices")
-    @classmethod
-    def _unique(cls, devices: list[_DeviceRecord]) -> list[_DeviceRecord]:
-        names = [device.device for device in devices]
-        if len(set(names)) < len(names):
-            raise ValueError("a device is listed twice")
-        return devices
+_VERSION_1 = ("base", "coefficients", "dof", "scale_db", "receivers", "parts", "first_s",
+              "device_spread_db", "temper", "shadowing", "rest")  # of the effects
 
 
 def write_twin(folder: Path | str, channel: ChannelModel, devices: list[TwinDevice], level: str,
@@ -102,14 +57,24 @@ def write_twin(folder: Path | str, channel: ChannelModel, devices: list[TwinDevi
     """
     folder = Path(folder)
     check_twin_target(folder)
+    record, content = encode_twin(channel, devices, level, limit_db, provenance, fitted)
+    with atomic_folder(folder) as temporary:
+        (temporary / CHANNEL_FILE).write_bytes(content)
+        (temporary / TWIN_FILE).write_text(record, encoding="utf-8")
+
+
+def encode_twin(channel: ChannelModel, devices: list[TwinDevice], level: str,
+                limit_db: float | None, provenance: dict,
+                fitted: EffectModel | None) -> tuple[str, bytes]:
+    """Return the contents of a twin's two files: the record, and the channel.
+
+    The arguments are those of `write_twin`.
+    """
     record = {"schema": SCHEMA, "channel": {"model": channel.name, "file": CHANNEL_FILE},
               "level": level, "limit_db": limit_db,
               "devices": [_device_record(device) for device in devices],
               "fitted": _fitted_record(fitted) if fitted else None, "provenance": provenance}
-    with atomic_folder(folder) as temporary:
-        save_channel(channel, temporary / CHANNEL_FILE)
-        text = json.dumps(record, indent=1, allow_nan=False)
-        (temporary / "twin.json").write_text(text, encoding="utf-8")
+    return json.dumps(record, indent=1, allow_nan=False), encode_channel(channel)
 
 
 def read_twin(folder: Path | str) -> dict[str, Any]:
@@ -122,27 +87,48 @@ def read_twin(folder: Path | str) -> dict[str, Any]:
         BadInput: not a twin's folder, a damaged one, or effects that are not installed.
     """
     folder = Path(folder)
-    path = folder / "twin.json"
+    path = folder / TWIN_FILE
+    if not path.exists():
+        raise BadInput(f"{folder} is not a twin's folder (no {TWIN_FILE}); `radiotwin fit` makes "
+                       "one")
+    record = read_text(path, "twin")
+    return decode_twin(record, read_bytes(folder / CHANNEL_FILE, "channel model"), path)
+
+
+def decode_twin(record: str, channel: bytes, source: object) -> dict[str, Any]:
+    """Return what `encode_twin` described, of this version or of version 0.1.
+
+    Args:
+        record: content of `twin.json`.
+        channel: content of the channel's file.
+        source: where they are from, for the message.
+
+    Returns:
+        the attributes of `Twin` by name.
+
+    Raises:
+        BadInput: they are damaged, or have effects that are not installed.
+    """
+    given = parse_json(record, source)
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        schema = record["schema"]
+        schema = given["schema"]
         if schema not in (SCHEMA, SCHEMA_1):
-            raise BadInput(f"{path}: schema is {schema!r}, this version reads {SCHEMA!r} and "
-                           f"{SCHEMA_1!r}")
-        channel = load_channel(folder / CHANNEL_FILE)
+            raise BadInput(f"{source}: schema is {str(schema)[:60]!r}, this version reads "
+                           f"{SCHEMA!r} and {SCHEMA_1!r}")
+        model = decode_channel(channel, f"the channel of {source}")
+        name = model.name
         if schema == SCHEMA_1:
-            record, channel = _from_version_1(record, channel)
-        content = _TwinRecord.model_validate(record)
+            given, model = _from_version_1(given, model)
+        content = TwinRecord.model_validate(given)
+        if content.channel.model != name:
+            raise ValueError(f"the channel is {name}, not {content.channel.model[:60]}")
         devices = [_device(device) for device in content.devices]
-        fitted = None if content.fitted is None else _fitted(content.fitted, channel, devices)
-        return {"channel": channel, "devices": devices, "level": content.level,
+        fitted = None if content.fitted is None else _fitted(content.fitted, model, devices)
+        return {"channel": model, "devices": devices, "level": content.level,
                 "limit_db": content.limit_db, "provenance": content.provenance, "fitted": fitted}
-    except (FileNotFoundError, NotADirectoryError):
-        raise BadInput(f"{folder} is not a twin's folder (no twin.json); `radiotwin fit` makes "
-                       "one") from None
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise BadInput(f"{path} is damaged ({type(error).__name__}: {error}); run `radiotwin fit` "
-                       "again") from None
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
+        raise BadInput(f"{source} is damaged ({type(error).__name__}: {str(error)[:500]}); run "
+                       "`radiotwin fit` again") from None
 
 
 def check_twin_target(folder: Path) -> None:
@@ -151,7 +137,7 @@ def check_twin_target(folder: Path) -> None:
     Raises:
         BadInput: it cannot.
     """
-    require_writable(folder / "twin.json")
+    require_writable(folder / TWIN_FILE)
     names = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     foreign = sorted(name for name in names - TWIN_FILES if not name.startswith("."))
     if foreign:
@@ -171,15 +157,22 @@ def _fitted_record(fitted: EffectModel) -> dict[str, Any]:
             "shadowing": fitted.shadowing.state() if fitted.shadowing else None}
 
 
-def _fitted(record: _FittedRecord, channel: ChannelModel,
+def _fitted(record: FittedRecord, channel: ChannelModel,
             devices: list[TwinDevice]) -> EffectModel:
+    _check_levels(record, channel)
     device_m = np.array([(each.x_m, each.y_m, each.z_m) for each in devices])
+    known = {"device": len(devices), "receiver": len(record.receivers)}
     effects = []
     for each in record.effects:
         effect = effect_named(each.name, each.variant)
-        params = effect.Params.model_validate(each.params)
-        effects.append(FittedEffect(effect, params, np.array(each.coefficients)))
-    shadowing = CorrelatedShadowing.from_state(record.shadowing) if record.shadowing else None
+        # As JSON, because strict checks allow only there what JSON has no other form for.
+        params = effect.Params.model_validate_json(json.dumps(each.params), strict=True,
+                                                   context=known)
+        effects.append(FittedEffect(effect, params, np.array(each.coefficients, dtype=float)))
+    shadowing = None
+    if record.shadowing is not None:
+        shadowing = CorrelatedShadowing.from_state(record.shadowing)
+    _check_terms(effects, [each.device for each in devices], record.receivers)
     return EffectModel(channel, tuple(effects), np.array(record.level_coefficients),
                        np.array(record.scale_db), record.dof, np.nan_to_num(device_m),
                        tuple(record.receivers),
@@ -187,18 +180,54 @@ def _fitted(record: _FittedRecord, channel: ChannelModel,
                        record.device_sd_db, record.likelihood_power, shadowing)
 
 
+def _check_terms(effects: list[FittedEffect], devices: list[str], receivers: list[str]) -> None:
+    """Refuse effects with another number of coefficients than they need, on a link or two."""
+    n = max(len(devices), len(receivers), 2)
+    row, nothing = np.arange(n), np.zeros(n)
+    links = LinkData(
+        np.full(n, -80.0), None, np.column_stack([100.0 + row, nothing, np.full(n, 30.0)]),
+        np.zeros((len(devices), 3)), row % len(devices), row % max(len(receivers), 1),
+        row % 2, row.astype(float), nothing, devices, receivers or ["any"], ["f0", "f1"], 2.4e9,
+        None, True, frozenset(range(len(devices))))
+    for each in effects:
+        needs_map = "no 3D map" in (each.effect.unavailable(links) or "")
+        if needs_map or getattr(each.params, "exact", False):
+            continue  # checked when it predicts
+        term = each.effect.term(links, each.params, lambda links, exact=False: np.zeros(len(links)))
+        if term.columns.shape[1] != len(each.coefficients):
+            raise ValueError(f"{each.effect.name} needs {term.columns.shape[1]} coefficients and "
+                             f"has {len(each.coefficients)}")
+        if not (np.isfinite(term.offset_db).all() and np.isfinite(term.columns).all()):
+            raise ValueError(f"{each.effect.name} adds something else than numbers")
+
+
+def _check_levels(record: FittedRecord, channel: ChannelModel) -> None:
+    """Refuse another number of levels or of scales than the channel has classes of links."""
+    if not isinstance(channel, BUILT_IN):
+        return
+    allowed = {(2, 1), (4, 2)} if channel.uses_map else {(2, 1)}
+    allowed = {(2, 2)} if channel.follows_paths else allowed
+    given = len(record.level_coefficients), len(record.scale_db)
+    if given not in allowed:
+        raise ValueError(f"{given[0]} levels and {given[1]} scales do not fit {channel.name}")
+
+
 def _from_version_1(record: dict, channel: ChannelModel) -> tuple[dict, ChannelModel]:
     """Return the record and the channel as version 2 has them.
 
     There, paths were followed upon a law (`base`), and effects had a `setting`.
     """
-    old = record.get("effects")
+    old = record.get("effects", [])
     record = {name: value for name, value in record.items() if name != "effects"}
-    if not isinstance(old, dict) or not old:  # a list, always empty, in the earliest twins
+    if old in ([], {}):  # a list, always empty, in the earliest twins
         return record, channel
+    wrong = set(old) - set(_VERSION_1)
+    if wrong:
+        raise ValueError(f"effects: {sorted(wrong)[0][:60]!r} is unknown")
     if old["base"] == "raytrace":
-        gain_db, exponent = map(float, old["rest"])
-        channel = ImagePaths(channel, (gain_db, exponent))
+        if not isinstance(channel, SegmentedLogDistance):
+            raise ValueError(f"paths do not go with {channel.name}")
+        channel = ImagePaths(channel, stored_diffuse(old["rest"]))
     shadowing = old.get("shadowing")
     if shadowing is not None:
         shadowing = {name: value for name, value in shadowing.items() if name != "sigma"} | {
@@ -219,7 +248,7 @@ def _device_record(device: TwinDevice) -> dict[str, Any]:
             for name, value in vars(device).items()}
 
 
-def _device(record: _DeviceRecord) -> TwinDevice:
+def _device(record: DeviceRecord) -> TwinDevice:
     x_m, y_m, z_m = (np.nan if each is None else each
                      for each in (record.x_m, record.y_m, record.z_m))
     radius_m = np.inf if record.credible_radius_m is None else record.credible_radius_m

@@ -23,7 +23,7 @@ from radiotwin.localize import TwinDevice
 from radiotwin.progress import progress
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
-from radiotwin.twin.store import read_twin, write_twin
+from radiotwin.twin.store import decode_twin, encode_twin, read_twin, write_twin
 
 CHUNK, CHUNK_WITH_EFFECTS = 200_000, 20_000  # links predicted at once: bounds memory
 
@@ -171,6 +171,25 @@ class Twin:
             BadInput: not a twin's folder, a damaged one, or effects that are not installed.
         """
         return cls(**read_twin(folder))
+
+    def encode(self) -> tuple[str, bytes]:
+        """Return the contents of the twin's two files: the record, and the channel."""
+        return encode_twin(self.channel, self.devices, self.level, self.limit_db, self.provenance,
+                           self.fitted)
+
+    @classmethod
+    def decode(cls, record: str, channel: bytes, source: object) -> Twin:
+        """Return the twin that `encode` described.
+
+        Args:
+            record: content of `twin.json`.
+            channel: content of the channel's file.
+            source: where they are from, for the message.
+
+        Raises:
+            BadInput: as `load`.
+        """
+        return cls(**decode_twin(record, channel, source))
 
     def warn_of_another_scene(self, scene: Scene, scene_hash: str) -> None:
         """Warn where the twin was learnt in another scene than one with this hash."""

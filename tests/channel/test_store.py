@@ -95,7 +95,7 @@ def test_nothing_is_left_where_saving_fails(models, tmp_path, monkeypatch):
     path = tmp_path / "channel.safetensors"
     path.write_text("the old one")
     monkeypatch.setattr(
-        "radiotwin.channel.store.save_file", lambda *_: (_ for _ in ()).throw(OSError("disk full"))
+        "radiotwin.channel.store.encode_channel", lambda *_: (_ for _ in ()).throw(OSError("disk full"))
     )
     with pytest.raises(OSError, match="disk full"):
         save_channel(models["log_distance"], path)

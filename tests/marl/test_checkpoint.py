@@ -1,11 +1,14 @@
-"""Checkpoints hold what they were given."""
+"""Checkpoints hold what they were given, and are data only."""
+
+import json
 
 import numpy as np
 import pandas as pd
 import pytest
 import torch
 
-from marl.checkpoint import folder_content, load_checkpoint, restore_folder, save_checkpoint
+from marl.checkpoint import load_checkpoint, save_checkpoint
+from radiotwin.array_file import write_arrays
 from radiotwin.errors import BadInput
 
 
@@ -15,48 +18,55 @@ def test_every_type_of_value_comes_back(tmp_path):
     state = {
         "rng": rng.bit_generator.state, "rows": [{"ratio": 0.1 + 0.2, "round": 3, "nothing": float("nan")}],
         "array": np.arange(6, dtype=np.int16).reshape(2, 3), "mask": np.array([True, False]), "none": None,
+        "empty": np.zeros((0, 3), np.float32), "scalar": np.float64(0.1), "number": -np.inf,
         "tensor": torch.ones(2), "tables": [pd.DataFrame({"x_m": [0.1, np.nan], "device": ["d0", "d1"]})]}
-    save_checkpoint(state, tmp_path / "state.pt")
-    back = load_checkpoint(tmp_path / "state.pt")
+    save_checkpoint(state, tmp_path / "state")
+    back = load_checkpoint(tmp_path / "state")
     again = np.random.default_rng()
     again.bit_generator.state = back["rng"]
     assert again.random() == rng.random()
     assert back["rows"][0]["ratio"] == 0.1 + 0.2 and np.isnan(back["rows"][0]["nothing"])
     np.testing.assert_array_equal(back["array"], state["array"])
     assert back["array"].dtype == np.int16 and back["mask"].dtype == bool and back["none"] is None
+    assert back["empty"].shape == (0, 3) and back["scalar"] == 0.1 and back["number"] == -np.inf
     assert torch.equal(back["tensor"], state["tensor"])
     pd.testing.assert_frame_equal(back["tables"][0], state["tables"][0], check_dtype=False)
 
 
 def test_a_damaged_checkpoint_is_bad_input(tmp_path):
-    path = tmp_path / "state.pt"
-    save_checkpoint({"a": np.zeros(1000)}, path)
-    path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(BadInput, match="damaged"):
-        load_checkpoint(path)
+    path = tmp_path / "state"
+    save_checkpoint({"a": np.zeros(1000), "b": [1]}, path)
+    whole = path.read_bytes()
+    for share in (0.0, 0.01, 0.5, 0.99):
+        path.write_bytes(whole[:int(share * len(whole))])
+        with pytest.raises(BadInput, match="damaged"):
+            load_checkpoint(path)
 
 
-def test_no_code_is_executed_on_reading(tmp_path):
+@pytest.mark.parametrize("text", [
+    "[]", "{", '{"format": 4}', '{"format": 4, "state": 3}', '{"format": 4, "state": {"$array": "7"}}',
+    '{"format": 4, "state": {"a": {"$number": "many"}}}', '{"format": 4, "state": {"a": {"$array": ["0"]}}}',
+    '{"format": 4, "state": {"a": {"$texts": 3, "codes": 1}}}', '{"format": 4, "state": {}}',
+    '{"format": 4, "state": {"a": ' + "[" * 5000 + "]" * 5000 + "}}", '{"format": 4, "state": {"a": ' + "9" * 5000 + "}}"])
+def test_a_document_that_makes_no_sense_is_one_message(text, tmp_path):
+    with (tmp_path / "state").open("wb") as file:
+        write_arrays(file, {"0": np.zeros(3)}, "checkpoint", text)
+    with pytest.raises(BadInput, match="state"):
+        load_checkpoint(tmp_path / "state")
+
+
+def test_a_pickle_is_not_run(tmp_path):
     class Harmful:
         def __reduce__(self):
-            return (print, ("executed",))
+            return (pytest.fail, ("executed",))
 
-    torch.save({"a": Harmful()}, tmp_path / "state.pt")
+    torch.save({"a": Harmful()}, tmp_path / "state")
     with pytest.raises(BadInput, match="damaged"):
-        load_checkpoint(tmp_path / "state.pt")
-
-
-def test_a_folder_comes_back(tmp_path):
-    (tmp_path / "twin").mkdir()
-    (tmp_path / "twin" / "a.json").write_text("{}")
-    (tmp_path / "twin" / "b.bin").write_bytes(bytes(range(256)))
-    content = folder_content(tmp_path / "twin")
-    restore_folder(content, tmp_path / "other")
-    assert (tmp_path / "other" / "b.bin").read_bytes() == bytes(range(256))
-    assert (tmp_path / "other" / "a.json").read_text() == "{}"
+        load_checkpoint(tmp_path / "state")
 
 
 def test_a_checkpoint_of_another_version_is_refused(tmp_path):
-    torch.save({"rows": []}, tmp_path / "state.pt")
+    with (tmp_path / "state").open("wb") as file:
+        write_arrays(file, {}, "checkpoint", json.dumps({"format": 99, "state": {}}))
     with pytest.raises(BadInput, match="another version.*start again"):
-        load_checkpoint(tmp_path / "state.pt")
+        load_checkpoint(tmp_path / "state")

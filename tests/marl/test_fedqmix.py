@@ -50,7 +50,7 @@ def test_a_whole_run_writes_everything_and_ends_in_the_table(scene_option, tmp_p
     # Trained in the truth, every episode of both replicas is a real one, and so are three looks at the policy.
     assert lines[2].split()[3] == str(160 + 3 * 64)
     folder = tmp_path / "result"
-    for name in ("config.json", "metrics.csv", "checkpoint.pt", "comparison.csv", "curve.png", "trajectories.png",
+    for name in ("config.json", "metrics.csv", "checkpoint.safetensors", "comparison.csv", "curve.png", "trajectories.png",
                  "flights.csv", "twin/twin.json", "compare/truth/metrics.csv"):
         assert (folder / name).is_file(), name
     assert list((folder / "tensorboard").iterdir())
@@ -66,7 +66,7 @@ def test_a_killed_run_resumes_to_the_same_result_bit_for_bit(scene_option, tmp_p
     status, _, err = run(words + "--out unbroken", tmp_path)
     assert status == 0, err
     process = start(words + "--out killed", tmp_path)
-    checkpoint = tmp_path / "killed" / "checkpoint.pt"
+    checkpoint = tmp_path / "killed" / "checkpoint.safetensors"
     for _ in range(1200):
         if checkpoint.exists() or process.poll() is not None:
             break
@@ -77,7 +77,7 @@ def test_a_killed_run_resumes_to_the_same_result_bit_for_bit(scene_option, tmp_p
     status, _, err = run(words + "--out killed --resume", tmp_path)
     assert status == 0, err
     assert metrics(tmp_path / "killed" / "metrics.csv") == metrics(tmp_path / "unbroken" / "metrics.csv")
-    ends = [load_checkpoint(tmp_path / name / "checkpoint.pt") for name in ("killed", "unbroken")]
+    ends = [load_checkpoint(tmp_path / name / "checkpoint.safetensors") for name in ("killed", "unbroken")]
     for one, other in zip(*(flat(end["strategy"]) for end in ends), strict=True):
         assert one == other
     for name in ("trajectories.png", "curve.png", "twin/twin.json"):

@@ -1,5 +1,7 @@
 """A scene and a radio map become a mission."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -106,3 +108,26 @@ def test_a_maps_attributes_say_how_long_its_errors_last(small_scene):
                 {"shadowing_share": "much"}):
         with pytest.raises(BadInput, match="a share from 0 to 1 and a length above 0"):
             make_mission(small_scene, RadioMap(lasting.assign_attrs(bad)), known)
+
+
+@pytest.mark.parametrize("name, value", [("gain_db", 1e308), ("gain_db", np.inf), ("sigma_db", -1.0), ("sigma_db", 1e30)])
+def test_a_map_of_impossible_values_is_refused(name, value, small_scene):
+    dataset = segmented_truth(small_scene).dataset.copy(deep=True)
+    dataset[name] = dataset[name].astype(float)
+    dataset[name].values[2, :, 3, 4] = value
+    with pytest.raises(BadInput, match=f"{name} of d2"):
+        make_mission(small_scene, RadioMap(dataset), Known.truth(small_scene))
+
+
+@pytest.mark.parametrize("name", ["data_units", "rate_scale", "slot_s"])
+@pytest.mark.parametrize("value", [1e308, 1e-308])
+def test_an_implausible_mission_is_refused(name, value, small_scene):
+    scene = changed(small_scene, mission=small_scene.config.mission.model_copy(update={name: value}))
+    with pytest.raises(BadInput, match=re.escape(f"mission.{name} = {value:g}")):
+        make_mission(scene, segmented_truth(small_scene), Known.truth(scene))
+
+
+def test_a_mission_beyond_the_budget_takes_no_memory(small_scene, monkeypatch):
+    monkeypatch.setenv("RADIOTWIN_MAX_MAP_VALUES", "1000")
+    with pytest.raises(BadInput, match="RADIOTWIN_MAX_MAP_VALUES"):
+        make_mission(small_scene, segmented_truth(small_scene), Known.truth(small_scene))
