@@ -1,7 +1,8 @@
 """Atomic output: files and folders are written under a temporary name, flushed, then renamed.
 
-A killed run leaves its temporaries; the next one that writes to the same folder removes them. A
-temporary is locked while its process lives, so that none in use is taken away.
+A temporary name is a folder `.radiotwin-????????` beside the output. A killed run leaves it; the
+next one that writes there removes it. It is locked while its process lives, so that none in use is
+taken away. (Files are not locked: HDF5 locks those that it writes itself.)
 """
 
 import errno
@@ -24,7 +25,7 @@ except ImportError:  # Windows: nothing is locked, and nothing is swept
     fcntl = None  # type: ignore[assignment]
 
 _DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
-_TEMPORARY = re.compile(r"\.radiotwin-[a-z0-9_]{8}(?P<aside>-aside)?(?:[-.].*)?")
+_TEMPORARY = re.compile(r"\.radiotwin-[a-z0-9_]{8}(?P<aside>-aside)?")
 
 
 def require_writable(path: Path | str) -> None:
@@ -39,8 +40,8 @@ def require_writable(path: Path | str) -> None:
     """
     path = Path(path)
     _refuse_folder(path)
-    with _parent_of(path), _reported(path), _temporary_file(path):
-        pass
+    with _parent_of(path), _reported(path), _temporary_folder(path) as folder:
+        (folder / path.name).touch()
 
 
 @contextmanager
@@ -51,8 +52,8 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
         path: of the file; missing folders are made.
 
     Yields:
-        a temporary path in the same folder with the same suffixes; it is flushed to the disk and
-        renamed to `path` on success and removed on failure.
+        a temporary path with the same name in a folder beside `path`; it is flushed to the disk
+        and renamed to `path` on success and removed on failure.
 
     Raises:
         BadInput: the folder cannot be made or written, or `path` is not an ordinary file.
@@ -60,13 +61,13 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     """
     path = Path(path)
     _refuse_folder(path)
-    with _parent_of(path), _reported(path, only_disk=True), _temporary_file(path) as temporary:
+    with _parent_of(path), _reported(path, only_disk=True), _temporary_folder(path) as folder:
+        temporary = folder / path.name
+        with _reported(path):
+            temporary.touch()
         yield temporary
         with _reported(path):
             _flush(temporary)
-            umask = os.umask(0)
-            os.umask(umask)
-            temporary.chmod(0o666 & ~umask)  # mkstemp makes private files
             os.replace(temporary, path)
 
 
@@ -191,19 +192,6 @@ class _ErrorsKept(io.RawIOBase):
 
 
 @contextmanager
-def _temporary_file(path: Path) -> Iterator[Path]:
-    """Make and lock an empty file beside `path` with its suffixes; remove it in the end."""
-    _sweep(path.parent)
-    suffix = "".join(path.suffixes[-2:])
-    with _reported(path):
-        while True:
-            handle, name = tempfile.mkstemp(prefix=".radiotwin-", suffix=suffix, dir=path.parent)
-            if _locked(handle, name):
-                break
-    yield from _removed(Path(name), handle)
-
-
-@contextmanager
 def _temporary_folder(path: Path, suffix: str = "") -> Iterator[Path]:
     """Make and lock an empty folder beside `path`; remove it in the end."""
     _sweep(path.parent)
@@ -213,29 +201,16 @@ def _temporary_folder(path: Path, suffix: str = "") -> Iterator[Path]:
             handle = None if fcntl is None else os.open(name, os.O_RDONLY)
             if handle is None or _locked(handle, name):
                 break
-    yield from _removed(Path(name), handle)
-
-
-def _removed(temporary: Path, handle: int | None) -> Iterator[Path]:
-    """Yield a temporary; remove it and release its lock in the end."""
-    if fcntl is None and handle is not None:  # Windows renames no open file
-        os.close(handle)
-        handle = None
     try:
-        yield temporary
+        yield Path(name)
     finally:
-        if temporary.is_dir():
-            shutil.rmtree(temporary, ignore_errors=True)
-        else:
-            temporary.unlink(missing_ok=True)
+        shutil.rmtree(name, ignore_errors=True)
         if handle is not None:
             os.close(handle)
 
 
 def _locked(handle: int, name: str) -> bool:
-    """Lock a new temporary; False if another process has swept it before."""
-    if fcntl is None:
-        return True
+    """Lock a new folder; False if another process has swept it before."""
     with suppress(OSError):  # a file system without locks
         fcntl.flock(handle, fcntl.LOCK_EX)
     try:
@@ -255,8 +230,7 @@ def _sweep(folder: Path) -> None:
     with suppress(OSError):
         for entry in os.scandir(folder):
             match = _TEMPORARY.fullmatch(entry.name)
-            if match and (entry.is_file(follow_symlinks=False)
-                          or entry.is_dir(follow_symlinks=False)):
+            if match and entry.is_dir(follow_symlinks=False):
                 with suppress(OSError):
                     _remove_stale(Path(entry.path), aside=bool(match["aside"]))
 
@@ -265,9 +239,6 @@ def _remove_stale(path: Path, aside: bool) -> None:
     handle = os.open(path, os.O_RDONLY)
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)  # raises if its process lives
-        if not path.is_dir():
-            path.unlink()
-            return
         for old in path.iterdir() if aside else ():  # killed in `_swap`
             if not (path.parent / old.name).exists():
                 os.replace(old, path.parent / old.name)

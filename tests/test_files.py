@@ -174,7 +174,7 @@ def test_temporaries_of_a_killed_process_are_swept_by_the_next_one_that_writes_t
     child = subprocess.Popen([sys.executable, "-c", program, tmp_path], stdout=subprocess.PIPE)
     assert child.stdout.readline() == b"ready\n"
     alive = sorted(tmp_path.iterdir())
-    assert len(alive) == 2
+    assert len(alive) == 2 and all(path.is_dir() for path in alive)
     files._sweep.cache_clear()
     require_writable(tmp_path / "other")
     assert sorted(tmp_path.iterdir()) == alive, "those of a living process are kept"
