@@ -11,6 +11,7 @@ from typing import Any
 from marl.threads import keep_memory, limit_threads, usable_cores
 from marl.training import Trainer
 from radiotwin.errors import RunFailed
+from radiotwin.signals import kept_from_children
 
 
 class Replicas:
@@ -77,7 +78,8 @@ class _Remote:
         context = multiprocessing.get_context("spawn")
         self._pipe, other = context.Pipe()
         self._process = context.Process(target=_serve, args=(other, arguments), daemon=True)
-        self._process.start()
+        with kept_from_children():
+            self._process.start()
         other.close()
 
     def call(self, method: str, *arguments: Any) -> Any:
