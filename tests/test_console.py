@@ -10,7 +10,14 @@ from rich.text import Text
 
 from radiotwin import console
 from radiotwin import progress as progress_module
-from radiotwin.console import PrintableConsole, complain, print_rows, printable, say, show_warnings_plainly
+from radiotwin.console import (
+    PrintableConsole,
+    complain,
+    print_rows,
+    printable,
+    say,
+    show_warnings_plainly,
+)
 
 HOSTILE = "a\x1b]0;title\x07\x9b31m\x7f\r\u202eb\u2066\u2028\udcff[red]"
 SHOWN = "a\\x1b]0;title\\x07\\x9b31m\\x7f\\r\\u202eb\\u2066\\u2028\\udcff[red]"
