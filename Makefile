@@ -1,12 +1,16 @@
 # Set-up and checks. `make demo` and `make test` need nothing but make and Python >= 3.11.
 #
 #   make demo PYTHON=python3.12         another Python
-#   make demo PIP_ARGS="--extra-index-url https://download.pytorch.org/whl/cpu"
-#                                       the CPU build of torch (on Linux, PyPI's is the CUDA build: gigabytes)
+#   make demo TORCH_INDEX=https://download.pytorch.org/whl/cpu
+#                                       the CPU build of torch (on Linux, PyPI's is the CUDA build: gigabytes).
+#                                       Nothing else is taken from there: with --extra-index-url, a package of any
+#                                       name could be.
+#   make demo PIP_ARGS=--no-cache-dir   other options of pip
 #   make test TESTS=tests/channel       a part of the tests
 
 VENV ?= .venv
 PIP_ARGS ?=
+TORCH_INDEX ?=
 TESTS ?=
 FAST_TESTS := $(addprefix tests/,antennas channel effects export footprints importing inference links paths \
 	report scene survey trace test_layout.py)
@@ -63,6 +67,8 @@ bench: llvm
 # The second run does nothing, until what is to be installed has changed.
 $(INSTALLED): pyproject.toml constraints.txt
 	@$(BIN)/python -m pip --version > /dev/null 2>&1 || $(MAKE) --no-print-directory $(VENV)
+	@[ -z "$(TORCH_INDEX)" ] || $(BIN)/python -m pip install --disable-pip-version-check --no-deps \
+		--index-url "$(TORCH_INDEX)" "$$(grep '^torch==' constraints.txt)"
 	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e '.[test]'
 	@touch $@
 

@@ -5,9 +5,8 @@ import os
 import pickle
 import signal
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -15,6 +14,7 @@ from marl.checkpoint import Damaged
 from marl.threads import die_with_parent, keep_memory, limit_threads, usable_cores
 from marl.training import Trainer
 from radiotwin.errors import RunFailed
+from radiotwin.signals import kept_from_children
 
 
 class Replicas:
@@ -93,8 +93,7 @@ class _Remote:
         self._pipe, other = context.Pipe()
         self._process = context.Process(target=_serve, args=(other, os.getpid(), arguments),
                                         daemon=True)
-        # Ctrl-C reaches all processes of a terminal; this one alone answers it.
-        with _without_interrupts():
+        with kept_from_children():
             self._process.start()
         other.close()
 
@@ -122,19 +121,6 @@ class _Remote:
 
     def close(self) -> None:
         self._pipe.close()
-
-
-@contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """Block Ctrl-C, which a process that is started meanwhile inherits; this one gets it later."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _serve(pipe: Connection, parent: int, arguments: tuple) -> None:

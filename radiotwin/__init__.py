@@ -5,7 +5,6 @@ first used, so that importing the package takes no time.
 """
 
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -25,10 +24,7 @@ if TYPE_CHECKING:
     from radiotwin.trace import SolverSettings, trace_map
     from radiotwin.twin import Twin, fit_twin
 
-try:
-    __version__ = version("radiotwin")
-except PackageNotFoundError:  # run from a source tree that was never installed
-    __version__ = "0+source"
+__version__: str  # found when it is asked for, as all names
 
 _MODULES = {
     "closeloop.corrected_twin": ["corrected_twin"],
@@ -58,9 +54,20 @@ __all__ = [  # noqa: F822 - names that __getattr__ finds
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return _version()
     if name not in _MODULE_OF:
         raise AttributeError(f"module 'radiotwin' has no attribute {name!r}")
     return getattr(import_module(f"radiotwin.{_MODULE_OF[name]}"), name)
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version  # half the time of this import
+
+    try:
+        return version("radiotwin")
+    except PackageNotFoundError:  # run from a source tree that was never installed
+        return "0+source"
 
 
 def __dir__() -> list[str]:

@@ -1,21 +1,18 @@
-"""Options and exit statuses that the commands of both packages share."""
+"""Options that the commands of both packages share."""
 
 import functools
 import inspect
 import json
 import math
-import os
-import signal
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any
 
 import typer
 
 from radiotwin import progress
-from radiotwin.console import collected, complain, console
-from radiotwin.errors import BadInput, RunFailed
+from radiotwin.console import collected, console
 
 TABLES = ("build-scene", "import", "fit", "compare", "close-loop", "locate", "demo", "doctor")
 """Commands of `radiotwin` that print tables."""
@@ -86,50 +83,8 @@ def output(quiet: bool, as_json: bool) -> Iterator[None]:
     finally:
         console.quiet, progress.silent = before
         if done and as_json:
-            json.dump(_plain(collected), sys.stdout, indent=1, allow_nan=False, default=str)
-            sys.stdout.write("\n")
-
-
-class _Interrupted(BaseException):
-    """Ctrl-C. Typer would swallow a KeyboardInterrupt without a message."""
-
-
-def _interrupt(*_: Any) -> NoReturn:
-    raise _Interrupted
-
-
-def _terminate(*_: Any) -> NoReturn:
-    sys.exit(143)  # an exception, so that open files are cleaned up
-
-
-def exit_status(work: Callable[[], Any], kept: str) -> int:
-    """Do the work of a command; print one message for an error that the user can mend.
-
-    Args:
-        work: a Typer app, which may also end the process itself, or any function.
-        kept: part of the message after Ctrl-C: what is kept and how to go on.
-
-    Returns:
-        0 done, 1 failed while running, 2 bad input, 130 interrupted; SIGTERM ends the process
-        with 143.
-    """
-    signal.signal(signal.SIGINT, _interrupt)
-    signal.signal(signal.SIGTERM, _terminate)
-    try:
-        work()
-        return 0
-    except BadInput as error:
-        complain(str(error))
-        return 2
-    except RunFailed as error:
-        complain(str(error))
-        return 1
-    except _Interrupted:
-        complain(f"interrupted; {kept}")
-        return 130
-    except BrokenPipeError:  # the reader of a pipe has gone, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+            document = json.dumps(_plain(collected), indent=1, allow_nan=False, default=str)
+            sys.stdout.write(document + "\n")
 
 
 def _plain(value: Any) -> Any:

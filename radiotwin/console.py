@@ -1,29 +1,68 @@
-"""Print messages, warnings and tables the same way in every command."""
+"""Print messages, warnings and tables the same way in every command.
 
+Names come from strangers' files: what a terminal would obey is shown as an escape.
+"""
+
+import logging
+import re
 import warnings
+from collections.abc import Iterable
+from contextlib import suppress
 from typing import Any, TextIO
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
+from rich.segment import Segment
 from rich.table import Table
 
-console = Console(highlight=False)
-error_console = Console(stderr=True, highlight=False)
+# C0 but tab and line feed, DEL, C1; marks, embeddings, overrides and isolates of direction; line
+# and paragraph separators; halves of characters, as Python reads names that are not UTF-8.
+_OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069"
+                     "\ud800-\udfff]")
+
+
+def printable(text: str) -> str:
+    """Return a text with escapes in place of what a terminal would obey or could not show.
+
+    Args:
+        text: any; tabs and line feeds are kept.
+    """
+    return _OBEYED.sub(lambda match: repr(match[0])[1:-1], text)
+
+
+class PrintableConsole(Console):
+    """A console on which no text gives orders to the terminal, whatever prints it."""
+
+    def render(self, renderable: RenderableType,
+               options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Yield segments of printable text; see `rich.console.Console.render`.
+
+        Args:
+            renderable: anything that rich can print.
+            options: of the console.
+        """
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(printable(segment.text), segment.style)
+
+
+console = PrintableConsole(highlight=False)
+error_console = PrintableConsole(stderr=True, highlight=False)
 collected: dict[str, Any] = {}
 """Messages, tables and results printed so far, for `--json`."""
 
 
 def complain(message: str) -> None:
     """Print one message on standard error, without markup and without wrapping inside paths."""
-    error_console.print("[bold red]radiotwin:[/] ", end="")
-    error_console.print(message, markup=False, soft_wrap=True)
+    with suppress(OSError):  # standard error is closed, or its disk is full: nobody to tell
+        error_console.print("[bold red]radiotwin:[/] ", end="")
+        error_console.print(printable(message), markup=False, soft_wrap=True)
 
 
 def say(message: str) -> None:
     """Print one line on standard output."""
     collected.setdefault("messages", []).append(message)
-    console.print(message, markup=False, soft_wrap=True)
+    console.print(printable(message), markup=False, soft_wrap=True)
 
 
 def show_warnings_plainly() -> None:
@@ -32,9 +71,18 @@ def show_warnings_plainly() -> None:
              file: TextIO | None = None, line: str | None = None) -> None:
         path = filename.replace("\\", "/")
         if issubclass(category, UserWarning) and ("/radiotwin/" in path or "/marl/" in path):
-            error_console.print("[yellow]warning:[/] ", end="")
-            error_console.print(str(message), markup=False, soft_wrap=True)
+            with suppress(OSError):
+                error_console.print("[yellow]warning:[/] ", end="")
+                error_console.print(printable(str(message)), markup=False, soft_wrap=True)
+
     warnings.showwarning = show
+    if logging.lastResort is not None:  # of libraries that log; nothing else sets up logging
+        logging.lastResort.setFormatter(_PrintableLog())
+
+
+class _PrintableLog(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return printable(super().format(record))
 
 
 def result(name: str, value: Any) -> None:
@@ -53,10 +101,10 @@ def print_rows(title: str, columns: dict[str, str], rows: list[list]) -> None:
     names = [heading or f"column {number}" for number, heading in enumerate(columns, start=1)]
     collected.setdefault("tables", []).append(
         {"title": title, "rows": [dict(zip(names, row)) for row in rows]})
-    table = Table(title=escape(title), title_justify="left", title_style="bold", box=SIMPLE_HEAD,
-                  pad_edge=False)
+    table = Table(title=escape(_text(title)), title_justify="left", title_style="bold",
+                  box=SIMPLE_HEAD, pad_edge=False)
     for heading, justify in columns.items():
-        table.add_column(escape(heading), justify=justify)  # type: ignore[arg-type]  # a Literal
+        table.add_column(escape(_text(heading)), justify=justify)  # type: ignore[arg-type]  # a Literal
     for row in rows:
         table.add_row(*(escape(_text(cell)) for cell in row))
     console.print(table)
@@ -65,4 +113,4 @@ def print_rows(title: str, columns: dict[str, str], rows: list[list]) -> None:
 def _text(cell: Any) -> str:
     if isinstance(cell, float):
         return "–" if cell != cell else f"{cell:.2f}"
-    return str(cell)
+    return printable(str(cell)).replace("\n", "\\n").replace("\t", "\\t")

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from radiotwin.errors import BadInput, RunFailed
+from radiotwin.signals import deferred
 
 try:
     import fcntl
@@ -200,18 +201,22 @@ class _ErrorsKept(io.RawIOBase):
 def _temporary_folder(path: Path, suffix: str = "") -> Iterator[Path]:
     """Make and lock an empty folder beside `path`; remove it in the end."""
     _sweep(path.parent)
-    with _reported(path):
-        while True:
-            name = tempfile.mkdtemp(prefix=".radiotwin-", suffix=suffix, dir=path.parent)
-            handle = None if fcntl is None else os.open(name, os.O_RDONLY)
-            if handle is None or _locked(handle, name):
-                break
+    name: str | None = None
+    handle: int | None = None
     try:
+        with _reported(path), deferred():
+            while True:
+                name = tempfile.mkdtemp(prefix=".radiotwin-", suffix=suffix, dir=path.parent)
+                handle = None if fcntl is None else os.open(name, os.O_RDONLY)
+                if handle is None or _locked(handle, name):
+                    break
         yield Path(name)
     finally:
-        shutil.rmtree(name, ignore_errors=True)
-        if handle is not None:
-            os.close(handle)
+        with deferred():
+            if name is not None:
+                shutil.rmtree(name, ignore_errors=True)
+            if handle is not None:
+                os.close(handle)
 
 
 def _locked(handle: int, name: str) -> bool:
@@ -257,7 +262,7 @@ def _swap(new: Path, path: Path) -> None:
     if not path.exists():
         os.replace(new, path)
         return
-    with _temporary_folder(path, "-aside") as aside:
+    with _temporary_folder(path, "-aside") as aside, deferred():
         old = aside / path.name
         os.replace(path, old)
         try:

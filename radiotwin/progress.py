@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -12,6 +11,8 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+from radiotwin.console import PrintableConsole
 
 silent = False  # True hides every bar
 _displays: list[Progress] = []  # at most one: a terminal has room for one display
@@ -38,8 +39,8 @@ def progress(description: str, total: float | None) -> Iterator[Callable[..., No
         finally:
             _displays[0].remove_task(task)
         return
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+    console = PrintableConsole(stderr=True)
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
                TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True,
                   disable=silent or not console.is_terminal) as display:

@@ -25,7 +25,8 @@ SCHEMA, RECORDS = "radiotwin.study/1", Path(__file__).parents[1] / "docs" / "res
 MODULES = {"models": "models", "curve": "learning", "federation": "learning", "tuning": "learning",
            "options": "learning", "twin": "twins", "quality": "twins", "pays": "disturbances",
            "hidden": "closeloop", "null": "closeloop", "towers": "twins",
-           "real": "closeloop_real", "tracer": "tracer", "speed": "speed", "load": "load"}
+           "real": "closeloop_real", "tracer": "tracer", "speed": "speed", "load": "load",
+           "kill": "kill"}
 """Name of a study -> its module in this package."""
 Run = Callable[[int, dict], dict]
 Todo = list[tuple[str, int, dict]]

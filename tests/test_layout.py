@@ -26,11 +26,12 @@ LAYERS = (
     {"trace", "survey", "importing", "export", "footprints"},
     {"radiomap"},
     {"scene"},
-    {"antennas", "measurements", "command", "doctor"},
-    {"array_file", "geodesy", "llvm", "safe_xml", "cells", "console", "progress", "published", "records"},
+    {"antennas", "measurements", "command", "doctor", "exits"},
+    {"array_file", "geodesy", "llvm", "safe_xml", "cells", "progress", "published", "records"},
+    {"console"},
     {"files", "inputs", "plugins", "tables"},
     {"budgets"},
-    {"errors"},
+    {"errors", "signals"},
 )
 DEPTH = {part: depth for depth, row in enumerate(LAYERS) for part in row}
 # What planning takes of radiotwin ends at its objects: not how a city is traced, and not how a twin is corrected.

@@ -1,6 +1,10 @@
 """`python -m marl.fedqmix`: Algorithm 1 of the paper with any learner, and a comparison."""
 
-import sys
+from radiotwin import signals
+
+if __name__ == "__main__":
+    signals.handle()  # before anything that takes time
+
 from pathlib import Path
 from typing import Annotated
 
@@ -8,8 +12,9 @@ import typer
 
 from marl.options import settings_of, with_settings
 from marl.settings import LearnerSettings, RunSettings
-from radiotwin.command import exit_status, with_output_options
+from radiotwin.command import with_output_options
 from radiotwin.console import say, show_warnings_plainly
+from radiotwin.exits import exit_status
 
 
 @with_settings(RunSettings, LearnerSettings)
@@ -42,5 +47,5 @@ app.command()(with_output_options(fedqmix, prints_tables=True))
 
 
 if __name__ == "__main__":
-    sys.exit(exit_status(app, "the finished rounds are kept: the same command with --resume goes "
-                              "on"))
+    signals.leave(exit_status(app, "the finished rounds are kept: the same command with --resume "
+                                   "goes on"))

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from radiotwin import console
+from radiotwin import console, signals
 from radiotwin.cli import main
 
 COMMAND = Path(sys.executable).with_name("radiotwin")
@@ -24,7 +24,7 @@ COLUMNS = 100
 def as_in_a_process_of_its_own(arguments: list[str], cwd: Path) -> Iterator[None]:
     """Restore the state of the process that a command changes."""
     argv, folder, show = sys.argv, Path.cwd(), warnings.showwarning
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.getsignal(number) for number in (*signals.NUMBERS, signal.SIGALRM)}
     width = console.console.width
     try:
         sys.argv, console.console.width = ["radiotwin", *arguments], COLUMNS

@@ -11,11 +11,12 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from radiotwin.cli import app
+from radiotwin.cli.commands import app
 from radiotwin.command import TABLES, add_output_options
 from radiotwin.console import print_rows, say
 
 COMMAND = Path(sys.executable).with_name("radiotwin")
+ROOT = str(Path(__file__).parents[2])
 AT_RANDOM = ("build-scene", "trace", "survey", "fit", "compare", "close-loop", "demo")
 
 
@@ -75,9 +76,51 @@ def test_the_real_command(run_installed, run, tmp_path):
     assert "\x1b" not in text, "no colours where nobody looks"
 
 
-def test_bad_input_is_no_json(run, tmp_path):
-    done = run("fit nothing.csv --scene nowhere --json", tmp_path)
-    assert done.returncode == 2 and done.stdout == "" and "does not exist" in done.stderr
+@pytest.mark.parametrize("arguments, part", [
+    ("fit nothing.csv --scene nowhere --json", "does not exist"), ("fit --json", "Missing argument"),
+    ("fit a.csv --nope 3 --json", "No such option"), ("nothing --json", "No such command")])
+def test_an_error_is_json_too(arguments, part, run, tmp_path):
+    done = run(arguments, tmp_path)
+    error = json.loads(done.stdout)["error"]
+    assert done.returncode == 2 == error["status"] and part in error["message"] and part in done.stderr
+
+
+def test_wrong_options_are_one_message(run, tmp_path):
+    done = run("fit a.csv --scene s --seed x\x1b[31m\u202e", tmp_path)
+    assert done.returncode == 2 and done.stdout == "" and len(done.stderr.splitlines()) == 1
+    assert "'--seed'" in done.stderr and "radiotwin fit --help shows" in done.stderr
+    assert "\x1b" not in done.stderr and "\u202e" not in done.stderr
+    assert run("", tmp_path).returncode == 2 and "close-loop" in run("--help", tmp_path).stdout
+
+
+def shell(line, folder, **environment):
+    """Run a line of the shell in which `$RADIOTWIN` is the command, as a process of its own."""
+    program = f"{sys.executable} -c 'from radiotwin.cli import main; main()'"
+    return subprocess.run(["bash", "-c", line.replace("$RADIOTWIN", program)], cwd=folder, capture_output=True,
+                          text=True, timeout=60, env=os.environ | {"PYTHONPATH": ROOT} | environment)
+
+
+@pytest.mark.parametrize("line, status, said", [
+    ("$RADIOTWIN build-scene preset:small --check | true; exit ${PIPESTATUS[0]}", 141, 0),
+    ("$RADIOTWIN build-scene preset:small --check >&-", 0, 0),
+    ("$RADIOTWIN build-scene preset:small --check --json >&-", 0, 0),
+    ("$RADIOTWIN build-scene nothing 2>&-", 2, 0),
+    ("$RADIOTWIN build-scene nothing 2>/dev/full", 2, 0),
+    ("$RADIOTWIN build-scene preset:small --check >/dev/full", 1, 1),
+    ("$RADIOTWIN build-scene preset:small --check --json >/dev/full", 1, 1),
+    ("$RADIOTWIN --help >/dev/full", 1, 1)])
+def test_an_output_that_takes_nothing_is_no_traceback(line, status, said, tmp_path):
+    done = shell(line, tmp_path)
+    assert (done.returncode, len(done.stderr.splitlines())) == (status, said), done.stderr
+    assert "standard output cannot be written" in done.stderr or not said
+
+
+@pytest.mark.parametrize("environment", [{"PYTHONIOENCODING": "ascii"}, {"TERM": "dumb", "COLUMNS": "1"},
+                                         {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}])
+def test_any_terminal_will_do(environment, tmp_path):
+    done = shell("$RADIOTWIN build-scene preset:small --check", tmp_path,
+                 **environment)
+    assert done.returncode == 0 and done.stderr == "" and "problems" in done.stdout.replace("\n", "")
 
 
 @pytest.mark.parametrize("arguments, expected", [("radiotwin clo", "close-loop"),

@@ -1,0 +1,34 @@
+"""All commands of `radiotwin`: parse options, call one function of the library, show its result.
+
+Heavy packages are imported inside the commands, so that `--help` answers at once.
+"""
+
+import typer
+
+from radiotwin import __version__
+from radiotwin.cli import importing, loop, model, report, scenes, tools, world
+from radiotwin.command import add_output_options
+from radiotwin.console import show_warnings_plainly
+
+app = typer.Typer(
+    name="radiotwin", no_args_is_help=True, pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # or every [default] in a help text is taken for markup
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Radio digital twins of cities, learnt from measurements. Build, trace and survey a "
+         "scene; fit a twin to the measurements; map and compare it.")
+
+for module in (scenes, world, importing, model, loop, report, tools):
+    module.add_commands(app)
+add_output_options(app)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"radiotwin {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(version: bool = typer.Option(False, "--version", callback=_show_version, is_eager=True,
+                                          help="Print the version and exit.")) -> None:
+    show_warnings_plainly()

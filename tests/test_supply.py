@@ -1,0 +1,46 @@
+"""What is installed, and what SECURITY.md promises about it."""
+
+import re
+from pathlib import Path
+
+from radiotwin import budgets
+
+ROOT = Path(__file__).parents[1]
+
+
+def normal(name):
+    return re.sub("[-_.]+", "-", name).lower()
+
+
+def pinned(text):
+    """Return name -> version of lines such as `name==1.0`."""
+    return {normal(name): version for name, version in re.findall(r"^([\w.-]+)==([^\s;\\]+)", text, re.MULTILINE)}
+
+
+def test_the_lock_file_has_the_versions_of_the_constraints_and_a_hash_for_each():
+    lock = (ROOT / "requirements.lock").read_text()
+    constraints, locked = pinned((ROOT / "constraints.txt").read_text()), pinned(lock)
+    assert {name: locked.get(name) for name in constraints} == constraints
+    entries = re.split(r"^(?=[\w.-]+==)", lock, flags=re.MULTILINE)
+    assert "uv pip compile pyproject.toml" in entries[0] and "--default-index https://pypi.org/simple" in entries[0]
+    assert len(entries) - 1 == len(locked)
+    assert all(re.search(r"--hash=sha256:[0-9a-f]{64}", entry) for entry in entries[1:])
+    assert not re.search(r"extra-index|^-|https?://(?!pypi)", lock, re.MULTILINE)
+
+
+def test_the_lock_file_has_every_declared_dependency():
+    declared = (ROOT / "pyproject.toml").read_text().split("[project.scripts]")[0].split("dependencies = [")[1]
+    names = {normal(name) for name in re.findall(r'"([A-Za-z][\w.-]*)(?:\[\w+\])?>=', declared)}
+    assert len(names) > 30 and names <= pinned((ROOT / "requirements.lock").read_text()).keys()
+
+
+def test_every_budget_is_in_the_table():
+    table = re.findall(r"^\| `(\w+)` \| ([\d,]+) \| ([^|]+) \|", (ROOT / "SECURITY.md").read_text(), re.MULTILINE)
+    assert table == [(each.variable, f"{each.default:,}", each.unit) for each in vars(budgets).values()
+                     if isinstance(each, budgets.Budget)]
+
+
+def test_nothing_takes_packages_from_two_indexes():
+    for name in ("README.md", "Makefile", "SECURITY.md", "CONTRIBUTING.md"):
+        lines = [line for line in (ROOT / name).read_text().splitlines() if "--extra-index-url " in line]
+        assert not lines, name
