@@ -19,6 +19,8 @@ from radiotwin.inputs import open_gzip, open_input
 _WHAT = "table (.csv, .csv.gz, .parquet)"
 _BLOCK_BYTES = 2**20  # of a CSV file that are checked at a time
 _CHUNK_CELLS = 2_000_000  # that are parsed at a time
+_NUMBERS_AT_ONCE = 1_000_000  # pandas makes an object of each
+_MAX_DIGITS = 1000  # of a number
 _PARQUET_ROWS, _NESTED_ROWS = 2**17, 2**10  # that are decoded at a time
 _SHOWN_CHARACTERS, _SHOWN_COLUMNS = 80, 50  # of a cell, and of a table, in a message
 # A spreadsheet takes a cell for a formula that begins so; the last four are full-width.
@@ -140,6 +142,23 @@ def refuse(path: Path, name: str, column: pd.Series, bad: ArrayLike, reason: str
                        f"{shown(column.iloc[rows[0]])} {reason}{more}")
 
 
+def as_numbers(text: pd.Series) -> np.ndarray:
+    """Convert texts to numbers, (n,); NaN where one is not a number, or empty.
+
+    Args:
+        text: (n,) without spaces around.
+    """
+    numbers = np.empty(len(text))
+    for start in range(0, len(text), _NUMBERS_AT_ONCE):
+        rows = slice(start, start + _NUMBERS_AT_ONCE)
+        try:
+            numbers[rows] = pd.to_numeric(text.iloc[rows], errors="coerce")
+        except ValueError:  # an integer of more digits than Python converts
+            short = text.iloc[rows].mask(text.iloc[rows].str.len() > _MAX_DIGITS, "")
+            numbers[rows] = pd.to_numeric(short, errors="coerce")
+    return numbers
+
+
 def shown(cell: object) -> str:
     """Return the text of a cell in quotation marks for a message, cut where it is long."""
     text = str(cell)
@@ -198,8 +217,8 @@ def _read_parquet(path: Path, required: Collection[str],
     """Read Parquet without the index that pandas may have saved.
 
     A table that was filtered or sorted before it was saved would keep its old row labels; messages
-    count rows. It is decoded in batches, whose texts count before they are written out: a dictionary
-    can stand for far more than it takes in the file.
+    count rows. It is decoded in batches, whose texts count before they are written out: a
+    dictionary can stand for far more than it takes in the file.
     """
     require_pyarrow(path)
     import pyarrow
@@ -317,8 +336,8 @@ class _Layout:
     def _checked(self, block: bytes) -> bytes:
         block.decode()
         if b"\0" in block:
-            raise BadInput(f"{self._path} is not text in UTF-8 (it has null characters); allowed is "
-                           "comma-separated, UTF-8")
+            raise BadInput(f"{self._path} is not text in UTF-8 (it has null characters); allowed "
+                           "is comma-separated, UTF-8")
         self.has_apostrophes = self.has_apostrophes or b"'" in block
         return block
 
@@ -365,8 +384,8 @@ class _Layout:
     def _begin(self, header: list[str]) -> None:
         self.header, self.rows = [_unquoted(name.strip()) for name in header], 1
         if len(header) == 1 and not self.header[0].isidentifier():
-            raise BadInput(f"{self._path}: its header {self.header[0][:60]!r} is one single column; "
-                           "allowed is comma-separated, UTF-8")
+            raise BadInput(f"{self._path}: its header {self.header[0][:60]!r} is one single "
+                           "column; allowed is comma-separated, UTF-8")
 
     def _add(self, rows: int) -> None:
         self.rows += rows

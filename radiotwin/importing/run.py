@@ -58,6 +58,7 @@ def import_file(path: Path | str, settings: Settings, out: Path | str, compress:
     readings = rows * per_row
     tally.count("repeats an earlier row exactly", "", len(repeated) * per_row,
                 source.where(repeated[0]) if repeated else "")
+    source = source.without_cells()
     on_progress("positions")
     positioned = add_positions(source, links, settings, tally)
     positioned = _filtered(source, positioned, settings, tally)
@@ -93,22 +94,37 @@ def _check_target(out: Path) -> None:
 
 def _without_repetition(source: Source) -> tuple[Source, list[int]]:
     """Remove the rows that equal an earlier one in every column; return also their indices."""
-    comparable = source.table
-    if comparable.dtypes.eq(object).any():
+    table = source.table
+    rows = np.arange(len(table))  # that repeat, or are repeated, in the columns so far
+    for name in table:
+        cells = table[name].iloc[rows]
+        if cells.dtype.kind == "O":
+            cells = cells.astype(str)
+        number, values = pd.factorize(cells, use_na_sentinel=False)
+        rows = rows[(np.bincount(number, minlength=len(values)) > 1)[number]]
+        if not len(rows):
+            return source, []
+    comparable = table.iloc[rows]
+    if table.dtypes.eq(object).any():
         comparable = comparable.astype(str)
-    repeats = comparable.duplicated()
-    unique = Source(source.path, source.table[~repeats], source.where)
-    return unique, list(source.table.index[repeats])
+    repeats = np.zeros(len(table), dtype=bool)
+    repeats[rows] = comparable.duplicated()
+    if not repeats.any():
+        return source, []
+    unique = Source(source.path, table[~repeats], source.where)
+    return unique, list(table.index[repeats])
 
 
 def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,
               tally: Tally) -> PositionedLinks:
     """Apply the limits of distance and level; a link whose value is unknown passes."""
     links = positioned.links
-    difference_m = links[[f"receiver_{axis}_m" for axis in "xyz"]].to_numpy() - positioned.device_m
-    difference_m[np.isnan(difference_m[:, 2]), 2] = 0.0
-    distance_m = np.linalg.norm(difference_m, axis=1)
-    level_db = links["level_db"].to_numpy()
+    distance_m, level_db = None, links["level_db"].to_numpy()
+    if settings.min_distance_m is not None or settings.max_distance_m is not None:
+        difference_m = (links[[f"receiver_{axis}_m" for axis in "xyz"]].to_numpy()
+                        - positioned.device_m)
+        difference_m[np.isnan(difference_m[:, 2]), 2] = 0.0
+        distance_m = np.linalg.norm(difference_m, axis=1)
     keep = np.ones(len(links), dtype=bool)
     for limit, values, is_minimum, text in (
             (settings.min_distance_m, distance_m, True, "nearer than {} m"),
@@ -122,6 +138,8 @@ def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,
             where = source.where(links.index[int(np.argmax(bad))])
             tally.count(text.format(limit), "", bad.sum(), where)
             keep &= ~bad
+    if keep.all():
+        return positioned
     links = links[keep]
     devices = positioned.devices
     devices = devices[devices["device"].isin(links["device"])].reset_index(drop=True)
