@@ -18,6 +18,7 @@ EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
 """Texts, in lower case, of cells without a value."""
 ALWAYS = "always "
 """Prefix of a constant in place of a column's name."""
+_ROWS_AT_ONCE = 1_000_000  # of which stripped texts are made
 FORMATS = (".csv", ".parquet", ".geojson", ".json")
 
 
@@ -77,12 +78,15 @@ class Source:
         Raises:
             BadInput: no such column, or a text that cannot be a name.
         """
-        text = self.text(spec, purpose)
-        number, names = pd.factorize(text)
+        cells = self.cells(spec, purpose)
+        if not isinstance(cells.dtype, pd.StringDtype):
+            cells = as_text(cells)
+        number, different = pd.factorize(cells, use_na_sentinel=False)
+        names = as_text(pd.Series(different))
         for i, name in enumerate(names):
             if name and (fault := name_fault(name)):
-                self.refuse(spec, text, number == i, fault)
-        return np.asarray(names, dtype=object)[number]
+                self.refuse(spec, pd.Series(name, index=self.table.index), number == i, fault)
+        return names.to_numpy(dtype=object)[number]
 
     def without_cells(self) -> "Source":
         """Return the same file for messages only, without the memory of its cells."""
@@ -102,9 +106,15 @@ class Source:
         if cells.dtype.kind in "fiu":
             numbers = cells.to_numpy(dtype=float, na_value=np.nan)
         else:
-            text = as_text(cells)
-            numbers = as_numbers(text)
-            self.refuse(spec, text, np.isnan(numbers) & (text != ""), "is not a number")
+            numbers = np.full(len(cells), np.nan)
+            wrong = np.zeros(len(cells), dtype=bool)
+            for start in range(0, len(cells), _ROWS_AT_ONCE):
+                rows = slice(start, start + _ROWS_AT_ONCE)
+                text = as_text(cells.iloc[rows])
+                numbers[rows] = as_numbers(text)
+                wrong[rows] = np.isnan(numbers[rows]) & (text != "")
+            if wrong.any():
+                self.refuse(spec, as_text(cells), wrong, "is not a number")
         self.refuse(spec, cells, np.isinf(numbers), "is not finite")
         return numbers
 

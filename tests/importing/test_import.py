@@ -237,5 +237,5 @@ def test_options_overrule_the_file_and_tables_lie_beside_it(tmp_path):
         (tmp_path / "m.toml").write_text(text)
         with pytest.raises(BadInput, match=message):
             read_settings(tmp_path / "m.toml", {})
-    with pytest.raises(BadInput, match="none.toml cannot be read"):
+    with pytest.raises(BadInput, match="none.toml does not exist"):
         read_settings(tmp_path / "none.toml", {})
