@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from radiotwin.cells import write_csv
 from radiotwin.compare import Comparison
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
@@ -70,8 +71,7 @@ def write_comparison(comparison: Comparison, scene: Scene, folder: Path | str) -
     for name, table in (("scores.csv", comparison.scores), ("locations.csv", comparison.locations),
                         ("predictions.csv.gz", comparison.predictions)):
         with atomic_path(folder / name) as temporary:
-            table.to_csv(temporary, index=False, float_format="%.4f",
-                         compression="gzip" if name.endswith(".gz") else None)
+            write_csv(table, temporary, "%.4f")
 
 
 def _rows(table: pd.DataFrame) -> list[dict]:

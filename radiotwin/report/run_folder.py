@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from radiotwin.cells import without_quotes
 from radiotwin.closeloop.result_file import SCHEMA, SCHEMA_1, upgrade_report
 from radiotwin.compare import Comparison
 from radiotwin.errors import BadInput
@@ -231,4 +232,4 @@ def _read_table(path: Path, columns: list[str]) -> pd.DataFrame:
     missing = [name for name in columns if name not in table]
     if missing:
         raise BadInput(f"{path}: column {missing[0]!r} is missing; make the run again")
-    return table
+    return without_quotes(table)

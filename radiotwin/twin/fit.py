@@ -24,8 +24,8 @@ from radiotwin.twin.twin import Twin
 
 MAX_BLANK, LIMIT_GAP_DB = 0.02, 10.0  # beyond both, blanks and the limit of detection disagree
 DOFS = (3.0, 5.0, 10.0, 30.0)  # of the errors, that are tried
-# Of more links, so many are fitted: a law of a few numbers is then exact to hundredths of a decibel,
-# and a network's training time is in proportion to them.
+# Of more links, so many are fitted: a law of a few numbers is then exact to hundredths of a
+# decibel, and the time that a network is trained is in proportion to them.
 MAX_LINKS, THINNED_LINKS = 1_000_000, 300_000
 MIN_HEARD = 30  # links of a class of line of sight, to learn its level from
 MIN_LOSS_NATS = 0.02  # a link, to be worse than the law, which has more numbers to be fitted
