@@ -1,5 +1,6 @@
 """Measured levels of links, and their devices: two tables, checked when they are read."""
 
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -125,7 +126,7 @@ class Measurements:
 
     def _check_replaceable(self, path: Path) -> None:
         """Allow replacing a table of the same devices only; another one may be the only copy."""
-        if not path.exists():
+        if not os.path.exists(path):  # False, not an error, of a name that no file can have
             return
         try:
             same = sorted(read_devices(path)["device"]) == sorted(self.devices["device"])
@@ -154,7 +155,7 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
         raise BadInput(f"{path}: needs exactly one of the columns {LEVELS}, it has "
                        f"{levels or 'neither'}")
     devices_path = Path(devices_path) if devices_path else path.parent / "devices.csv"
-    if not devices_path.is_file():
+    if not os.path.exists(devices_path):
         raise BadInput(f"{devices_path} does not exist; the table of devices needs the columns "
                        f"{', '.join(DEVICE_REQUIRED)} (role: {' or '.join(ROLES)}); --devices "
                        "names another file")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from radiotwin.cells import shown
 from radiotwin.errors import BadInput
 from radiotwin.geodesy import to_local
 from radiotwin.tables import Origin
@@ -100,8 +101,8 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
     try:
         system = CRS(crs)
     except CRSError as error:
-        raise BadInput(f"crs {crs!r} is unknown; allowed is what PROJ knows, such as EPSG:32633 "
-                       f"(UTM 33 N): {error}") from None
+        raise BadInput(f"crs {shown(crs)} is unknown; allowed is what PROJ knows, such as "
+                       f"EPSG:32633 (UTM 33 N): {str(error)[:200]}") from None
     if not system.is_projected:
         raise BadInput(f"crs {crs} is {system.type_name}, not a projected one with x and y; "
                        "degrees go into latitude and longitude")

@@ -71,7 +71,7 @@ def _check_near(source: Source, links: pd.DataFrame, position_m: np.ndarray, end
     if far.any():
         row = int(np.argmax(far))
         raise BadInput(f"{source.path}: {source.where(links.index[row])}: the {end} lies "
-                       f"{np.nanmax(np.abs(position_m[row])) / 1000:.0f} km from the origin "
+                       f"{np.nanmax(np.abs(position_m[row])) / 1000:.10g} km from the origin "
                        f"({far.sum()} such rows); are position, unit and origin right?")
 
 

@@ -1,6 +1,7 @@
 """The whole import: from a file to a folder."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -85,7 +86,7 @@ def import_file(path: Path | str, settings: Settings, out: Path | str, compress:
 
 def _check_target(out: Path) -> None:
     """Refuse a folder that holds anything but an earlier import."""
-    if out.is_dir():
+    if os.path.isdir(out):  # False, not an error, of a name that no folder can have
         others = sorted(path.name for path in out.iterdir() if path.name not in FILES)
         if others or (any(out.iterdir()) and not (out / "import.json").is_file()):
             detail = f" (it has {others[0]})" if others else ""
