@@ -1,12 +1,13 @@
 """Fitting a twin: what it is learnt from, and what is refused or warned of."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
-from radiotwin.twin import Twin, fit_twin
+from radiotwin.twin import Twin, fit, fit_twin
 
 
 def test_positions_of_unknown_devices_are_not_read(small_scene, flown, twin):
