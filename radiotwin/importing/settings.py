@@ -107,7 +107,8 @@ class Settings(Table):
     level_unit: Literal["dBm", "dB", "mW", "W"] | None = None
     length_unit: Literal["m", "ft"] | None = None
     time_format: str | None = Field(
-        None, max_length=200, description="epoch s, epoch ms, ISO 8601, or a strftime format")
+        None, max_length=200,
+        description="epoch s, epoch ms, ISO 8601, or a strftime format")
     time_zone: str | None = None
     not_detected: list[Number | str] = Field(
         [], description="levels that mean: not detected; `empty` is an empty cell")
