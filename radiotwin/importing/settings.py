@@ -122,7 +122,8 @@ class Settings(Table):
     average_m: Positive | None = Field(None, description="length of the bins of the local mean")
     average: Literal["power", "median"] = "power"
     crs: str | None = Field(
-        None, max_length=10_000, description="of x and y, such as EPSG:32612; without one they are local")
+        None, max_length=10_000,
+        description="of x and y, such as EPSG:32612; without one they are local")
     devices: str | None = Field(None, description="table of the devices' positions")
     receivers: str | None = Field(None, description="table of the fixed receivers' positions")
     origin: Origin | None = None
