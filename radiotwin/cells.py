@@ -167,9 +167,9 @@ def shown(cell: object) -> str:
 
 def listed(names: Iterable[object]) -> str:
     """Return the names of columns for a message, the first ones where there are many."""
-    names = [str(name)[:_SHOWN_CHARACTERS] for name in names]
-    more = f", … ({len(names):,} columns)" if len(names) > _SHOWN_COLUMNS else ""
-    return ", ".join(names[:_SHOWN_COLUMNS]) + more
+    texts = [str(name)[:_SHOWN_CHARACTERS] for name in names]
+    more = f", … ({len(texts):,} columns)" if len(texts) > _SHOWN_COLUMNS else ""
+    return ", ".join(texts[:_SHOWN_COLUMNS]) + more
 
 
 def _quoted(text: Any) -> Any:

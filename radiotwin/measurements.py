@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -216,8 +216,7 @@ def _read_table(path: Path, required: list[str], optional: list[str],
         else:
             cells = table[name]
             table[name] = _numbers(path, name, cells, name in may_be_empty)
-            refuse_limits(lambda bad, reason, name=name, cells=cells:
-                          refuse(path, name, cells, bad, reason), name, table[name].to_numpy())
+            refuse_limits(partial(refuse, path, name, cells), name, table[name].to_numpy())
     return table
 
 
