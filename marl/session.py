@@ -20,6 +20,7 @@ from marl.registry import learner_class
 from marl.settings import LearnerSettings, RunSettings
 from marl.sizes import check_sizes
 from marl.threads import keep_memory, limit_threads, torch_device
+from radiotwin.cells import write_csv
 from radiotwin.console import print_rows
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.files import atomic_file, atomic_path, is_temporary
@@ -132,7 +133,7 @@ class Session:
                     for name in baselines]
         table = pd.DataFrame(entries)
         with atomic_path(self.out / "comparison.csv") as temporary:
-            table.to_csv(temporary, index=False)
+            write_csv(table, temporary)
         levels = {entry["method"]: entry["truth_ratio"] for entry in entries
                   if entry["method"] in baselines}
         curves = {f"{self.run.algorithm} in {TRAINED_IN[twin]}": outcome.rows
@@ -140,7 +141,7 @@ class Session:
         draw_curve(curves, levels, self.out / "curve.png")
         flights, typical = main.flights, choose_flight(main.flights, real)
         with atomic_path(self.out / "flights.csv") as temporary:
-            track_table(scene, real, flights, typical).to_csv(temporary, index=False)
+            write_csv(track_table(scene, real, flights, typical), temporary)
         draw_trajectories(scene, real, flights, typical, main.known, self.out / "trajectories.png")
         print_rows(f"Collected in the truth ({self.run.truth}), of all data; mean and standard "
                    f"deviation of {self.run.flights} flights",
@@ -187,7 +188,7 @@ class _Log:
 
     def __call__(self, rows: list[dict], blocks: list[dict]) -> None:
         with atomic_path(self._folder / "metrics.csv") as temporary:
-            pd.DataFrame(rows).to_csv(temporary, index=False)
+            write_csv(pd.DataFrame(rows), temporary)
         try:
             self._log(rows, blocks)
         except OSError as error:

@@ -80,6 +80,7 @@ ENTRIES = Budget("ENTRIES", 100_000, "entries")  # of one list or object in it
 SETTINGS_BYTES = Budget("SETTINGS_BYTES", 4 * 2**20, "bytes")  # TOML
 NESTING = Budget("NESTING", 100, "levels of nesting")
 ROWS = Budget("ROWS", 50_000_000, "rows")
+ROW_BYTES = Budget("ROW_BYTES", 16 * 2**20, "bytes in one row")  # of a CSV file
 COLUMNS = Budget("COLUMNS", 5_000, "columns")
 CELLS = Budget("CELLS", 1_000_000_000, "cells")  # rows times columns of a table
 MAP_VALUES = Budget("MAP_VALUES", 500_000_000, "values")  # of one variable of a radio map

@@ -1,6 +1,5 @@
 """Read further models for a comparison, write its tables, and read them."""
 
-import gzip
 import json
 import warnings
 from collections import Counter
@@ -11,9 +10,10 @@ import numpy as np
 import pandas as pd
 from pydantic import field_validator
 
+from radiotwin.cells import write_csv
 from radiotwin.compare import CLASSES, Comparison
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_file, atomic_path
+from radiotwin.files import atomic_path
 from radiotwin.radiomap import RadioMap
 from radiotwin.records import Number, Record, Whole, read_record, validated
 from radiotwin.scene import Scene
@@ -115,10 +115,8 @@ def write_comparison(comparison: Comparison, scene: Scene, folder: Path | str) -
         temporary.write_text(json.dumps(record, indent=1, allow_nan=False), encoding="utf-8")
     for name, table in (("scores.csv", comparison.scores), ("locations.csv", comparison.locations),
                         ("predictions.csv.gz", comparison.predictions)):
-        with atomic_file(folder / name) as file:
-            text = table.to_csv(index=False, float_format="%.4f").encode()
-            # The same bytes when it is run again: no time in the header.
-            file.write(gzip.compress(text, mtime=0) if name.endswith(".gz") else text)
+        with atomic_path(folder / name) as temporary:
+            write_csv(table, temporary, "%.4f")
 
 
 def read_comparison(path: Path) -> Comparison:

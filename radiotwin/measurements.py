@@ -1,16 +1,27 @@
 """Measured levels of links, and their devices: two tables, checked when they are read."""
 
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
-from radiotwin.cells import check_suffix, read_cells, refuse, require_pyarrow
+from radiotwin.budgets import DEVICES
+from radiotwin.cells import (
+    as_numbers,
+    check_suffix,
+    read_cells,
+    refuse,
+    require_pyarrow,
+    shown,
+    write_csv,
+)
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
+from radiotwin.tables import name_fault
 
 # Columns of the two files, as in docs/conventions.md.
 REQUIRED = ["flight", "receiver", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device"]
@@ -25,7 +36,13 @@ _DEVICE_MAY_BE_EMPTY = {"x_m", "y_m", "z_m", *DEVICE_OPTIONAL}
 # Limits that no measurement exceeds: what lies beyond them is another unit or a placeholder.
 MAX_LEVEL_DB = 300.0
 MAX_COORDINATE_M = 1e7  # a quarter of a meridian
+MAX_APART_M = 1e6  # between an anchor and the receivers' middle: no radio link is so long
 FREQUENCIES_HZ = (1e6, 450e9)  # as of a scene; materials of ITU-R P.2040 end at 450 GHz
+MAX_TIME_S = 1e11  # the year 5138; milliseconds since 1970 lie beyond
+MAX_SPAN_S = 3.2e9  # a century, the longest campaign
+MAX_ANGLE_DEG = 1e6  # thousands of turns in one direction, which some compasses count
+MAX_POWER_DBM = 300.0  # as of a level
+MAX_QUALITY = 1e15  # whole numbers are exact up to there
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,17 +117,16 @@ class Measurements:
                            "the links; give the links another name, such as measurements.csv")
         self._check_replaceable(path.parent / "devices.csv")
         with atomic_path(path.parent / "devices.csv") as devices, atomic_path(path) as links:
-            self.devices.to_csv(devices, index=False)
+            write_csv(self.devices, devices)
             if path.suffix == ".parquet":
                 require_pyarrow(path)
                 self.table.to_parquet(links, index=False)
             else:
-                compression = "gzip" if path.suffix == ".gz" else None
-                self.table.to_csv(links, index=False, compression=compression)
+                write_csv(self.table, links)
 
     def _check_replaceable(self, path: Path) -> None:
         """Allow replacing a table of the same devices only; another one may be the only copy."""
-        if not path.exists():
+        if not os.path.exists(path):  # False, not an error, of a name that no file can have
             return
         try:
             same = sorted(read_devices(path)["device"]) == sorted(self.devices["device"])
@@ -139,7 +155,7 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
         raise BadInput(f"{path}: needs exactly one of the columns {LEVELS}, it has "
                        f"{levels or 'neither'}")
     devices_path = Path(devices_path) if devices_path else path.parent / "devices.csv"
-    if not devices_path.is_file():
+    if not os.path.exists(devices_path):
         raise BadInput(f"{devices_path} does not exist; the table of devices needs the columns "
                        f"{', '.join(DEVICE_REQUIRED)} (role: {' or '.join(ROLES)}); --devices "
                        "names another file")
@@ -152,6 +168,7 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
         raise BadInput(f"{path}: row {row + 2}, column device: {table['device'][row]!r} is not in "
                        f"{devices_path} (it has {_enumerate(devices['device'])}); add it there or "
                        "correct the name")
+    _check_spread(path, table, devices_path, devices)
     return Measurements(table, devices)
 
 
@@ -171,6 +188,7 @@ def read_devices(path: Path | str) -> pd.DataFrame:
     devices = _read_table(path, DEVICE_REQUIRED, DEVICE_OPTIONAL, _DEVICE_MAY_BE_EMPTY)
     if devices.empty:
         raise BadInput(f"{path}: has no rows; it needs one for each device")
+    DEVICES.check(len(devices), path)
     repeated = devices["device"].duplicated()
     if repeated.any():
         row = int(np.flatnonzero(repeated)[0])
@@ -179,8 +197,8 @@ def read_devices(path: Path | str) -> pd.DataFrame:
     wrong = ~devices["role"].isin(ROLES)
     if wrong.any():
         row = int(np.flatnonzero(wrong)[0])
-        raise BadInput(f"{path}: row {row + 2}, column role: {devices['role'][row]!r}; allowed are "
-                       f"{ROLES}")
+        raise BadInput(f"{path}: row {row + 2}, column role: {shown(devices['role'][row])}; "
+                       f"allowed are {ROLES}")
     unplaced = (devices["role"] == "anchor") & devices[["x_m", "y_m"]].isna().any(axis=1)
     if unplaced.any():
         row = int(np.flatnonzero(unplaced)[0])
@@ -191,20 +209,24 @@ def read_devices(path: Path | str) -> pd.DataFrame:
 
 def _read_table(path: Path, required: list[str], optional: list[str],
                 may_be_empty: set[str]) -> pd.DataFrame:
-    cells = read_cells(path)
-    missing = [name for name in required if name not in cells]
-    if missing:
-        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {required}, it has "
-                       f"{list(cells.columns)}")
-    table = cells[[name for name in cells.columns if name in required + optional]].copy()
+    table = read_cells(path, required, optional)
     for name in table.columns:
         if name in _TEXT:
-            table[name] = table[name].astype(str).str.strip()
-            refuse(path, name, table[name], table[name] == "", "is empty; give a name")
+            table[name] = _names(path, name, table[name])
         else:
-            table[name] = _numbers(path, name, table[name], name in may_be_empty)
-            _check_limits(path, name, cells[name], table[name])
+            cells = table[name]
+            table[name] = _numbers(path, name, cells, name in may_be_empty)
+            refuse_limits(partial(refuse, path, name, cells), name, table[name].to_numpy())
     return table
+
+
+def _names(path: Path, name: str, column: pd.Series) -> pd.Series:
+    """Return the names in a column without spaces around them."""
+    names = column.astype(str).str.strip()
+    faults = {text: fault for text in names.unique() if (fault := name_fault(text))}
+    for text, fault in faults.items():
+        refuse(path, name, names, names == text, fault)
+    return names
 
 
 def _numbers(path: Path, name: str, column: pd.Series, may_be_empty: bool) -> pd.Series:
@@ -215,12 +237,12 @@ def _numbers(path: Path, name: str, column: pd.Series, may_be_empty: bool) -> pd
     else:
         text = column.fillna("").astype(str).str.strip()
         empty = text == ""
-        numbers = pd.to_numeric(text, errors="coerce")
-        named_nan = text.str.lower().isin(["nan", "na", "none"])
+        numbers = pd.Series(as_numbers(text), index=column.index)
+        named_nan = numbers.isna() & ~empty
+        named_nan[named_nan] = text[named_nan].str.lower().isin(["nan", "na", "none"])
         refuse(path, name, column, numbers.isna() & ~empty & ~named_nan, "is not a number")
         remedy = "leave the cell empty where there is no value" if may_be_empty else needed
         refuse(path, name, column, named_nan, f"is not a number; {remedy}")
-        numbers = numbers.astype(float)
     remedy = "; leave the cell empty where nothing was detected" if name in LEVELS else ""
     refuse(path, name, column, np.isinf(numbers), f"is not finite{remedy}")
     if not may_be_empty:
@@ -228,23 +250,61 @@ def _numbers(path: Path, name: str, column: pd.Series, may_be_empty: bool) -> pd
     return numbers
 
 
-def _check_limits(path: Path, name: str, column: pd.Series, numbers: pd.Series) -> None:
-    """Refuse numbers that can only be mistakes, such as a wrong unit."""
+def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
+                  numbers: np.ndarray) -> None:
+    """Refuse numbers of a column that can only be mistakes, such as a wrong unit.
+
+    Args:
+        refuse: called with (n,) bool and the reason; raises where one is true.
+        name: of the column, as in `measurements.csv` or `devices.csv`.
+        numbers: (n,) in its unit; NaN where empty.
+    """
     if name in LEVELS:
-        refuse(path, name, column, numbers.abs() > MAX_LEVEL_DB,
+        refuse(np.abs(numbers) > MAX_LEVEL_DB,
                f"is no level; allowed are -{MAX_LEVEL_DB:g} to {MAX_LEVEL_DB:g}")
     if name == "gain_db":
-        refuse(path, name, column, numbers > 0,
+        refuse(numbers > 0,
                "is above 0 dB, which no channel gain is; received power [dBm] goes into a column "
                "rssi_dbm, and a path loss needs a minus sign")
     if name == "frequency_hz":
         low, high = FREQUENCIES_HZ
-        refuse(path, name, column, (numbers < low) | (numbers > high),
+        refuse((numbers < low) | (numbers > high),
                f"is no frequency; allowed are {low:g} to {high:g} Hz; the unit is Hz")
     if name.endswith("_m"):
-        refuse(path, name, column, numbers.abs() > MAX_COORDINATE_M,
+        refuse(np.abs(numbers) > MAX_COORDINATE_M,
                f"is too far away; allowed are -{MAX_COORDINATE_M:g} to {MAX_COORDINATE_M:g} m in "
                "the scene's frame")
+    if name == "time_s":
+        refuse(np.abs(numbers) > MAX_TIME_S,
+               f"is no time; allowed are -{MAX_TIME_S:g} to {MAX_TIME_S:g} s; the unit is s, not "
+               "ms")
+        if np.isfinite(numbers).any():
+            refuse(numbers - np.nanmin(numbers) > MAX_SPAN_S,
+                   f"is more than a century ({MAX_SPAN_S:g} s) after the first time, "
+                   f"{np.nanmin(numbers):g} s; is one of them wrong, or in another unit?")
+    for ending, limit in (("_deg", MAX_ANGLE_DEG), ("tx_power_dbm", MAX_POWER_DBM),
+                          ("quality", MAX_QUALITY)):
+        if name.endswith(ending):
+            refuse(np.abs(numbers) > limit,
+                   f"is out of range; allowed are -{limit:g} to {limit:g}")
+
+
+def _check_spread(path: Path, table: pd.DataFrame, devices_path: Path,
+                  devices: pd.DataFrame) -> None:
+    """Refuse an anchor that is too far away for any link.
+
+    Where all are, receivers and devices have different frames, which is found where it matters.
+    """
+    middle_m = table[["receiver_x_m", "receiver_y_m"]].median().to_numpy()
+    anchor = (devices["role"] == "anchor").to_numpy()
+    far = anchor & (np.abs(devices[["x_m", "y_m"]].to_numpy() - middle_m).max(axis=1) > MAX_APART_M)
+    if far.any() and far.sum() < anchor.sum():
+        row = int(np.argmax(far))
+        x_m, y_m = devices.loc[row, ["x_m", "y_m"]]
+        raise BadInput(f"{devices_path}: row {row + 2}: anchor {devices['device'][row]!r} at "
+                       f"({x_m:g}, {y_m:g}) m is more than {MAX_APART_M / 1000:g} km from the "
+                       f"middle of the receivers of {path.name}, ({middle_m[0]:g}, "
+                       f"{middle_m[1]:g}) m; both need one frame, in metres")
 
 
 def _enumerate(names: Iterable[str]) -> str:

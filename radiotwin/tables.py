@@ -1,5 +1,6 @@
 """Base classes of the tables in TOML files, which are validated when they are read."""
 
+import re
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, Field, Strict
@@ -10,6 +11,27 @@ Number = Annotated[float, Strict()]
 """A finite number; an integer is accepted, `true` and texts are not."""
 Metres = Annotated[Number, Field(ge=-MAX_COORDINATE_M, le=MAX_COORDINATE_M)]
 """A coordinate of the local frame."""
+
+MAX_NAME = 200  # characters
+# Control characters, separators of lines and paragraphs, surrogates, and marks that change the
+# direction of what follows: a name with them is shown as another one.
+_NOT_IN_NAMES = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069"
+                           "\ud800-\udfff\ufeff]")
+
+
+def name_fault(name: str) -> str | None:
+    """Return why a text cannot be a name of a device, a receiver or a flight; None if it can.
+
+    Args:
+        name: without spaces around it.
+    """
+    if not name:
+        return "is empty; give a name"
+    if len(name) > MAX_NAME:
+        return f"is no name; it has {len(name):,} characters, allowed are {MAX_NAME}"
+    if _NOT_IN_NAMES.search(name):
+        return "is no name; it has control characters or marks of direction: leave them out"
+    return None
 
 
 class Table(BaseModel):

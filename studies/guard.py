@@ -116,6 +116,8 @@ def write_inputs(inputs: Path) -> None:
 
 def write_powder(folder: Path) -> None:
     """Write a part of the real set: the last day's transmitters are unknown in `unknown/`."""
+    from radiotwin.cells import write_csv
+
     table = pd.read_csv(REAL_SET / "measurements.csv.gz")
     devices = pd.read_csv(REAL_SET / "devices.csv")
     kept = devices["device"].iloc[::EVERY]
@@ -123,13 +125,13 @@ def write_powder(folder: Path) -> None:
     last = table["flight"].max()
     for part, rows in (("known", table["flight"] != last), ("unknown", table["flight"] == last)):
         (folder / part).mkdir(parents=True)
-        table[rows].to_csv(folder / part / "measurements.csv", index=False)
+        write_csv(table[rows], folder / part / "measurements.csv")
         mine = devices[devices["device"].isin(table[rows]["device"])].copy()
-        mine.to_csv(folder / part / "truth.csv", index=False)
+        write_csv(mine, folder / part / "truth.csv")
         if part == "unknown":
             mine["role"] = "unknown"
             mine[["x_m", "y_m"]] = float("nan")
-        mine.to_csv(folder / part / "devices.csv", index=False)
+        write_csv(mine, folder / part / "devices.csv")
 
 
 def call(tree: Path, scratch: Path, *words: object, module: str = "") -> None:

@@ -7,10 +7,13 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
+from radiotwin.cells import write_csv
 from radiotwin.errors import RunFailed
 from radiotwin.files import scratch_folder
+from radiotwin.scene import Scene
 from studies.runner import Study
 from studies.tables import markdown
 
@@ -50,7 +53,44 @@ def run_measured(command: list[str], folder: Path) -> dict[str, float]:
             "peak_mib": usage.ru_maxrss / 2**10}
 
 
+def make_import(links: int, folder: Path) -> dict[str, list[str]]:
+    """Write a table of links in a small city, and how to read it; see `Make`."""
+    run_measured(["radiotwin.cli", "build-scene", "preset:small", "-o", "scene"], folder)
+    scene, rng = Scene.load(folder / "scene"), np.random.default_rng(0)
+    names = np.array([device.device for device in scene.config.devices])
+    low_x, high_x, low_y, high_y = scene.config.extent.bounds
+    part = folder / "part.csv"
+    for start in range(0, links, 500_000):
+        n = min(500_000, links - start)
+        place = [rng.uniform(low_x, high_x, n), rng.uniform(low_y, high_y, n),
+                 np.full(n, 50.0) + rng.uniform(0, 20, n)]
+        device = rng.integers(len(names), size=n)
+        distance_m = np.linalg.norm(np.column_stack(place) - scene.device_m[device], axis=1)
+        level_dbm = -10 - 30 * np.log10(distance_m) + rng.normal(0, 5, n)
+        time_s = 1.65e9 + 0.02 * np.arange(start, start + n)
+        write_csv(pd.DataFrame({
+            "time": time_s.round(2), "x": place[0].round(3), "y": place[1].round(3),
+            "z": place[2].round(2), "cell": names[device],
+            "flight": np.char.add("f", (time_s // 1200 % 97).astype(int).astype(str)),
+            "rsrp": np.where(level_dbm < -100, -140.0, level_dbm.round(1)),
+            "speed": rng.uniform(0, 15, n).round(1),
+        }), part)
+        header, _, rows = part.read_bytes().partition(b"\n")
+        with open(folder / "links.csv", "ab") as file:
+            file.write(rows if start else header + b"\n" + rows)
+    write_csv(pd.DataFrame({"device": names, **dict(zip("xyz", scene.device_m.T))}),
+              folder / "cells.csv")
+    columns = "level=rsrp,device=cell,x=x,y=y,z=z,time=time,flight=flight"
+    fit = ["radiotwin.cli", "fit", "out/measurements.csv", "--scene", "scene", "-o"]
+    return {"import": ["radiotwin.cli", "import", "links.csv", "--columns", columns,
+                       "--level-unit", "dBm", "--length-unit", "m", "--time-format", "epoch s",
+                       "--not-detected=-140", "--devices", "cells.csv", "-o", "out"],
+            "fit segmented_log_distance": [*fit, "law", "--model", "segmented_log_distance"],
+            "fit segmented_nn": [*fit, "net"]}
+
+
 PARTS: dict[str, tuple[Make, tuple[int, ...]]] = {
+    "import and fit": (make_import, (100_000, 1_000_000, 10_000_000)),
 }
 """Name of a part -> inputs and commands, and sizes from the smallest."""
 

@@ -171,3 +171,56 @@ def test_a_table_of_other_devices_is_not_overwritten(write, tmp_path, other):
     devices.write_text("device,x_m,y_m,z_m,role\nb,,,9,unknown\na,1,2,3,anchor\n")
     measurements.write(tmp_path / "out" / "m.csv")
     assert read_measurements(tmp_path / "out" / "m.csv").devices.equals(measurements.devices)
+
+
+@pytest.mark.parametrize(("column", "cell", "message"), [
+    ("time_s", "1e308", "'1e308' is no time; allowed are -1e.11 to 1e.11 s; the unit is s, not ms"),
+    ("time_s", "1.65e12", "is no time"), ("time_s", "9e9", "more than a century"),
+    ("heading_deg", "1e300", "is out of range"), ("quality", "-1e300", "is out of range"),
+    ("gain_db", "-" + "9" * 5000, "row 2, column gain_db: '-9999.*… is n"),
+    ("receiver_z_m", "1e300", "is too far away")])
+def test_numbers_that_nobody_measured(write, column, cell, message):
+    header = HEADER.strip().split(",")
+    if column not in header:
+        header.append(column)
+    rows = [dict(zip(header, row)) | {column: value} for row, value in
+            (("0,f0,u,0,0,5,a,-80".split(","), cell), ("0,f0,u,0,0,5,a,-81".split(","), ""))]
+    text = "\n".join([",".join(header), *[",".join(row.get(name, "") for name in header) for row in rows], "1,f,u,0,0,5,a,-8"
+                      + ("," if len(header) == 9 else "")])
+    with pytest.raises(BadInput, match=message) as error:
+        read_measurements(write(text + "\n"))
+    assert len(str(error.value)) < 1000
+
+
+@pytest.mark.parametrize("name", ["a\x1b[2J", "a\u202eb", "a\nb", "\u2066a", "x" * 10_000, "a\tb", "\x7f"])
+def test_names_that_show_as_something_else(write, name):
+    quoted = f'"{name}"'
+    for devices in (DEVICES, DEVICES.replace("\na,", f"\n{quoted},")):
+        with pytest.raises(BadInput, match="column (device|flight): .* is no name; it has") as error:
+            read_measurements(write(HEADER + f"0,{quoted},u,0,0,5,a,-80\n", devices))
+        assert len(str(error.value)) < 500 and "\x1b" not in str(error.value)
+
+
+def test_names_of_any_other_kind_survive(write, tmp_path):
+    names = ["=cmd()", "'=x", "../../etc", "Zürich-東京", "-5", "a\u200cb", "@x", "'"]
+    devices = "device,x_m,y_m,z_m,role\n" + "".join(f"{name},1,2,3,anchor\n" for name in names[1:])
+    rows = "".join(f"0,f,u,0,0,5,{name},-80\n" for name in names[2:])
+    measurements = read_measurements(write(HEADER + rows, devices.replace("'=x", "''=x")))
+    assert list(measurements.devices["device"]) == names[1:]
+    for suffix in (".csv", ".csv.gz"):
+        measurements.write(tmp_path / "again" / f"m{suffix}")
+        again = read_measurements(tmp_path / "again" / f"m{suffix}")
+        assert again.table.equals(measurements.table) and again.devices.equals(measurements.devices)
+
+
+def test_an_anchor_at_the_end_of_the_world(write):
+    devices = DEVICES + "c,9e6,0,1.5,anchor\n"
+    with pytest.raises(BadInput, match=r"devices.csv: row 4: anchor 'c' at \(9e\+06, 0\) m is more than 1000 km"):
+        read_measurements(write(HEADER + ROWS, devices))
+    assert len(read_measurements(write(HEADER + ROWS, DEVICES + "c,9e5,0,1.5,anchor\n")).devices) == 3
+
+
+def test_too_many_devices(write, monkeypatch):
+    monkeypatch.setenv("RADIOTWIN_MAX_DEVICES", "1")
+    with pytest.raises(BadInput, match="RADIOTWIN_MAX_DEVICES"):
+        read_measurements(write(HEADER + ROWS))

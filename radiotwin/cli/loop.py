@@ -115,6 +115,7 @@ def locate(
 
     It works with or without a 3D map.
     """
+    from radiotwin.cells import write_csv
     from radiotwin.files import atomic_path, require_writable
     from radiotwin.measurements import read_devices, read_measurements
     from radiotwin.progress import progress
@@ -132,7 +133,7 @@ def locate(
     for note in notes:
         say(f"note: {note}")
     with atomic_path(out) as temporary:
-        positions.to_csv(temporary, index=False)
+        write_csv(positions, temporary)
     if true is not None:
         error = position_errors(positions, true)
         print_rows("How far off [m]", {"devices": "right", "median": "right", "90 %": "right",

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from radiotwin.cells import write_csv
 from radiotwin.closeloop.run import Loop
 from radiotwin.files import atomic_path
 
@@ -38,4 +39,4 @@ def residual_table(loop: Loop) -> pd.DataFrame:
 def write_residuals(loop: Loop, path: Path) -> None:
     """Write `residuals.csv.gz`, completely or not at all."""
     with atomic_path(path) as temporary:
-        residual_table(loop).to_csv(temporary, index=False, float_format="%.4f", compression="gzip")
+        write_csv(residual_table(loop), temporary, "%.4f")

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from radiotwin.cells import write_csv as write_table
 from radiotwin.files import atomic_path
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
@@ -36,7 +37,7 @@ def write_csv(radio_map: RadioMap, scene: Scene, path: Path) -> None:
     first = ["device", "x_m", "y_m", "z_m", "gain_db"]
     rest = [name for name in table.columns if name not in first]
     with atomic_path(path) as temporary:
-        table[first + rest].to_csv(temporary, index=False, float_format="%.9g")
+        write_table(table[first + rest], temporary, "%.9g")
 
 
 def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from radiotwin.cells import shown
 from radiotwin.errors import BadInput
 from radiotwin.geodesy import to_local
-from radiotwin.importing.settings import POSITION
 from radiotwin.tables import Origin
 
 AREA_MARGIN_DEG = 1.0  # accepted outside the area for which a projected system is defined
@@ -28,21 +28,26 @@ class Frame:
         """Convert positions to the local frame.
 
         Args:
-            positions: columns of `POSITION` [degrees, m], n rows.
+            positions: any columns of `POSITION` [degrees, m], n rows.
 
         Returns:
             x, y, z [m], (n, 3); NaN where unknown.
         """
-        x_m = positions["x"].to_numpy(dtype=float)
-        y_m = positions["y"].to_numpy(dtype=float)
+        local_m = np.full((len(positions), 3), np.nan)
+        for axis, name in enumerate("xy"):
+            if name in positions:
+                local_m[:, axis] = positions[name]
         ground_m = 0.0 if self.origin is None else self.origin.altitude_m
-        z_m = positions["height"].fillna(positions["z"]).fillna(positions["altitude"] - ground_m)
-        if self.origin is not None:
+        for name, zero_m in (("altitude", ground_m), ("z", 0.0), ("height", 0.0)):
+            if name in positions:  # the last one counts
+                height_m = positions[name].to_numpy(dtype=float) - zero_m
+                known = ~np.isnan(height_m)
+                local_m[known, 2] = height_m[known]
+        if self.origin is not None and "latitude" in positions:
             known = positions[["latitude", "longitude"]].notna().all(axis=1).to_numpy()
-            x_m, y_m = x_m.copy(), y_m.copy()
-            x_m[known], y_m[known] = to_local(self.origin, positions["longitude"][known],
-                                              positions["latitude"][known])
-        return np.column_stack([x_m, y_m, z_m.to_numpy(dtype=float)])
+            local_m[known, 0], local_m[known, 1] = to_local(
+                self.origin, positions["longitude"][known], positions["latitude"][known])
+        return local_m
 
 
 def find_frame(declared: Origin | None, receivers: pd.DataFrame, devices: pd.DataFrame) -> Frame:
@@ -50,7 +55,7 @@ def find_frame(declared: Origin | None, receivers: pd.DataFrame, devices: pd.Dat
 
     Args:
         declared: origin from the settings.
-        receivers: positions with columns of `POSITION`.
+        receivers: positions with any columns of `POSITION`.
         devices: the same; their median is the origin where no receiver has a latitude.
 
     Raises:
@@ -58,15 +63,16 @@ def find_frame(declared: Origin | None, receivers: pd.DataFrame, devices: pd.Dat
     """
     if declared is not None:
         return Frame(declared)
-    both = pd.concat([receivers, devices])
-    geographic, local = both["latitude"].notna().any(), both["x"].notna().any()
+    geographic, local = (any(name in ends and ends[name].notna().any()
+                             for ends in (receivers, devices)) for name in ("latitude", "x"))
     if geographic and local:
         raise BadInput("some positions are latitude and longitude, others are local x and y; give "
                        "the origin of the local frame: --origin LATITUDE,LONGITUDE,ALTITUDE, or "
                        "the crs of x and y")
     if not geographic:
         return Frame(None)
-    known = receivers if receivers["latitude"].notna().any() else devices
+    of_receivers = "latitude" in receivers and receivers["latitude"].notna().any()
+    known = receivers if of_receivers else devices
     first = known["longitude"].dropna().iloc[0]
     east = (known["longitude"] - first + 180) % 360 - 180  # so that the date line does no harm
     longitude = (first + east.median() + 180) % 360 - 180
@@ -82,13 +88,12 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
         crs: projected reference system, as PROJ knows it; None leaves x, y as they are.
 
     Returns:
-        all columns of `POSITION`.
+        latitude and longitude instead of x and y, and the other columns as they are.
 
     Raises:
         BadInput: unknown or not projected system, or x, y far outside its area of use.
     """
-    positions = positions.reindex(columns=list(POSITION)).astype(float)
-    if crs is None:
+    if crs is None or "x" not in positions:
         return positions
     from pyproj import CRS, Transformer
     from pyproj.exceptions import CRSError
@@ -96,8 +101,8 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
     try:
         system = CRS(crs)
     except CRSError as error:
-        raise BadInput(f"crs {crs!r} is unknown; allowed is what PROJ knows, such as EPSG:32633 "
-                       f"(UTM 33 N): {error}") from None
+        raise BadInput(f"crs {shown(crs)} is unknown; allowed is what PROJ knows, such as "
+                       f"EPSG:32633 (UTM 33 N): {str(error)[:200]}") from None
     if not system.is_projected:
         raise BadInput(f"crs {crs} is {system.type_name}, not a projected one with x and y; "
                        "degrees go into latitude and longitude")
@@ -117,5 +122,11 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
             raise BadInput(f"x, y = {x[i]:g}, {y[i]:g} is latitude {latitude[i]:.3f}, longitude "
                            f"{longitude[i]:.3f}, far outside of the area of {crs}; is it another "
                            "system, or are x and y swapped?")
-    positions.loc[known, "longitude"], positions.loc[known, "latitude"] = longitude, latitude
-    return positions.assign(x=np.nan, y=np.nan)
+    if not (np.isfinite(longitude) & np.isfinite(latitude)).all():
+        i = int(np.argmin(np.isfinite(longitude) & np.isfinite(latitude)))
+        raise BadInput(f"x, y = {x[i]:g}, {y[i]:g} is no place of {crs}; is it another system, or "
+                       "another unit?")
+    degrees = np.full((len(positions), 2), np.nan)
+    degrees[known] = np.column_stack([longitude, latitude])
+    return positions.drop(columns=["x", "y"]).assign(longitude=degrees[:, 0],
+                                                     latitude=degrees[:, 1])

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
+from radiotwin.cells import as_numbers
 from radiotwin.errors import BadInput
 from radiotwin.importing.settings import Settings
 from radiotwin.importing.source import EMPTY, Source, as_text
@@ -45,7 +46,7 @@ def read_levels(source: Source, spec: str, settings: Settings) -> Levels:
             meaning.
     """
     text = as_text(source.cells(spec, "level"))
-    numbers = pd.to_numeric(text, errors="coerce").to_numpy(dtype=float)
+    numbers = as_numbers(text)
     not_measured = _is_one_of(text, numbers, settings.not_measured)
     not_detected = _is_one_of(text, numbers, settings.not_detected) & ~not_measured
     declared = not_measured | not_detected
@@ -69,14 +70,11 @@ def read_levels(source: Source, spec: str, settings: Settings) -> Levels:
 
 def _is_one_of(text: pd.Series, numbers: np.ndarray, values: list[float | str]) -> np.ndarray:
     """Return where a cell equals one of the values, (n,) bool; texts in any case."""
-    result = np.zeros(len(text), dtype=bool)
-    for value in values:
-        if isinstance(value, str):
-            label = value.strip().lower()
-            label = "" if label in (*EMPTY, "empty") else label
-            result |= (text.str.lower() == label).to_numpy(dtype=bool)
-        else:
-            result |= numbers == value
+    labels = {value.strip().lower() for value in values if isinstance(value, str)}
+    labels = {"" if label in (*EMPTY, "empty") else label for label in labels}
+    result = np.isin(numbers, [value for value in values if not isinstance(value, str)])
+    if labels:
+        result |= text.str.lower().isin(labels).to_numpy(dtype=bool)
     return result
 
 

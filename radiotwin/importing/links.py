@@ -1,11 +1,12 @@
 """The rows of a file as links: one row per receiver, device and reading."""
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
 
+from radiotwin.budgets import ROWS
+from radiotwin.cells import listed, shown
 from radiotwin.errors import BadInput
 from radiotwin.importing.lengths import in_metres
 from radiotwin.importing.levels import read_levels
@@ -13,7 +14,8 @@ from radiotwin.importing.settings import POSITION, Settings, Wide
 from radiotwin.importing.source import Source
 from radiotwin.importing.tally import Tally
 from radiotwin.importing.times import calendar_days, seconds
-from radiotwin.measurements import FREQUENCIES_HZ
+from radiotwin.measurements import refuse_limits
+from radiotwin.tables import name_fault
 
 ANGLES = ("heading", "pitch", "roll")
 LIMITS_DEG = {"latitude": 90.0, "longitude": 360.0}
@@ -64,16 +66,21 @@ def build_links(source: Source, settings: Settings, tally: Tally) -> tuple[pd.Da
         if name in columns:
             shared[name] = _names(source, name, columns[name], shared, settings)
     levels = _level_columns(source, settings)
-    links = pd.concat([_links_of(source, level, shared, settings, tally) for level in levels])
-    return links.sort_index(kind="stable"), len(levels)
+    ROWS.check(len(source) * len(levels), f"{source.path}: rows times columns of levels")
+    parts = [_links_of(source, level, shared, settings, tally) for level in levels]
+    links = parts[0] if len(parts) == 1 else pd.concat(parts).sort_index(kind="stable")
+    return links, len(levels)
 
 
 def _links_of(source: Source, level: LevelColumn, shared: pd.DataFrame, settings: Settings,
               tally: Tally) -> pd.DataFrame:
     """Return the usable links of one column of levels."""
-    links = shared.copy()
+    links = shared.copy(deep=False)  # columns are added and replaced, none is changed
     for name, spec in level.own.items():
         if name in NAMES:
+            if spec and (fault := name_fault(spec)):
+                raise BadInput(f"{source.path}: {name} {shown(spec)} of column {level.spec} "
+                               f"{fault}")
             links[name] = spec
         else:
             prefix = "device_" if "device" in level.own else ""
@@ -105,26 +112,9 @@ def _quantity(source: Source, name: str, spec: str, settings: Settings) -> np.nd
     is_length = base in POSITION and base not in LIMITS_DEG
     if is_length and not (settings.crs and base in "xy"):
         return in_metres(numbers, settings.length_unit, f"{source.path}: column {spec}")
-    if name == "frequency_hz":
-        refuse_frequencies(source, spec, source.cells(spec, name), numbers)
+    refuse_limits(lambda bad, reason: source.refuse(spec, source.cells(spec, name), bad, reason),
+                  f"{name}_deg" if name in ANGLES else name, numbers)
     return numbers
-
-
-def refuse_frequencies(source: Source, spec: str, cells: pd.Series, numbers: np.ndarray) -> None:
-    """Check the frequencies of a column.
-
-    Args:
-        source: the file.
-        spec: the column.
-        cells: (n,) as in the file, for the message.
-        numbers: (n,) [Hz].
-
-    Raises:
-        BadInput: a number outside `FREQUENCIES_HZ`.
-    """
-    low, high = FREQUENCIES_HZ
-    source.refuse(spec, cells, (numbers < low) | (numbers > high),
-                  f"is no frequency; allowed are {low:g} to {high:g} Hz")
 
 
 def _names(source: Source, name: str, spec: str, shared: pd.DataFrame,
@@ -140,7 +130,7 @@ def _names(source: Source, name: str, spec: str, shared: pd.DataFrame,
         unknown = shared[horizontal].isna().any(axis=1)
         names = "p" + number.astype(str).str.zfill(len(str(number.max())))
         return names.mask(unknown, "").to_numpy(dtype=object)
-    return source.text(spec, name).to_numpy(dtype=object)
+    return source.names(spec, name)
 
 
 def _level_columns(source: Source, settings: Settings) -> list[LevelColumn]:
@@ -148,9 +138,9 @@ def _level_columns(source: Source, settings: Settings) -> list[LevelColumn]:
     if not settings.wide:
         return [LevelColumn(str(settings.columns.level), {})]
     found = [column for block in settings.wide for column in _wide_columns(source, block)]
-    specs = [column.spec for column in found]
-    repeated = next((spec for spec in specs if specs.count(spec) > 1), None)
-    if repeated:
+    specs = pd.Index([column.spec for column in found])
+    if specs.has_duplicates:
+        repeated = specs[specs.duplicated(keep=False)][0]
         raise BadInput(f"{source.path}: column {repeated!r} fits two of the wide blocks; every "
                        "column of levels belongs to one: narrow their patterns")
     return found
@@ -160,12 +150,13 @@ def _wide_columns(source: Source, block: Wide) -> list[LevelColumn]:
     """Return the columns of levels that match the patterns of a block."""
     own = block.model_dump(exclude_none=True, exclude={"level"})
     found = []
+    names = list(map(str, source.table))
     for pattern in [block.level] if isinstance(block.level, str) else block.level:
-        matches = {name: star for name in map(str, source.table)
+        matches = {name: star for name in names
                    if (star := _match(pattern, name)) is not None}
         if not matches:
             raise BadInput(f"{source.path}: no column fits {pattern!r} (wide.level); the file has "
-                           f"{', '.join(map(str, source.table.columns))}. Correct the mapping")
+                           f"{listed(names)}. Correct the mapping")
         found += [LevelColumn(name, {key: spec.replace("*", star) for key, spec in own.items()})
                   for name, star in matches.items()]
     return found
@@ -176,8 +167,10 @@ def _match(pattern: str, name: str) -> str | None:
     if "*" not in pattern:
         return name if name == pattern else None
     before, after = pattern.split("*", 1)
-    match = re.fullmatch(f"{re.escape(before)}(.*){re.escape(after)}", name)
-    return match and match[1]
+    if len(name) < len(before) + len(after):
+        return None
+    fits = name.startswith(before) and name.endswith(after)
+    return name[len(before):len(name) - len(after)] if fits else None
 
 
 def _spec(settings: Settings, level: LevelColumn, name: str) -> str:

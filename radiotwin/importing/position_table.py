@@ -3,13 +3,15 @@
 import numpy as np
 import pandas as pd
 
+from radiotwin.budgets import DEVICES
+from radiotwin.cells import listed
 from radiotwin.errors import BadInput
 from radiotwin.importing.frame import to_geographic
 from radiotwin.importing.lengths import METRES, in_metres
-from radiotwin.importing.links import LIMITS_DEG, refuse_frequencies
+from radiotwin.importing.links import LIMITS_DEG
 from radiotwin.importing.settings import POSITION, Settings, check_position
 from radiotwin.importing.source import Source, read_source
-from radiotwin.measurements import DEVICE_OPTIONAL
+from radiotwin.measurements import DEVICE_OPTIONAL, refuse_limits
 
 
 def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
@@ -32,7 +34,8 @@ def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
         BadInput: names file, row and column.
     """
     source = read_source(path)
-    names = source.text(key, f"the {key}s' names")
+    DEVICES.check(len(source), path)
+    names = pd.Series(source.names(key, f"the {key}s' names"), index=source.table.index)
     source.refuse(key, names, names == "", f"is empty; every {key} needs a name")
     source.refuse(key, names, names.duplicated(), f"occurs twice; every {key} has one row")
     columns = {name: (spec, unit) for spec in map(str, source.table)
@@ -41,17 +44,16 @@ def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
         check_position(set(columns), "")
         if not {"latitude", "x"} & set(columns):
             raise ValueError("there is no position; columns latitude, longitude or x, y are "
-                             "needed, the table has "
-                             f"{', '.join(map(str, source.table.columns))}")
+                             f"needed, the table has {listed(source.table.columns)}")
     except ValueError as error:
         raise BadInput(f"{path}: {error}") from None
     positions = pd.DataFrame({name: _quantity(source, name, spec, unit, settings)
                               for name, (spec, unit) in columns.items()},
                              index=names.to_numpy(dtype=object))
     others = {name: source.numbers(name, name) for name in DEVICE_OPTIONAL if name in source.table}
-    if "frequency_hz" in others:
-        refuse_frequencies(source, "frequency_hz", source.table["frequency_hz"],
-                           others["frequency_hz"])
+    for name, numbers in others.items():
+        refuse_limits(lambda bad, reason, name=name: source.refuse(name, source.table[name], bad,
+                                                                   reason), name, numbers)
     return to_geographic(positions, settings.crs).assign(**others)
 
 

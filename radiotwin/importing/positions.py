@@ -52,6 +52,7 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     devices = _positions(links, "device_", tables["device"], links["device"], settings.crs)
     frame = find_frame(settings.origin, receivers, devices)
     receiver_m, device_m = frame.local_m(receivers), frame.local_m(devices)
+    del receivers, devices  # as much memory as the links themselves
     _check_near(source, links, receiver_m, "receiver")
     _check_near(source, links, device_m, "device")
     links = links.assign(**{f"receiver_{axis}_m": receiver_m[:, i] for i, axis in enumerate("xyz")})
@@ -59,7 +60,8 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     names = links["receiver"][unknown]
     for name, rows in names.groupby(names, sort=False):
         tally.count(f"no position of receiver {name}", "", len(rows), source.where(rows.index[0]))
-    links, device_m = links[~unknown], device_m[~unknown]
+    if unknown.any():
+        links, device_m = links[~unknown], device_m[~unknown]
     table = _device_table(source, links, device_m, tables["device"])
     return PositionedLinks(links, table, device_m, frame)
 
@@ -69,23 +71,32 @@ def _check_near(source: Source, links: pd.DataFrame, position_m: np.ndarray, end
     if far.any():
         row = int(np.argmax(far))
         raise BadInput(f"{source.path}: {source.where(links.index[row])}: the {end} lies "
-                       f"{np.nanmax(np.abs(position_m[row])) / 1000:.0f} km from the origin "
+                       f"{np.nanmax(np.abs(position_m[row])) / 1000:.10g} km from the origin "
                        f"({far.sum()} such rows); are position, unit and origin right?")
 
 
 def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, names: pd.Series,
                crs: str | None) -> pd.DataFrame:
-    """Return the columns of `POSITION`: from the file, else from the table, else NaN."""
+    """Return columns of `POSITION`: from the file, else from the table."""
     own = {name: links[prefix + name] for name in POSITION if prefix + name in links}
     positions = to_geographic(pd.DataFrame(own, index=links.index), crs)
     if table is None:
         return positions
-    values = positions.to_numpy(copy=True)
-    horizontal = [POSITION.index("latitude"), POSITION.index("x")]
-    unknown = np.isnan(values[:, horizontal]).all(axis=1)
-    declared = table[list(POSITION)].reindex(names[unknown]).to_numpy()
-    values[unknown] = np.where(np.isnan(values[unknown]), declared, values[unknown])
-    return pd.DataFrame(values, index=links.index, columns=positions.columns)
+    unknown = np.ones(len(links), dtype=bool)
+    for name in ("latitude", "x"):
+        if name in positions:
+            unknown &= positions[name].isna().to_numpy()
+    row = table.index.get_indexer(names[unknown])
+    for name in POSITION:
+        if name not in table:
+            continue
+        values = (positions[name].to_numpy(dtype=float, copy=True) if name in positions
+                  else np.full(len(links), np.nan))
+        declared = np.append(table[name].to_numpy(dtype=float), np.nan)[row]  # -1: not in it
+        own_values = values[unknown]
+        values[unknown] = np.where(np.isnan(own_values), declared, own_values)
+        positions[name] = values
+    return positions
 
 
 def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,

@@ -1,6 +1,7 @@
 """The whole import: from a file to a folder."""
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from radiotwin.importing.source import Source, read_source
 from radiotwin.importing.tally import Tally
 from radiotwin.measurements import OPTIONAL, REQUIRED, Measurements
 
+HASHED_AT_ONCE = 500_000  # rows; bounds the memory of that
 FILES = {"measurements.csv", "measurements.csv.gz", "devices.csv", "import.toml", "import.json"}
 DECIMALS = {"_m": 3, "_db": 4, "_dbm": 4, "_deg": 4, "_s": 6}
 """End of a column's name -> decimals that are written; all finer than any measurement."""
@@ -58,6 +60,7 @@ def import_file(path: Path | str, settings: Settings, out: Path | str, compress:
     readings = rows * per_row
     tally.count("repeats an earlier row exactly", "", len(repeated) * per_row,
                 source.where(repeated[0]) if repeated else "")
+    source = source.without_cells()
     on_progress("positions")
     positioned = add_positions(source, links, settings, tally)
     positioned = _filtered(source, positioned, settings, tally)
@@ -83,7 +86,7 @@ def import_file(path: Path | str, settings: Settings, out: Path | str, compress:
 
 def _check_target(out: Path) -> None:
     """Refuse a folder that holds anything but an earlier import."""
-    if out.is_dir():
+    if os.path.isdir(out):  # False, not an error, of a name that no folder can have
         others = sorted(path.name for path in out.iterdir() if path.name not in FILES)
         if others or (any(out.iterdir()) and not (out / "import.json").is_file()):
             detail = f" (it has {others[0]})" if others else ""
@@ -93,22 +96,47 @@ def _check_target(out: Path) -> None:
 
 def _without_repetition(source: Source) -> tuple[Source, list[int]]:
     """Remove the rows that equal an earlier one in every column; return also their indices."""
-    comparable = source.table
-    if comparable.dtypes.eq(object).any():
+    table = source.table
+    rows = np.arange(len(table))  # that repeat, or are repeated, in the columns so far
+    key = np.zeros(len(table), dtype=np.uint64)
+    for name in table:
+        key = key * np.uint64(0x9E3779B97F4A7C15) + _hashes(table[name], rows)
+        again = pd.Series(key).duplicated(keep=False).to_numpy()
+        rows, key = rows[again], key[again]
+    if not len(rows):
+        return source, []
+    comparable = table.iloc[rows]  # equal hashes may be of different rows
+    if table.dtypes.eq(object).any():
         comparable = comparable.astype(str)
-    repeats = comparable.duplicated()
-    unique = Source(source.path, source.table[~repeats], source.where)
-    return unique, list(source.table.index[repeats])
+    repeats = np.zeros(len(table), dtype=bool)
+    repeats[rows] = comparable.duplicated()
+    unique = Source(source.path, table[~repeats], source.where)
+    return unique, list(table.index[repeats])
+
+
+def _hashes(cells: pd.Series, rows: np.ndarray) -> np.ndarray:
+    """Return hashes (n,) of the cells of some rows; equal cells have equal ones."""
+    parts = [np.empty(0, dtype=np.uint64)]
+    for start in range(0, len(rows), HASHED_AT_ONCE):
+        part = cells.iloc[rows[start:start + HASHED_AT_ONCE]]
+        if part.dtype.kind == "O":
+            part = part.astype(str)
+        elif part.dtype.kind == "f":
+            part = part + 0.0  # of two zeros that are equal, one is negative
+        parts.append(pd.util.hash_pandas_object(part, index=False).to_numpy())
+    return np.concatenate(parts)
 
 
 def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,
               tally: Tally) -> PositionedLinks:
     """Apply the limits of distance and level; a link whose value is unknown passes."""
     links = positioned.links
-    difference_m = links[[f"receiver_{axis}_m" for axis in "xyz"]].to_numpy() - positioned.device_m
-    difference_m[np.isnan(difference_m[:, 2]), 2] = 0.0
-    distance_m = np.linalg.norm(difference_m, axis=1)
-    level_db = links["level_db"].to_numpy()
+    distance_m, level_db = None, links["level_db"].to_numpy()
+    if settings.min_distance_m is not None or settings.max_distance_m is not None:
+        difference_m = (links[[f"receiver_{axis}_m" for axis in "xyz"]].to_numpy()
+                        - positioned.device_m)
+        difference_m[np.isnan(difference_m[:, 2]), 2] = 0.0
+        distance_m = np.linalg.norm(difference_m, axis=1)
     keep = np.ones(len(links), dtype=bool)
     for limit, values, is_minimum, text in (
             (settings.min_distance_m, distance_m, True, "nearer than {} m"),
@@ -122,6 +150,8 @@ def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,
             where = source.where(links.index[int(np.argmax(bad))])
             tally.count(text.format(limit), "", bad.sum(), where)
             keep &= ~bad
+    if keep.all():
+        return positioned
     links = links[keep]
     devices = positioned.devices
     devices = devices[devices["device"].isin(links["device"])].reset_index(drop=True)

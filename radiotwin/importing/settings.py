@@ -107,7 +107,8 @@ class Settings(Table):
     level_unit: Literal["dBm", "dB", "mW", "W"] | None = None
     length_unit: Literal["m", "ft"] | None = None
     time_format: str | None = Field(
-        None, description="epoch s, epoch ms, ISO 8601, or a strftime format")
+        None, max_length=200,
+        description="epoch s, epoch ms, ISO 8601, or a strftime format")
     time_zone: str | None = None
     not_detected: list[Number | str] = Field(
         [], description="levels that mean: not detected; `empty` is an empty cell")
@@ -121,7 +122,8 @@ class Settings(Table):
     average_m: Positive | None = Field(None, description="length of the bins of the local mean")
     average: Literal["power", "median"] = "power"
     crs: str | None = Field(
-        None, description="of x and y, such as EPSG:32612; without one they are local")
+        None, max_length=10_000,
+        description="of x and y, such as EPSG:32612; without one they are local")
     devices: str | None = Field(None, description="table of the devices' positions")
     receivers: str | None = Field(None, description="table of the fixed receivers' positions")
     origin: Origin | None = None

@@ -1,7 +1,6 @@
 """Settings from and to TOML, and from pairs of the command line."""
 
 import os
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.settings import Columns, Settings, Wide
+from radiotwin.inputs import read_toml
 from radiotwin.tables import Origin
 
 
@@ -46,13 +46,7 @@ def read_settings(path: Path | str | None, given: Mapping[str, Any]) -> Settings
     data: dict[str, Any] = {}
     if path is not None:
         path = Path(path)
-        try:
-            data = tomllib.loads(path.read_text("utf-8"))
-        except OSError as error:
-            raise BadInput(f"{path} cannot be read: {error.strerror}; --columns takes a TOML file "
-                           "or pairs such as latitude=lat,longitude=lon") from None
-        except ValueError as error:
-            raise BadInput(f"{path} is not TOML: {error}") from None
+        data = read_toml(path, "TOML file, or pairs such as latitude=lat,longitude=lon")
         for table in ("devices", "receivers"):
             if isinstance(data.get(table), str):
                 data[table] = str(path.parent / data[table])

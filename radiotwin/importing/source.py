@@ -1,6 +1,5 @@
 """A file of measurements as a table whose cells can be named in a message."""
 
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,13 +8,17 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from radiotwin.cells import read_cells
+from radiotwin.budgets import CELLS, COLUMNS, ROWS
+from radiotwin.cells import as_numbers, listed, read_cells, shown
 from radiotwin.errors import BadInput
+from radiotwin.inputs import read_json
+from radiotwin.tables import name_fault
 
 EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
 """Texts, in lower case, of cells without a value."""
 ALWAYS = "always "
 """Prefix of a constant in place of a column's name."""
+_ROWS_AT_ONCE = 1_000_000  # of which stripped texts are made
 FORMATS = (".csv", ".parquet", ".geojson", ".json")
 
 
@@ -50,7 +53,7 @@ class Source:
             return pd.Series(spec.removeprefix(ALWAYS), index=self.table.index)
         if spec not in self.table:
             raise BadInput(f"{self.path}: column {spec!r} ({purpose}) is missing; the file has "
-                           f"{', '.join(map(str, self.table.columns))}. Correct the mapping")
+                           f"{listed(self.table.columns)}. Correct the mapping")
         return self.table[spec]
 
     def text(self, spec: str, purpose: str) -> pd.Series:
@@ -64,6 +67,30 @@ class Source:
             BadInput: no such column.
         """
         return as_text(self.cells(spec, purpose))
+
+    def names(self, spec: str, purpose: str) -> np.ndarray:
+        """Return the cells as names, (n,) texts, `""` where empty; equal ones are one object.
+
+        Args:
+            spec: name of a column, or `always VALUE`.
+            purpose: what they are needed for, for the message.
+
+        Raises:
+            BadInput: no such column, or a text that cannot be a name.
+        """
+        cells = self.cells(spec, purpose)
+        if not isinstance(cells.dtype, pd.StringDtype):
+            cells = as_text(cells)
+        number, different = pd.factorize(cells, use_na_sentinel=False)
+        names = as_text(pd.Series(different))
+        for i, name in enumerate(names):
+            if name and (fault := name_fault(name)):
+                self.refuse(spec, pd.Series(name, index=self.table.index), number == i, fault)
+        return names.to_numpy(dtype=object)[number]
+
+    def without_cells(self) -> "Source":
+        """Return the same file for messages only, without the memory of its cells."""
+        return Source(self.path, self.table.iloc[:0], self.where)
 
     def numbers(self, spec: str, purpose: str) -> np.ndarray:
         """Return the cells as numbers, (n,); NaN where empty.
@@ -79,10 +106,15 @@ class Source:
         if cells.dtype.kind in "fiu":
             numbers = cells.to_numpy(dtype=float, na_value=np.nan)
         else:
-            text = as_text(cells)
-            parsed = pd.to_numeric(text, errors="coerce")
-            self.refuse(spec, text, parsed.isna() & (text != ""), "is not a number")
-            numbers = parsed.to_numpy(dtype=float)
+            numbers = np.full(len(cells), np.nan)
+            wrong = np.zeros(len(cells), dtype=bool)
+            for start in range(0, len(cells), _ROWS_AT_ONCE):
+                rows = slice(start, start + _ROWS_AT_ONCE)
+                text = as_text(cells.iloc[rows])
+                numbers[rows] = as_numbers(text)
+                wrong[rows] = np.isnan(numbers[rows]) & (text != "")
+            if wrong.any():
+                self.refuse(spec, as_text(cells), wrong, "is not a number")
         self.refuse(spec, cells, np.isinf(numbers), "is not finite")
         return numbers
 
@@ -102,7 +134,7 @@ class Source:
         if len(rows):
             more = f" ({len(rows)} such rows)" if len(rows) > 1 else ""
             raise BadInput(f"{self.path}: {self.where(cells.index[rows[0]])}, column {spec}: "
-                           f"{str(cells.iloc[rows[0]])!r} {reason}{more}")
+                           f"{shown(cells.iloc[rows[0]])} {reason}{more}")
 
 
 def as_text(cells: pd.Series) -> pd.Series:
@@ -146,12 +178,7 @@ def read_source(path: Path | str) -> Source:
 
 def _read_geojson(path: Path) -> pd.DataFrame:
     """Return one row per point: longitude, latitude, altitude (RFC 7946, 3.1.1) and properties."""
-    try:
-        data = json.loads(path.read_text("utf-8"))
-    except OSError as error:
-        raise BadInput(f"{path} cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise BadInput(f"{path} is not GeoJSON: {error}") from None
+    data = read_json(path, "GeoJSON file")
     features = data.get("features") if isinstance(data, dict) else None
     if not isinstance(features, list):
         raise BadInput(f"{path} is not a GeoJSON FeatureCollection; allowed is one of points")
@@ -159,8 +186,12 @@ def _read_geojson(path: Path) -> pd.DataFrame:
     if not ("CRS84" in crs or "4326" in crs):
         raise BadInput(f"{path}: its crs is {crs}; allowed is WGS84, the only one of GeoJSON since "
                        "RFC 7946")
-    return pd.DataFrame([_point(path, number, feature)
-                         for number, feature in enumerate(features, start=1)])
+    ROWS.check(len(features), path)
+    points = [_point(path, number, feature) for number, feature in enumerate(features, start=1)]
+    columns = set().union(*points)
+    COLUMNS.check(len(columns), path)
+    CELLS.check(len(columns) * len(points), path)
+    return pd.DataFrame(points)
 
 
 def _point(path: Path, number: int, feature: object) -> dict[str, object]:
@@ -169,9 +200,10 @@ def _point(path: Path, number: int, feature: object) -> dict[str, object]:
     kind = geometry.get("type") if isinstance(geometry, dict) else None
     coordinates = geometry.get("coordinates") if geometry and kind == "Point" else None
     if (not isinstance(coordinates, list) or len(coordinates) not in (2, 3)
-            or not all(isinstance(value, int | float) for value in coordinates)):
-        raise BadInput(f"{path}: feature {number} is {kind or 'without a geometry'}; allowed are "
-                       "points with two or three coordinates: leave the others out")
+            or not all(type(value) in (int, float) for value in coordinates)):
+        what = str(kind or "without a geometry")[:80]
+        raise BadInput(f"{path}: feature {number} is {what}; allowed are points with two or three "
+                       "coordinates: leave the others out")
     properties = feature.get("properties") if isinstance(feature, dict) else None
     return ((properties if isinstance(properties, dict) else {})
             | dict(zip(("longitude", "latitude", "altitude"), coordinates)))

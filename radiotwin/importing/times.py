@@ -5,6 +5,7 @@ from zoneinfo import ZoneInfo, available_timezones
 import numpy as np
 import pandas as pd
 
+from radiotwin.cells import shown
 from radiotwin.errors import BadInput
 from radiotwin.importing.source import Source, as_text
 
@@ -13,6 +14,7 @@ ISO = "ISO 8601"
 ALLOWED = (f"allowed are {', '.join(EPOCH_S)}, {ISO}, or a strftime format, such as "
            "'%d.%m.%Y %H:%M:%S'")
 YEARS = (1900, 2200)  # of plausible times; milliseconds that are read as seconds lie outside
+_ROWS_AT_ONCE = 1_000_000  # of which texts are made
 SECONDS_PER_YEAR = 31_556_952  # Gregorian mean
 UTC_OFFSET = r":\d\d(?:\.\d+)?(?:[Zz]|[+-]\d\d(?::?\d\d)?)$"  # at the end of an ISO 8601 text
 
@@ -40,19 +42,19 @@ def seconds(source: Source, spec: str, time_format: str | None, zone: str | None
     typed = cells.dtype.kind == "M"  # Parquet has typed times
     if time_format is None and not typed:
         raise BadInput(f"{source.path}: column {spec}: time_format is not given; {ALLOWED}. The "
-                       f"values look like {str(cells.iloc[0])!r} to {str(cells.iloc[-1])!r}")
+                       f"values look like {shown(cells.iloc[0])} to {shown(cells.iloc[-1])}")
     if time_format in EPOCH_S and not typed:
         time_s = source.numbers(spec, "time") * EPOCH_S[time_format]
-        return _plausible(source, spec, as_text(cells), time_s)
+        return _plausible(source, spec, cells, time_s)
     if not typed and time_format != ISO and "%" not in str(time_format):
         raise BadInput(f"time_format {time_format!r} is unknown; {ALLOWED}")
     text = as_text(cells)
     parsed = cells if typed else _parse(source, spec, text, str(time_format))
     if parsed.dt.tz is None:
         if zone is None:
-            raise BadInput(f"{source.path}: column {spec}: the times, such as {text.iloc[0]!r}, "
-                           "carry no offset from UTC, and time_zone is not given; give UTC or a "
-                           "zone such as Europe/Berlin")
+            raise BadInput(f"{source.path}: column {spec}: the times, such as "
+                           f"{shown(text.iloc[0])}, carry no offset from UTC, and time_zone is "
+                           "not given; give UTC or a zone such as Europe/Berlin")
         parsed = _localize(source, spec, text, parsed, zone)
     utc = parsed.dt.tz_convert("UTC").dt.tz_localize(None).to_numpy(dtype="datetime64[us]")
     time_s = (utc - np.datetime64(0, "us")) / np.timedelta64(1, "s")
@@ -69,8 +71,14 @@ def calendar_days(time_s: np.ndarray, zone: str | None) -> np.ndarray:
     Returns:
         dates such as `2022-04-25`, (n,); `""` where the time is unknown.
     """
-    stamp = pd.Series(pd.to_datetime(time_s, unit="s", utc=True)).dt.tz_convert(zone or "UTC")
-    return stamp.dt.strftime("%Y-%m-%d").fillna("").to_numpy(dtype=object)
+    days = np.empty(len(time_s), dtype=object)
+    for start in range(0, len(time_s), _ROWS_AT_ONCE):
+        rows = slice(start, start + _ROWS_AT_ONCE)
+        stamp = pd.Series(pd.to_datetime(time_s[rows], unit="s", utc=True))
+        day = stamp.dt.tz_convert(zone or "UTC").dt.strftime("%Y-%m-%d").fillna("")
+        number, names = pd.factorize(day)  # one object for each day
+        days[rows] = np.asarray(names, dtype=object)[number]
+    return days
 
 
 def check_zone(zone: str) -> None:

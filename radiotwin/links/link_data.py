@@ -226,7 +226,8 @@ class LinkData:
 
     def renumber_receivers(self, names: Sequence[str]) -> LinkData:
         """Return the same links, counting receivers by `names`, which hold all of theirs."""
-        number = np.array([list(names).index(name) for name in self.receiver_names])
+        place = {name: i for i, name in reversed(list(enumerate(names)))}
+        number = np.array([place[name] for name in self.receiver_names])
         tracks = {(int(number[receiver]), flight): track
                   for (receiver, flight), track in self.tracks.items()}
         return replace(self, receiver=number[self.receiver], receiver_names=list(names),

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 import trimesh
 
+from radiotwin.cells import write_csv
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder
 from radiotwin.geodesy import local_crs
@@ -172,7 +173,7 @@ def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, optio
             write_city(folder, shapes)
             write_config(plan.config, folder / "scene.toml")
             if buildings is not None:
-                buildings.to_csv(folder / "buildings.csv", index=False)
+                write_csv(buildings, folder / "buildings.csv")
             draw_preview(Scene.load(folder), folder / "preview.png")
     return _report(city, shapes, plan, declared, None if check_only else out_folder)
 

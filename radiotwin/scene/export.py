@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import trimesh
 
+from radiotwin.cells import write_csv
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, atomic_path
 from radiotwin.scene import Scene
@@ -53,7 +54,7 @@ def export_scene(scene: Scene, out: Path | str) -> None:
         write_city(folder, shapes)
         devices = pd.DataFrame([device.model_dump() for device in scene.config.devices],
                                columns=["device", "x_m", "y_m", "z_m", "role"])
-        devices.to_csv(folder / "devices.csv", index=False)
+        write_csv(devices, folder / "devices.csv")
 
 
 def _colour(material: Material) -> tuple[int, int, int]:

@@ -8,7 +8,7 @@ from scipy.constants import speed_of_light
 
 from radiotwin.antennas import Antenna
 from radiotwin.budgets import ROWS
-from radiotwin.cells import read_cells
+from radiotwin.cells import read_cells, write_csv
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path, require_writable
 from radiotwin.geodesy import to_local
@@ -99,7 +99,7 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings,
     table = pd.concat(tables, ignore_index=True)
     if out_path is not None:
         with atomic_path(out_path) as temporary:
-            table.to_csv(temporary, index=False)
+            write_csv(table, temporary)
     return table
 
 

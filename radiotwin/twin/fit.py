@@ -18,12 +18,15 @@ from radiotwin.errors import BadInput
 from radiotwin.links import LinkData, join_links, link_geometry, prepare_links
 from radiotwin.localize import LocalizeSettings, Relocation, TwinDevice, localize
 from radiotwin.localize.along_paths import MAX_DEVICES
-from radiotwin.measurements import Measurements
+from radiotwin.measurements import MAX_APART_M, Measurements
 from radiotwin.scene import Scene
 from radiotwin.twin.twin import Twin
 
 MAX_BLANK, LIMIT_GAP_DB = 0.02, 10.0  # beyond both, blanks and the limit of detection disagree
 DOFS = (3.0, 5.0, 10.0, 30.0)  # of the errors, that are tried
+# Of more links, so many are fitted: a law of a few numbers is then exact to hundredths of a
+# decibel, and the time that a network is trained is in proportion to them.
+MAX_LINKS, THINNED_LINKS = 1_000_000, 300_000
 MIN_HEARD = 30  # links of a class of line of sight, to learn its level from
 MIN_LOSS_NATS = 0.02  # a link, to be worse than the law, which has more numbers to be fitted
 LOST_M = 40.0  # radius from which on a device's position says nothing about the channel
@@ -46,10 +49,14 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
     Returns:
         the twin; positions of devices that could not be located are NaN.
 
+    Warns:
+        Of more than `MAX_LINKS` links, `THINNED_LINKS` are drawn, evenly among the devices.
+
     Raises:
         BadInput: no anchor, nothing detected, links that no channel can be learnt from, an unknown
             model, or devices that may be indoors with `image_paths`.
     """
+    flights, measurements = measurements.flights, _thinned(measurements, seed)
     if start is not None:
         start.warn_of_another_scene(scene, scene.content_hash())
     channel = channel_named(model)
@@ -61,12 +68,12 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
         for note in links.notes:
             warnings.warn(note, stacklevel=2)
         twin = _fit_along_paths(links, scene, seed, start)
-        twin.provenance.update(flights=measurements.flights, seed=seed)
+        twin.provenance.update(flights=flights, seed=seed)
         return twin
     _check_heights(measurements)
     settings = LocalizeSettings(allow_indoor=allow_indoor)
     twin = fit_links(join_links(measurements, scene), scene, channel, seed, start, settings)
-    twin.provenance.update(flights=measurements.flights, seed=seed)
+    twin.provenance.update(flights=flights, seed=seed)
     return twin
 
 
@@ -253,6 +260,28 @@ def _locate(links: LinkData, scene: Scene, channel: ChannelModel, unknown: np.nd
         limit_db=links.limit_db, seed=seed, start_m=start_m, settings=settings)
 
 
+def _thinned(measurements: Measurements, seed: int) -> Measurements:
+    """Return all links, or random ones of each device where there are too many."""
+    device = measurements.device_index
+    if len(device) <= MAX_LINKS:
+        return measurements
+    links = np.bincount(device)
+    few, many = 1, len(device)  # a device; the first is possible, the second is not
+    while many - few > 1:
+        middle = (few + many) // 2
+        fits = np.minimum(links, middle).sum() <= max(THINNED_LINKS, len(links))
+        few, many = (middle, many) if fits else (few, middle)
+    shuffled = np.random.default_rng(seed).permutation(len(device))
+    by_device = shuffled[np.argsort(device[shuffled], kind="stable")]
+    number = np.arange(len(device)) - np.repeat(np.cumsum(links) - links, links)
+    keep = np.zeros(len(device), dtype=bool)
+    keep[by_device[number < few]] = True
+    warnings.warn(f"{len(device):,} links were measured, {keep.sum():,} of them are fitted: at "
+                  f"most {few:,} of each device, drawn at random; more would not change the result "
+                  "beyond its uncertainty", stacklevel=3)
+    return measurements.select(keep)
+
+
 def _check_heights(measurements: Measurements) -> None:
     """Raise BadInput, with the row, where a height is empty: a 3D map needs it."""
     empty = np.flatnonzero(measurements.table["receiver_z_m"].isna())
@@ -267,9 +296,14 @@ def _check_heights(measurements: Measurements) -> None:
 
 
 def _check_positions(links: LinkData, scene: Scene) -> None:
-    """Raise BadInput for anchors inside buildings, warn about receivers inside or off the map."""
+    """Raise BadInput for anchors inside buildings or far away, warn about receivers likewise."""
     anchors = np.array(sorted(links.anchors), dtype=int)
     anchors = anchors[np.isfinite(links.device_m[anchors]).all(axis=1)]
+    apart_m = np.abs(links.device_m[anchors, :2] - np.median(links.receiver_m[:, :2], axis=0))
+    for index in anchors[(apart_m > MAX_APART_M).any(axis=1)]:
+        raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} is more "
+                       f"than {MAX_APART_M / 1000:g} km from the middle of the receivers; both "
+                       "need one frame, in metres")
     for index in anchors[scene.city.inside(links.device_m[anchors])]:
         x_m, y_m, z_m = links.device_m[index]
         raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} at "

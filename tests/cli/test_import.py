@@ -1,6 +1,7 @@
 """`radiotwin import` as a user runs it: the worked examples, round trips, and input that cannot be used."""
 
 import json
+import os
 import shlex
 from collections import Counter
 from pathlib import Path
@@ -131,8 +132,8 @@ def test_many_columns_of_levels_by_options(run, tmp_path):
     ("", "", ["data.csv is empty"]),
     ("a,b\n", "", ["has no rows"]),
     (None, "", ["data.csv does not exist"]),
-    (GOOD, "--columns nowhere.toml", ["nowhere.toml cannot be read"]),
-    (GOOD, "--columns time", ["time cannot be read", "latitude=lat"]),
+    (GOOD, "--columns nowhere.toml", ["nowhere.toml does not exist"]),
+    (GOOD, "--columns time", ["time does not exist", "latitude=lat"]),
     (GOOD, "--origin here", ["--origin 'here'", "LATITUDE,LONGITUDE"]),
     (GOOD, "--origin 91,0", ["origin.latitude_deg", "91"]),
     (GOOD, "--average mode", ["average", "mode", "median"]),
@@ -163,3 +164,56 @@ def test_polygons(run, tmp_path):
     done = run(WORDS.replace("data.csv", "data.geojson"), tmp_path)
     assert done.returncode == 2 and "feature 1 is Polygon; allowed are points" in done.stderr
     assert not (tmp_path / "out").exists() and "Traceback" not in done.stderr
+
+
+LOCAL = "--columns level=l,device=d,x=x,y=y --level-unit dBm --length-unit m -o out"
+
+
+@pytest.mark.parametrize(("text", "options", "message"), [
+    ("d,x,y,l,h\na,0,0,-80,1e300\n", LOCAL.replace("y=y", "y=y,heading=h"), "row 2, column h: '1e300' is out of range"),
+    ("d,x,y,l\n\x1b[2Ja,0,0,-80\n", LOCAL, r"column d: '\x1b[2Ja' is no name"),
+    ("d,x,y,l\na,1e300,0,-80\n", LOCAL, "1e+297 km from the origin"),
+    ("d,x,y,l\na,1e300,0,-80\n", LOCAL + " --crs '+proj=utm +zone=33'", "1e+300, 0 is no place of"),
+    (f"d,x,y,l\nb,{'9' * 6000},0,-80\n", LOCAL, "is not a number"),
+    ("d,x,y,l\na,0,0,-80\n", LOCAL.replace("out", "n" * 300), "cannot write"),
+    ("d,x,y,l\na,0,0,-80\n", LOCAL + " --devices " + "n" * 300 + ".csv", "cannot be read"),
+    ("d,x,y,l\na,0,0,-80\n", LOCAL + " --crs '" + "GEOGCS[" * 1000 + "'", "is unknown"),
+    ("d,x,y,l\na,0,0,-80\n", LOCAL + " --time-format " + "%Y" * 5000, "at most 200"),
+])
+def test_a_stranger_s_table_is_one_message(run, tmp_path, text, options, message):
+    (tmp_path / "t.csv").write_text(text)
+    result = run(f"import t.csv {options}", tmp_path)
+    assert result.returncode == 2, result.stderr
+    assert message in " ".join(result.stderr.split()) and len(result.stderr) < 12_000 and "\x1b" not in result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["t.csv"]
+
+
+@pytest.mark.parametrize("options", ["t.csv --columns pipe -o out", "pipe.csv " + LOCAL, "deep.geojson " + LOCAL,
+                                     "t.csv --columns deep.toml -o out", f"t.csv {LOCAL} --devices pipe.csv"])
+def test_pipes_and_deep_nesting_are_one_message(run, tmp_path, options):
+    for name in ("pipe", "pipe.csv"):
+        os.mkfifo(tmp_path / name)
+    (tmp_path / "t.csv").write_text("d,x,y,l\na,0,0,-80\n")
+    (tmp_path / "deep.geojson").write_text('{"features":' + "[" * 100_000 + "]" * 100_000 + "}")
+    (tmp_path / "deep.toml").write_text("a." * 20_000 + "b = 1")
+    result = run(f"import {options}", tmp_path)
+    assert result.returncode == 2 and "Traceback" not in result.stderr and not (tmp_path / "out").exists()
+    assert "not a regular file" in result.stderr or "RADIOTWIN_MAX_NESTING" in " ".join(result.stderr.split())
+
+
+def test_formulas_are_written_as_texts_and_read_as_they_were(run, tmp_path):
+    (tmp_path / "t.csv").write_text("d,x,y,l\n=cmd|' /C calc'!A0,0,0,-80\n-5,1,1,-81\n=cmd|' /C calc'!A0,0,0,-80\n")
+    assert run(f"import t.csv {LOCAL}", tmp_path).returncode == 0
+    for name in ("devices.csv", "measurements.csv"):
+        assert "'=cmd" in (tmp_path / "out" / name).read_text() and "'-5" not in (tmp_path / "out" / name).read_text()
+    back = read_measurements(tmp_path / "out" / "measurements.csv")
+    assert list(back.table["device"]) == ["=cmd|' /C calc'!A0", "-5"], "and the repeated row was found"
+
+
+def test_points_with_a_property_of_their_own_each(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("RADIOTWIN_MAX_COLUMNS", "100")
+    points = [{"type": "Feature", "geometry": {"type": "Point", "coordinates": [1, 2]}, "properties": {f"p{i}": i}}
+              for i in range(200)]
+    (tmp_path / "t.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": points}))
+    result = run(f"import t.geojson {LOCAL}", tmp_path)
+    assert result.returncode == 2 and "RADIOTWIN_MAX_COLUMNS" in " ".join(result.stderr.split())

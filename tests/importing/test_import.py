@@ -233,9 +233,9 @@ def test_options_overrule_the_file_and_tables_lie_beside_it(tmp_path):
     (tmp_path / "m.toml").write_text('devices = "sites.csv"\naverage_m = 3\n[columns]\nlevel = "l"\ndevice = "d"\n')
     settings = read_settings(tmp_path / "m.toml", {"average_m": 5.0})
     assert settings.average_m == 5 and settings.devices == str(tmp_path / "sites.csv") and np.isscalar(settings.average)
-    for text, message in (("devices = [", "is not TOML"), ("colour = 1", "m.toml: colour: unknown")):
+    for text, message in (("devices = [", "is not readable TOML"), ("colour = 1", "m.toml: colour: unknown")):
         (tmp_path / "m.toml").write_text(text)
         with pytest.raises(BadInput, match=message):
             read_settings(tmp_path / "m.toml", {})
-    with pytest.raises(BadInput, match="none.toml cannot be read"):
+    with pytest.raises(BadInput, match="none.toml does not exist"):
         read_settings(tmp_path / "none.toml", {})

@@ -1,12 +1,13 @@
 """Fitting a twin: what it is learnt from, and what is refused or warned of."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
-from radiotwin.twin import Twin, fit_twin
+from radiotwin.twin import Twin, fit, fit_twin
 
 
 def test_positions_of_unknown_devices_are_not_read(small_scene, flown, twin):
@@ -80,3 +81,18 @@ def test_blanks_far_above_the_limit_of_detection_are_warned_of(small_scene, flow
     deaf = Scene(small_scene.folder, small_scene.config.model_copy(update={"radio": radio}))
     with pytest.warns(UserWarning, match="check sensitivity_dbm"):
         fit_twin(Measurements(table, flown.devices), deaf, model="segmented_log_distance", seed=0)
+
+
+def test_of_too_many_links_some_of_each_device_are_drawn(monkeypatch):
+    device = np.repeat(["a", "b", "c"], [10, 600, 390])
+    table = pd.DataFrame({"device": device, "row": np.arange(1000)})
+    data = Measurements(table, pd.DataFrame({"device": ["a", "b", "c", "never"]}))
+    assert fit._thinned(data, 0) is data
+    monkeypatch.setattr(fit, "MAX_LINKS", 999)
+    monkeypatch.setattr(fit, "THINNED_LINKS", 210)
+    with pytest.warns(UserWarning, match="1,000 links were measured, 210 of them are fitted: at most 100 of each"):
+        thin = fit._thinned(data, 0)
+    assert thin.table["device"].value_counts().to_dict() == {"a": 10, "b": 100, "c": 100}
+    assert thin.table["row"].is_monotonic_increasing and thin.table["row"].between(200, 400).sum() > 10
+    with pytest.warns(UserWarning):
+        assert fit._thinned(data, 0).table.equals(thin.table)
