@@ -85,3 +85,7 @@ VERTICES = Budget("VERTICES", 20_000_000, "vertices")  # of a city, as is the ne
 FACES = Budget("FACES", 40_000_000, "faces")
 SHAPES = Budget("SHAPES", 200_000, "shapes")
 DEVICES = Budget("DEVICES", 100_000, "devices")
+MAP_AXIS = Budget("MAP_AXIS", 20_000_000, "coordinates")  # of one axis of a radio map
+MAP_CHUNKS = Budget("MAP_CHUNKS", 1_000_000, "pieces")  # that HDF5 stores a variable in
+MAP_ATTRIBUTES = Budget("MAP_ATTRIBUTES", 1_000, "attributes")  # of one variable
+MAP_PICTURES = Budget("MAP_PICTURES", 2_000, "pictures")  # in one file

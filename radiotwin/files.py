@@ -91,10 +91,13 @@ def atomic_file(path: Path | str, hide_errors: bool = False) -> Iterator[IO[byte
             with open(temporary, "w+b") as file:
                 yield file
             return
-        with _ErrorsKept(open(temporary, "w+b", buffering=0)) as kept:
-            yield kept  # type: ignore[misc]  # a raw file
-        if kept.error is not None:
-            raise kept.error
+        kept = _ErrorsKept(open(temporary, "w+b", buffering=0))
+        try:
+            with kept:
+                yield kept  # type: ignore[misc]  # a raw file
+        finally:  # what the library made of the lost bytes matters less than why they were lost
+            if kept.error is not None:
+                raise kept.error
 
 
 @contextmanager
