@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import xarray as xr
 
+from radiotwin.errors import BadInput
 from radiotwin.files import atomic_file
 from radiotwin.geodesy import local_crs
 from radiotwin.progress import progress
@@ -19,6 +20,8 @@ DIMS = ("device", "z", "y", "x")
 SCHEMA = "radiotwin.radiomap/1"
 CONVENTIONS = "CF-1.11"  # https://cfconventions.org
 GRID_MAPPING = "crs"
+GAIN_RANGE_DB = (-1_000.0, 200.0)  # far beyond any link: what is outside is an error
+MAX_SIGMA_DB = 1_000.0
 BLOCK_VALUES = 200_000  # of a variable that are in memory at once
 _WHOLE_VALUES = 2**20  # of a variable that HDF5 stores in pieces of its own choice
 _CHUNK_CELLS = 256  # along y and x of a piece of a larger one
@@ -79,6 +82,7 @@ class MapStream:
                 for z, y, x in parts:
                     lattice = Lattice(self.lattice.x_m[x], self.lattice.y_m[y], self.lattice.z_m[z])
                     values = self.make(device, lattice)
+                    _check_values(device, values)
                     yield MapBlock((slice(row, row + 1), z, y, x),
                                    {name: values[name][None] for name in self.variables})
                     advance(1)
@@ -88,13 +92,23 @@ class MapStream:
         return replace(self, attributes=placed_attributes(self.attributes, origin))
 
     def selected(self, devices: list[str], lattice: Lattice) -> "MapStream":
-        """Return the map of some of its devices on a part of its lattice."""
+        """Return the map of some of its devices on some levels of its lattice."""
         return replace(self, devices=devices, lattice=lattice)
 
     @property
     def header(self) -> xr.Dataset:
         """Coordinates and attributes of the dataset that it would be."""
         return header(self.devices, self.lattice, self.attributes)
+
+
+def _check_values(device: str, values: dict[str, np.ndarray]) -> None:
+    """Refuse gains that no link has, before they become infinite in single precision."""
+    for name, (low, high) in (("gain_db", GAIN_RANGE_DB), ("sigma_db", (0.0, MAX_SIGMA_DB))):
+        if name in values and not ((values[name] >= low) & (values[name] <= high)
+                                   | np.isnan(values[name])).all():
+            raise BadInput(f"the model's {name} for device {device!r} goes from "
+                           f"{np.nanmin(values[name]):g} to {np.nanmax(values[name]):g}; allowed is "
+                           f"{low:g} to {high:g}: fit it again")
 
 
 def header(devices: list[str], lattice: Lattice, attributes: dict[str, Any] | None) -> xr.Dataset:

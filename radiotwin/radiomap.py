@@ -16,6 +16,8 @@ from radiotwin.inputs import open_input
 from radiotwin.map_file import (
     ATTRIBUTES,
     DIMS,
+    GAIN_RANGE_DB,
+    MAX_SIGMA_DB,
     MapBlock,
     MapStream,
     header,
@@ -28,8 +30,6 @@ from radiotwin.scene.lattice import Lattice
 from radiotwin.tables import Origin
 
 _VARIABLES = ("gain_db", "los", "sigma_db")
-GAIN_RANGE_DB = (-1_000.0, 200.0)  # far beyond any link: what is outside is an error
-MAX_SIGMA_DB = 1_000.0
 MAX_COORDINATE_M = 1e7  # a quarter of the way around the Earth
 MIN_STEP_M = 1e-3
 _MAX_NAME = 200  # characters
@@ -149,9 +149,8 @@ class RadioMap:
         return RadioMap(dataset)
 
     def selected(self, devices: list[str], lattice: Lattice) -> "RadioMap":
-        """Return the map of some of its devices on a part of its lattice."""
-        return RadioMap(self.dataset.sel(device=devices, z=lattice.z_m, y=lattice.y_m,
-                                         x=lattice.x_m))
+        """Return the map of some of its devices on some levels of its lattice."""
+        return RadioMap(self.dataset.sel(device=devices, z=lattice.z_m))
 
     @property
     def header(self) -> xr.Dataset:
@@ -204,11 +203,15 @@ def _form_problem(dataset: xr.Dataset) -> str | None:
         if (axis not in dataset.coords or dataset[axis].dims != (axis,)
                 or dataset.sizes[axis] == 0):
             return f"the coordinate {axis} is missing or empty"
-        (DEVICES if axis == "device" else MAP_AXIS).check(dataset.sizes[axis], f"axis {axis}")
+        budget = DEVICES if axis == "device" else MAP_AXIS
+        budget.check(dataset.sizes[axis], f"axis {axis} of the radio map")
     for name in _NUMBERS:
         value = dataset.attrs.get(name, 0.0)
         if not isinstance(value, int | float | np.number) or not math.isfinite(value):
             return f"the attribute {name} is {str(value)[:60]!r}, not a finite number"
+    for name, most in (("latitude", 90), ("longitude", 180)):
+        if abs(dataset.attrs.get(f"origin_{name}_deg", 0.0)) > most:
+            return f"the attribute origin_{name}_deg is not within {most} degrees of 0"
     return None
 
 
