@@ -49,7 +49,7 @@ def write_geotiff(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> 
     crs = None if origin is None else rasterio.crs.CRS.from_string(local_crs(origin))
     transform = rasterio.Affine(step_m, 0, lattice.x_m[0] - step_m / 2,
                                 0, -step_m, lattice.y_m[-1] + step_m / 2)
-    attributes = {name: str(value) for name, value in radio_map.attributes.items()}
+    attributes = {name: str(value) for name, value in radio_map.header.attrs.items()}
     is_large = len(names) * height * width > _WHOLE_VALUES
     # GDAL hides errors of a full disk: it writes to memory, and we to the disk.
     with rasterio.Env(GTIFF_WRITE_TOWGS84="NO", GDAL_CACHEMAX=_CACHE_BYTES), \
