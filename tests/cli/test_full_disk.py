@@ -15,6 +15,14 @@ from radiotwin.export import EXPORTERS
 from radiotwin.survey import fly_survey, segmented_truth
 
 DISK_BYTES = 64 * 1024
+IMPORT = """[columns]
+level = "gain_db"
+receiver = "receiver"
+x = "receiver_x_m"
+y = "receiver_y_m"
+z = "receiver_z_m"
+device = "device"
+"""
 OLD = b"an older result\n"
 
 
@@ -41,6 +49,7 @@ def inputs(small_scene, tmp_path_factory, run):
     truth = segmented_truth(small_scene)
     fly_survey(small_scene, truth, flights=2, pattern="random-waypoint", seed=0).write(folder / "m.csv")
     assert run("fit m.csv --scene scene --model log_distance -o twin", folder).returncode == 0
+    (folder / "import.toml").write_text(IMPORT)
     (folder / "points.csv").write_text("x_m,y_m,z_m\n" + "80,60,30\n" * 50)
     return folder
 
@@ -67,10 +76,9 @@ COMMANDS = [
     "build-scene preset:small -o {disk}/new",
     "survey scene --truth segmented -o {disk}/new/m.csv", "survey scene --truth segmented -o {disk}/new/m.parquet",
     "survey scene --truth segmented -o {disk}/new/m.csv.gz",
-    "import m.csv --devices devices.csv -o {disk}/new", "fit m.csv --scene scene --model log_distance -o {disk}/new",
+    "import m.csv --devices devices.csv --columns import.toml -o {disk}/new", "fit m.csv --scene scene --model log_distance -o {disk}/new",
     *(f"map twin --scene scene -o {{disk}}/old{suffix}" for suffix in (*EXPORTERS, ".png")),
     *(f"export-scene scene -o {{disk}}/{name}" for name in ("new", "old.glb", "old.gltf", "old.obj")),
-    "locate m.csv --twin twin --scene scene -o {disk}/old.csv",
     "report twin --scene scene -o {disk}/old.html",
 ]
 
@@ -93,6 +101,7 @@ def test_the_old_output_stays(run, disk, inputs, command, free):
     assert content(disk) == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["compare m.csv --scene scene -o {disk}/new",
                                      "close-loop m.csv --scene scene --base log-distance -o {disk}/new"])
 def test_what_takes_long_says_so_in_the_end(run, disk, inputs, command):
@@ -130,7 +139,7 @@ def test_trace(run, disk, inputs, monkeypatch):
     monkeypatch.setattr("radiotwin.trace.run.solve_lattice",
                         lambda scene, settings, store, index: np.full((len(index), scene.blocked.size), -80.0))
     monkeypatch.setattr("radiotwin.trace.run.solve_finer", lambda *_: (
-        np.zeros((1, 1), int), np.zeros((1, 1), int), np.full((1, 1), -80.0)))
+        np.zeros((1, 1), int), np.arange(1), np.full((1, 1), -80.0)))
     monkeypatch.setattr("radiotwin.trace.run.check_gains", lambda *_: {})
     monkeypatch.setattr("radiotwin.trace.run.noise_figures", lambda *_: {})
     fill(disk, 4096)
