@@ -107,8 +107,8 @@ def _check_values(device: str, values: dict[str, np.ndarray]) -> None:
         if name in values and not ((values[name] >= low) & (values[name] <= high)
                                    | np.isnan(values[name])).all():
             raise BadInput(f"the model's {name} for device {device!r} goes from "
-                           f"{np.nanmin(values[name]):g} to {np.nanmax(values[name]):g}; allowed is "
-                           f"{low:g} to {high:g}: fit it again")
+                           f"{np.nanmin(values[name]):g} to {np.nanmax(values[name]):g}; allowed "
+                           f"is {low:g} to {high:g}: fit it again")
 
 
 def header(devices: list[str], lattice: Lattice, attributes: dict[str, Any] | None) -> xr.Dataset:
@@ -182,7 +182,7 @@ def write_blocks(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[
         file.write(start.getbuffer())
         with h5netcdf.File(file, "r+", rdcc_nbytes=_CACHE_BYTES) as opened:
             for name, dtype in dtypes.items():
-                is_bool = dtype == bool
+                is_bool = dtype.kind == "b"
                 variable = opened.create_variable(
                     name, DIMS, np.int8 if is_bool else dtype,
                     fillvalue=dtype.type(np.nan) if dtype.kind == "f" else None, **options)
