@@ -9,7 +9,7 @@ import zlib
 from pathlib import Path
 from typing import IO
 
-import h5py
+import h5py  # type: ignore[import-untyped]
 import numpy as np
 
 from radiotwin.budgets import (
