@@ -102,3 +102,7 @@ CORNERS = Budget("CORNERS", 10_000, "corners in one face")  # cutting it takes t
 FIELD_PAIRS = Budget("FIELD_PAIRS", 200_000_000, "pairs of points")  # 8 bytes each
 TRAINING_BYTES = Budget("TRAINING_BYTES", 64 * 2**30, "bytes of memory")  # of a learner
 CHECKPOINT_BYTES = Budget("CHECKPOINT_BYTES", 64 * 2**30, "bytes")
+MAP_AXIS = Budget("MAP_AXIS", 20_000_000, "coordinates")  # of one axis of a radio map
+MAP_CHUNKS = Budget("MAP_CHUNKS", 1_000_000, "pieces")  # that HDF5 stores a variable in
+MAP_ATTRIBUTES = Budget("MAP_ATTRIBUTES", 1_000, "attributes")  # of one variable
+MAP_PICTURES = Budget("MAP_PICTURES", 2_000, "pictures")  # in one file

@@ -58,7 +58,8 @@ def read_cells(path: Path, required: Collection[str] = (),
                        f"{str(error)[:500]}") from None
 
 
-def write_csv(table: pd.DataFrame, target: Path, float_format: str | None = None) -> None:
+def write_csv(table: pd.DataFrame, target: Path | IO[bytes], float_format: str | None = None,
+              header: bool = True) -> None:
     """Write a table, without its index, as CSV in which a spreadsheet finds no formula.
 
     A text that begins as a formula does, and is not a number, gets an apostrophe in front, which
@@ -66,8 +67,9 @@ def write_csv(table: pd.DataFrame, target: Path, float_format: str | None = None
 
     Args:
         table: any columns.
-        target: temporary path from `radiotwin.files`; compressed if it ends in `.gz`.
+        target: temporary path from `radiotwin.files`, compressed if it ends in `.gz`; or a file.
         float_format: such as `%.4f`; all digits by default.
+        header: whether to write the names of the columns.
     """
     table = table.rename(columns=_quoted)
     for name in table.columns:
@@ -76,12 +78,12 @@ def write_csv(table: pd.DataFrame, target: Path, float_format: str | None = None
             odd = {text: _quoted(text) for text in texts.unique() if _quoted(text) is not text}
             if odd:
                 table[name] = texts.astype(object).map(lambda text, odd=odd: odd.get(text, text))
-    if target.suffix != ".gz":
-        table.to_csv(target, index=False, float_format=float_format)
+    if not isinstance(target, Path) or target.suffix != ".gz":
+        table.to_csv(target, index=False, float_format=float_format, header=header)
         return
     # Neither a name nor a time in the header: the same table gives the same bytes.
     with open(target, "wb") as file, gzip.GzipFile("", "wb", 9, file, mtime=0) as packed:
-        table.to_csv(packed, index=False, float_format=float_format)
+        table.to_csv(packed, index=False, float_format=float_format, header=header)
 
 
 def check_suffix(path: Path) -> None:

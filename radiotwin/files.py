@@ -84,7 +84,7 @@ def atomic_file(path: Path | str, hide_errors: bool = False) -> Iterator[IO[byte
     Args:
         path: of the file; missing folders are made.
         hide_errors: keep the first error of a write until the end, for libraries that crash or
-            swallow it (HDF5); all that is written after it is lost.
+            swallow it (HDF5); all that is written after it is kept in memory, and lost.
 
     Yields:
         binary file, open for reading and writing.
@@ -98,10 +98,13 @@ def atomic_file(path: Path | str, hide_errors: bool = False) -> Iterator[IO[byte
             with open(temporary, "w+b") as file:
                 yield file
             return
-        with _ErrorsKept(open(temporary, "w+b", buffering=0)) as kept:
-            yield kept  # type: ignore[misc]  # a raw file
-        if kept.error is not None:
-            raise kept.error
+        kept = _ErrorsKept(open(temporary, "w+b", buffering=0))
+        try:
+            with kept:
+                yield kept  # type: ignore[misc]  # a raw file
+        finally:  # what the library made of the lost bytes matters less than why they were lost
+            if kept.error is not None:
+                raise kept.error
 
 
 @contextmanager
@@ -142,42 +145,68 @@ def scratch_folder() -> Iterator[Path]:
 
 
 class _ErrorsKept(io.RawIOBase):
-    """A file whose writes always succeed.
+    """A file whose writes always succeed: from the first that did not they are kept in memory.
+
+    A library reads again what it wrote, and crashes where that is lost.
 
     Attributes:
-        error: of the first write that did not.
+        error: of the first write that did not succeed.
     """
 
     def __init__(self, file: io.FileIO) -> None:
         self._file = file
+        self._position = self._end = 0
+        self._lost: list[tuple[int, bytes]] = []  # position and data
         self.error: OSError | None = None
 
     def write(self, data: Any) -> int:
-        size = memoryview(data).nbytes
-        rest = memoryview(data).cast("B")
-        while self.error is None and rest:
-            try:
-                rest = rest[self._file.write(rest):]
-            except OSError as error:
-                self.error = error
-        return size
-
-    def readinto(self, buffer: Any) -> int:
-        return self._file.readinto(buffer)
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        return self._file.seek(offset, whence)
-
-    def tell(self) -> int:
-        return self._file.tell()
-
-    def truncate(self, size: int | None = None) -> int:
+        data = memoryview(data).cast("B")
         if self.error is None:
             try:
-                return self._file.truncate(size)
+                self._file.seek(self._position)
+                rest = data
+                while rest:
+                    rest = rest[self._file.write(rest):]
             except OSError as error:
                 self.error = error
-        return self.tell() if size is None else size
+        if self.error is not None:
+            self._lost.append((self._position, bytes(data)))
+        self._position += len(data)
+        self._end = max(self._end, self._position)
+        return len(data)
+
+    def readinto(self, buffer: Any) -> int:
+        view = memoryview(buffer).cast("B")
+        start = self._position
+        stop = max(start, min(start + len(view), self._end))
+        view[:stop - start] = bytes(stop - start)
+        self._file.seek(start)
+        rest = view[:stop - start]
+        while rest and (count := self._file.readinto(rest)):
+            rest = rest[count:]
+        for first, data in self._lost:
+            low, high = max(first, start), min(first + len(data), stop)
+            if low < high:
+                view[low - start:high - start] = data[low - first:high - first]
+        self._position = stop
+        return stop - start
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        self._position = offset + {os.SEEK_SET: 0, os.SEEK_CUR: self._position,
+                                   os.SEEK_END: self._end}[whence]
+        return self._position
+
+    def tell(self) -> int:
+        return self._position
+
+    def truncate(self, size: int | None = None) -> int:
+        self._end = self._position if size is None else size
+        if self.error is None:
+            try:
+                self._file.truncate(self._end)
+            except OSError as error:
+                self.error = error
+        return self._end
 
     def readable(self) -> bool:
         return True

@@ -1,6 +1,7 @@
 """The radio map: channel gain at every lattice position for every device."""
 
-from collections.abc import Hashable
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,32 +9,32 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from radiotwin.budgets import DEVICES, MAP_AXIS
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_path
-from radiotwin.geodesy import local_crs
+from radiotwin.hdf5 import check_hdf5
+from radiotwin.inputs import open_input
+from radiotwin.map_file import (
+    ATTRIBUTES,
+    DIMS,
+    GAIN_RANGE_DB,
+    MAX_SIGMA_DB,
+    MapBlock,
+    MapStream,
+    header,
+    parts_of,
+    placed_attributes,
+    without_cf,
+    write_blocks,
+)
 from radiotwin.scene.lattice import Lattice
 from radiotwin.tables import Origin
 
-DIMS = ("device", "z", "y", "x")
-SCHEMA = "radiotwin.radiomap/1"
-CONVENTIONS = "CF-1.11"  # https://cfconventions.org
-GRID_MAPPING = "crs"
-_ATTRIBUTES: dict[str, dict[str, str]] = {
-    "x": {"units": "m", "long_name": "east"},
-    "y": {"units": "m", "long_name": "north"},
-    "z": {"units": "m", "long_name": "height above the ground datum"},
-    "gain_db": {"units": "dB", "long_name": "channel gain (NaN: not detected)"},
-    "sigma_db": {"units": "dB", "long_name": "standard deviation of the gain"},
-    "los": {"long_name": "line of sight by the 3D map"},
-}
-# Attributes of the file only, by the CF conventions; in memory they would be in the way.
-_CF_ATTRIBUTES: dict[str, dict[str, str | np.ndarray]] = {
-    "x": {"axis": "X", "standard_name": "projection_x_coordinate"},
-    "y": {"axis": "Y", "standard_name": "projection_y_coordinate"},
-    "z": {"axis": "Z", "standard_name": "height", "positive": "up"},
-    "los": {"flag_values": np.array([0, 1], dtype=np.int8),
-            "flag_meanings": "no_line_of_sight line_of_sight"},
-}
+_VARIABLES = ("gain_db", "los", "sigma_db")
+MAX_COORDINATE_M = 1e7  # a quarter of the way around the Earth
+MIN_STEP_M = 1e-3
+_MAX_NAME = 200  # characters
+_NUMBERS = ("frequency_hz", "gain_limit_db", "origin_latitude_deg", "origin_longitude_deg",
+            "origin_altitude_m", "shadowing_share", "shadowing_length_m")  # among the attributes
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,15 +67,22 @@ class RadioMap:
         variables = {"gain_db": gain_db.astype(np.float32), "los": los.astype(bool)}
         if sigma_db is not None:
             variables["sigma_db"] = sigma_db.astype(np.float32)
-        dataset = xr.Dataset(
-            {name: (DIMS, values.reshape(shape)) for name, values in variables.items()},
-            coords={"device": np.array(devices, dtype=object),
-                    "z": lattice.z_m, "y": lattice.y_m, "x": lattice.x_m},
-            attrs={"schema": SCHEMA, **(attributes or {})},
-        )
-        for name in dataset.variables:
-            dataset[name].attrs.update(_ATTRIBUTES.get(str(name), {}))
+        dataset = header(devices, lattice, attributes).assign(
+            {name: (DIMS, values.reshape(shape), ATTRIBUTES[name])
+             for name, values in variables.items()})
         return cls(dataset)
+
+    @classmethod
+    def collect(cls, stream: MapStream) -> "RadioMap":
+        """Make all blocks of a stream and keep them in memory."""
+        shape = (len(stream.devices), *stream.lattice.shape)
+        arrays = {name: np.empty(shape, bool if name == "los" else np.float32)
+                  for name in stream.variables}
+        for block in stream.blocks():
+            for name, values in block.values.items():
+                arrays[name][block.where] = values
+        return cls(stream.header.assign({name: (DIMS, array, ATTRIBUTES[name])
+                                         for name, array in arrays.items()}))
 
     @classmethod
     def read(cls, path: Path | str) -> "RadioMap":
@@ -87,21 +95,27 @@ class RadioMap:
             BadInput: no such file, not NetCDF-4, or not a radio map.
         """
         path = Path(path)
-        if not path.is_file():
+        if not path.exists():
             raise BadInput(f"{path} does not exist; `radiotwin trace` or `radiotwin map` makes a "
                            "radio map")
-        try:
-            with xr.open_dataset(path, engine="h5netcdf") as file:
-                dataset = file.load()
-        except Exception as error:  # h5py raises OSError, KeyError or ValueError, by the damage
-            raise BadInput(f"{path} is not a readable NetCDF-4 file ({error}); make it again"
-                           ) from None
-        problem = _problem(dataset)
+        with open_input(path, "radio map (.nc)") as file:
+            try:
+                check_hdf5(file, path)
+                with xr.open_dataset(file, engine="h5netcdf") as opened:
+                    problem = _form_problem(opened)
+                    names = [*(name for name in _VARIABLES if name in opened), *DIMS]
+                    dataset = opened if problem else opened[names].load()
+            except BadInput:
+                raise
+            except Exception as error:  # h5py raises OSError, KeyError or ValueError, by the damage
+                raise BadInput(f"{path} is not a readable NetCDF-4 file ({error}); make it again"
+                               ) from None
+        problem = problem or _value_problem(dataset)
         if problem:
             raise BadInput(f"{path} is not a radio map: {problem}; `radiotwin trace` or "
                            "`radiotwin map` makes one")
         dataset["los"] = dataset["los"].astype(bool)
-        return cls(_without_cf(dataset))
+        return cls(without_cf(dataset.drop_encoding()))
 
     def write(self, path: Path | str) -> None:
         """Write compressed NetCDF-4 by the CF conventions, atomically.
@@ -111,12 +125,18 @@ class RadioMap:
 
         Raises:
             BadInput: `path` cannot be written.
+            RunFailed: the disk is full or failed; an older file is unchanged.
         """
-        encoding: dict[Hashable, dict[str, int | None]] = {
-            name: {"zlib": True, "complevel": 4} for name in self.dataset.data_vars}
-        encoding |= {axis: {"_FillValue": None} for axis in "xyz"}
-        with atomic_path(path) as temporary:
-            _with_cf(self.dataset).to_netcdf(temporary, engine="h5netcdf", encoding=encoding)
+        dtypes = {name: self.dataset[name].dtype for name in self.variables}
+        write_blocks(self.header, dtypes, self.blocks(), path)
+
+    def blocks(self) -> Iterator[MapBlock]:
+        """Return the map in parts, as `MapStream.blocks` makes them."""
+        arrays = {name: self.dataset[name].values for name in self.variables}
+        for row in range(self.dataset.sizes["device"]):
+            for part in parts_of(self.lattice.shape):
+                where = (slice(row, row + 1), *part)
+                yield MapBlock(where, {name: array[where] for name, array in arrays.items()})
 
     def placed(self, origin: Origin | None) -> "RadioMap":
         """Return the same map with another origin of the local frame.
@@ -124,12 +144,28 @@ class RadioMap:
         Args:
             origin: the new origin; None removes it.
         """
-        new = {} if origin is None else {
-            f"origin_{name}": value for name, value in origin.model_dump().items()}
         dataset = self.dataset.copy()
-        dataset.attrs = {name: value for name, value in dataset.attrs.items()
-                         if not name.startswith("origin_")} | new
+        dataset.attrs = placed_attributes(dataset.attrs, origin)
         return RadioMap(dataset)
+
+    def selected(self, devices: list[str], lattice: Lattice) -> "RadioMap":
+        """Return the map of some of its devices on some levels of its lattice."""
+        return RadioMap(self.dataset.sel(device=devices, z=lattice.z_m))
+
+    @property
+    def header(self) -> xr.Dataset:
+        """Coordinates and attributes."""
+        return self.dataset.drop_vars(self.variables)
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Provenance."""
+        return {str(name): value for name, value in self.dataset.attrs.items()}
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """`gain_db`, `los` and, of a learned map, `sigma_db`."""
+        return tuple(name for name in _VARIABLES if name in self.dataset)
 
     @property
     def devices(self) -> list[str]:
@@ -152,63 +188,65 @@ class RadioMap:
         return self.dataset["los"].values
 
 
-def _with_cf(dataset: xr.Dataset) -> xr.Dataset:
-    """Add the CF attributes, and the grid mapping where the origin is known."""
-    dataset = dataset.copy().assign_attrs(Conventions=CONVENTIONS)
-    for name, attributes in _CF_ATTRIBUTES.items():
-        if name in dataset.variables:
-            dataset[name] = dataset[name].assign_attrs(attributes)
-    latitude, longitude = (dataset.attrs.get(f"origin_{name}_deg")
-                           for name in ("latitude", "longitude"))
-    if latitude is None or longitude is None:
-        return dataset
-    from pyproj import CRS
-
-    origin = Origin(latitude_deg=float(latitude), longitude_deg=float(longitude))
-    dataset[GRID_MAPPING] = xr.Variable((), np.int32(0), CRS(local_crs(origin)).to_cf())
-    for variable in dataset.data_vars:
-        if variable != GRID_MAPPING:
-            dataset[variable] = dataset[variable].assign_attrs(grid_mapping=GRID_MAPPING)
-    return dataset
-
-
-def _without_cf(dataset: xr.Dataset) -> xr.Dataset:
-    """Remove the attributes that `_with_cf` adds."""
-    dataset = dataset.drop_vars(GRID_MAPPING, errors="ignore")
-    dataset.attrs.pop("Conventions", None)
-    for name in dataset.variables:
-        for key in ("grid_mapping", *_CF_ATTRIBUTES.get(str(name), ())):
-            dataset[name].attrs.pop(key, None)
-            dataset[name].encoding.pop(key, None)
-    return dataset
-
-
-def _problem(dataset: xr.Dataset) -> str | None:
-    """Return the first reason why a dataset is not a radio map, or None."""
-    for name in ("gain_db", "los", "sigma_db"):
+def _form_problem(dataset: xr.Dataset) -> str | None:
+    """Return the first reason why a dataset is not a radio map that is seen without its values."""
+    for name in _VARIABLES:
         if name not in dataset.data_vars:
             if name == "sigma_db":
                 continue
-            return f"it lacks {name}; it has {list(dataset.data_vars)}"
+            return f"it lacks {name}; it has {list(dataset.data_vars)[:20]}"
         if dataset[name].dims != DIMS:
             return f"{name} has the dims {dataset[name].dims}, it needs {DIMS}"
         if dataset[name].dtype.kind not in ("biuf" if name == "los" else "iuf"):
             return f"{name} holds {dataset[name].dtype}, not numbers"
     for axis in DIMS:
-        if axis not in dataset.coords or dataset.sizes[axis] == 0:
+        if (axis not in dataset.coords or dataset[axis].dims != (axis,)
+                or dataset.sizes[axis] == 0):
             return f"the coordinate {axis} is missing or empty"
+        budget = DEVICES if axis == "device" else MAP_AXIS
+        budget.check(dataset.sizes[axis], f"axis {axis} of the radio map")
+    for name in _NUMBERS:
+        value = dataset.attrs.get(name, 0.0)
+        if not isinstance(value, int | float | np.number) or not math.isfinite(value):
+            return f"the attribute {name} is {str(value)[:60]!r}, not a finite number"
+    for name, most in (("latitude", 90), ("longitude", 180)):
+        if abs(dataset.attrs.get(f"origin_{name}_deg", 0.0)) > most:
+            return f"the attribute origin_{name}_deg is not within {most} degrees of 0"
+    return None
+
+
+def _value_problem(dataset: xr.Dataset) -> str | None:
+    """Return the first reason why the values of a dataset cannot be those of a radio map."""
     for axis in "xyz":
         values = dataset[axis].values
         if (values.dtype.kind not in "iuf" or not np.isfinite(values).all()
                 or not (np.diff(values) > 0).all()):
             return f"the coordinate {axis} must hold finite numbers in ascending order [m]"
-    names = dataset["device"].values.astype(str).tolist()
-    if len(set(names)) < len(names):
-        return f"two devices have one name in {names}"
-    if np.isinf(dataset["gain_db"].values).any():
+        if max(-float(values[0]), float(values[-1])) > MAX_COORDINATE_M or (
+                len(values) > 1 and np.diff(values).min() < MIN_STEP_M):
+            return (f"the coordinate {axis} must lie within {MAX_COORDINATE_M:,.0f} m of 0, with "
+                    f"steps of at least {MIN_STEP_M:g} m")
+    names = dataset["device"].values.astype(str)
+    unique, count = np.unique(names, return_counts=True)
+    if len(unique) < len(names):
+        return f"two devices have one name, {str(unique[count > 1][0])[:_MAX_NAME]!r}"
+    for name in names.tolist():
+        if not name.isprintable() or not 0 < len(name) <= _MAX_NAME:
+            return (f"device name {name[:_MAX_NAME]!r} is empty, longer than {_MAX_NAME} "
+                    "characters, or has some that cannot be printed")
+    gain_db = dataset["gain_db"].values
+    low_db, high_db = np.fmin.reduce(gain_db, axis=None), np.fmax.reduce(gain_db, axis=None)
+    if np.isinf(low_db) or np.isinf(high_db):
         return "gain_db is infinite somewhere; where nothing is detected it must be NaN"
+    if low_db < GAIN_RANGE_DB[0] or high_db > GAIN_RANGE_DB[1]:
+        return (f"gain_db goes from {low_db:g} to {high_db:g} dB; allowed is "
+                f"{GAIN_RANGE_DB[0]:g} to {GAIN_RANGE_DB[1]:g}")
     if dataset["los"].dtype != bool and not np.isin(dataset["los"].values, (0, 1)).all():
         return "los holds other values than 0 and 1"
-    if "sigma_db" in dataset and (dataset["sigma_db"].values < 0).any():
-        return "sigma_db is negative somewhere"
+    if "sigma_db" in dataset:
+        sigma_db = dataset["sigma_db"].values
+        if np.fmin.reduce(sigma_db, axis=None) < 0:
+            return "sigma_db is negative somewhere"
+        if np.fmax.reduce(sigma_db, axis=None) > MAX_SIGMA_DB:
+            return f"sigma_db is above {MAX_SIGMA_DB:g} dB somewhere"
     return None

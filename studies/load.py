@@ -1,5 +1,6 @@
 """What large inputs cost: seconds and peak memory of whole commands, by size: `load`."""
 
+import math
 import os
 import subprocess
 import sys
@@ -14,6 +15,10 @@ from radiotwin.cells import write_csv
 from radiotwin.errors import RunFailed
 from radiotwin.files import scratch_folder
 from radiotwin.scene import Scene
+from radiotwin.scene.config import LatticeConfig, write_config
+from radiotwin.scene.presets import build_preset
+from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.twin import fit_twin
 from studies.runner import Study
 from studies.tables import markdown
 
@@ -89,8 +94,27 @@ def make_import(links: int, folder: Path) -> dict[str, list[str]]:
             "fit segmented_nn": [*fit, "net"]}
 
 
+def make_map_inputs(size: int, folder: Path) -> dict[str, list[str]]:
+    """Write a scene of 1.0 x 1.2 km whose lattice has about `size` positions, and a twin of it."""
+    build_preset("rdm", folder / "scene")
+    coarse = Scene.load(folder / "scene")
+    survey = fly_survey(coarse, segmented_truth(coarse), flights=4, pattern="random-waypoint",
+                        seed=0)
+    fit_twin(survey, coarse, seed=0).save(folder / "twin")
+    width_m, depth_m = coarse.lattice.x_m[-1], coarse.lattice.y_m[-1]
+    altitudes_m = coarse.config.lattice.altitudes_m
+    step_m = math.sqrt(width_m * depth_m * len(altitudes_m) / size)
+    fine = LatticeConfig(step_m=step_m * 1.005, altitudes_m=altitudes_m)
+    write_config(coarse.config.model_copy(update={"lattice": fine, "uavs": []}),
+                 folder / "scene" / "scene.toml")
+    device = coarse.config.devices[0].device
+    command = ["radiotwin.cli", "map", "twin", "--scene", "scene", "--devices", device, "-o"]
+    return {f"map to {suffix}": [*command, f"map{suffix}"] for suffix in (".nc", ".tif", ".csv")}
+
+
 PARTS: dict[str, tuple[Make, tuple[int, ...]]] = {
     "import and fit": (make_import, (100_000, 1_000_000, 10_000_000)),
+    "map": (make_map_inputs, (100_000, 1_000_000, 10_000_000)),
 }
 """Name of a part -> inputs and commands, and sizes from the smallest."""
 

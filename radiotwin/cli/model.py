@@ -93,7 +93,8 @@ def map_(
 
     It holds the gain of every device over the scene's lattice.
     """
-    from radiotwin.export import EXPORTERS, check_format, select
+    from radiotwin.export import EXPORTERS, check_format, select, write_map
+    from radiotwin.files import require_writable
     from radiotwin.radiomap import RadioMap
     from radiotwin.report import write_picture
     from radiotwin.scene import Scene
@@ -106,11 +107,12 @@ def map_(
     exporters = EXPORTERS | {".png": write_picture}
     world = Scene.load(scene)
     check_format(out, world, exporters)
-    radio_map = RadioMap.read(twin) if is_map else Twin.load(twin).radio_map(world)
+    require_writable(out)
+    radio_map = RadioMap.read(twin) if is_map else Twin.load(twin).map_stream(world)
     if is_map:
-        _check_scene(twin, radio_map.dataset.attrs, world)
+        _check_scene(twin, radio_map.attributes, world)
     radio_map = select(radio_map, split_names(devices), _altitudes(altitudes))
-    exporters[out.suffix](radio_map, world, out)
+    write_map(radio_map, world, out, exporters)
     say(f"wrote {out}: {len(radio_map.devices)} devices on {radio_map.lattice.shape} positions "
         "(z, y, x)")
 

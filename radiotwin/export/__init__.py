@@ -2,17 +2,51 @@
 
 from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import TypeVar
 
+import numpy as np
+
+from radiotwin.budgets import MAP_VALUES
 from radiotwin.errors import BadInput
 from radiotwin.export.geotiff import write_geotiff
 from radiotwin.export.kmz import write_kmz
 from radiotwin.export.tables import write_csv, write_netcdf, write_numpy
+from radiotwin.map_file import MapStream
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
+from radiotwin.scene.lattice import Lattice
 
 EXPORTERS: dict[str, Callable[[RadioMap, Scene, Path], None]] = {
     ".nc": write_netcdf, ".csv": write_csv, ".npz": write_numpy, ".tif": write_geotiff,
     ".kmz": write_kmz}
+STREAMED: dict[str, Callable[[RadioMap | MapStream, Scene, Path], None]] = {
+    ".nc": write_netcdf, ".csv": write_csv, ".tif": write_geotiff}
+"""Formats that a map is written to while it is made."""
+_Map = TypeVar("_Map", RadioMap, MapStream)
+_NAMED = 20  # devices, or altitudes, in a message
+
+
+def write_map(radio_map: RadioMap | MapStream, scene: Scene, path: Path,
+              exporters: dict[str, Callable[[RadioMap, Scene, Path], None]]) -> None:
+    """Write a map in the format of a file name, block by block where the format allows it.
+
+    Args:
+        radio_map: map to write.
+        scene: of the map.
+        path: of the output; its suffix chooses the format.
+        exporters: by suffix.
+
+    Raises:
+        BadInput: the map is too large to be in memory, as the format needs it.
+    """
+    if path.suffix in STREAMED:
+        STREAMED[path.suffix](radio_map, scene, path)
+        return
+    if isinstance(radio_map, MapStream):
+        MAP_VALUES.check(len(radio_map.devices) * np.prod(radio_map.lattice.shape, dtype=float),
+                         f"{path}: the map, which only {', '.join(STREAMED)} take in parts")
+        radio_map = RadioMap.collect(radio_map)
+    exporters[path.suffix](radio_map, scene, path)
 
 
 def check_format(path: Path, scene: Scene,
@@ -36,9 +70,8 @@ def check_format(path: Path, scene: Scene,
                        "and longitude_deg of x = y = 0")
 
 
-def select(
-    radio_map: RadioMap, devices: list[str] | None, altitudes_m: list[float] | None
-) -> RadioMap:
+def select(radio_map: _Map, devices: list[str] | None,
+           altitudes_m: list[float] | None) -> _Map:
     """Select devices and altitudes of a map.
 
     Args:
@@ -52,18 +85,23 @@ def select(
     Raises:
         BadInput: the map has no such device or altitude.
     """
-    dataset = radio_map.dataset
+    if not devices and not altitudes_m:
+        return radio_map
+    names, lattice = radio_map.devices, radio_map.lattice
+    known = set(names)
     for name in devices or []:
-        if name not in radio_map.devices:
-            raise BadInput(f"device {name!r} is not in the map; it has "
-                           f"{', '.join(radio_map.devices)}")
-    known_m = radio_map.lattice.z_m
+        if name not in known:
+            raise BadInput(f"device {name!r} is not in the map; it has {_some(names)}")
     for altitude_m in altitudes_m or []:
-        if altitude_m not in known_m:
+        if altitude_m not in lattice.z_m:
+            heights = [f"{z:g}" for z in lattice.z_m]
             raise BadInput(f"altitude {altitude_m:g} m is not in the map; it has "
-                           f"{', '.join(f'{z:g}' for z in known_m)} m")
-    if devices:
-        dataset = dataset.sel(device=list(dict.fromkeys(devices)))
+                           f"{_some(heights)} m")
     if altitudes_m:
-        dataset = dataset.sel(z=sorted(set(altitudes_m)))
-    return RadioMap(dataset)
+        lattice = Lattice(lattice.x_m, lattice.y_m, np.array(sorted(set(altitudes_m))))
+    return radio_map.selected(list(dict.fromkeys(devices or names)), lattice)
+
+
+def _some(names: list[str]) -> str:
+    more = f", … ({len(names):,} in all)" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more

@@ -1,17 +1,23 @@
 """Radio maps as GeoTIFF: one band for each device and altitude, for GIS programs."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_path
+from radiotwin.files import atomic_file
 from radiotwin.geodesy import local_crs
+from radiotwin.map_file import MapBlock, MapStream
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 
+MAX_BANDS = 65_535  # of the format
+_WHOLE_VALUES = 2**24  # of a map whose bands are interleaved pixel by pixel
+_CACHE_BYTES = 2**26  # of GDAL
 
-def write_geotiff(radio_map: RadioMap, scene: Scene, path: Path) -> None:
+
+def write_geotiff(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> None:
     """Write gains [dB] in single precision, north up, with NaN (nodata) where not detected.
 
     A cell lies around its lattice position. Bands are named `DEVICE at Z m`, devices first. The
@@ -32,29 +38,56 @@ def write_geotiff(radio_map: RadioMap, scene: Scene, path: Path) -> None:
         raise BadInput(
             f"{path}: GeoTIFF is written with the package rasterio, which is not installed; "
             "install it with `pip install 'radiotwin[gis]'`, or write .nc or .csv") from None
-    lattice, gain_db = radio_map.lattice, radio_map.gain_db
-    step_m = cell_size_m(radio_map, scene)
+    lattice, step_m = radio_map.lattice, cell_size_m(radio_map, scene)
     names = [(device, altitude_m) for device in radio_map.devices for altitude_m in lattice.z_m]
-    bands = gain_db.reshape(len(names), *gain_db.shape[2:])[:, ::-1]
+    if len(names) > MAX_BANDS:
+        raise BadInput(f"{path}: GeoTIFF has at most {MAX_BANDS:,} bands, and the map has "
+                       f"{len(names):,} devices and altitudes; choose some with --devices or "
+                       "--altitudes, or write .nc or .csv")
+    levels, height, width = lattice.shape
     origin = scene.config.origin
     crs = None if origin is None else rasterio.crs.CRS.from_string(local_crs(origin))
     transform = rasterio.Affine(step_m, 0, lattice.x_m[0] - step_m / 2,
                                 0, -step_m, lattice.y_m[-1] + step_m / 2)
-    attributes = {name: str(value) for name, value in radio_map.dataset.attrs.items()}
-    with atomic_path(path) as temporary, rasterio.Env(GTIFF_WRITE_TOWGS84="NO"):
-        with rasterio.open(
-                temporary, "w", driver="GTiff", dtype="float32", count=len(names), nodata=np.nan,
-                height=bands.shape[1], width=bands.shape[2], compress="deflate", crs=crs,
-                transform=transform) as file:
-            file.write(bands)
+    attributes = {name: str(value) for name, value in radio_map.header.attrs.items()}
+    is_large = len(names) * height * width > _WHOLE_VALUES
+    # GDAL hides errors of a full disk: it writes to memory, and we to the disk.
+    with rasterio.Env(GTIFF_WRITE_TOWGS84="NO", GDAL_CACHEMAX=_CACHE_BYTES), \
+            rasterio.MemoryFile(ext=".tif") as memory:
+        with memory.open(
+                driver="GTiff", dtype="float32", count=len(names), nodata=np.nan,
+                height=height, width=width, compress="deflate", crs=crs, transform=transform,
+                **({"interleave": "band", "bigtiff": "if_safer"} if is_large else {})) as file:
+            bands = None if is_large else np.empty((len(names), height, width), np.float32)
+            for block in radio_map.blocks():
+                _put(file, bands, block, levels)
+            if bands is not None:
+                file.write(bands)
             file.update_tags(**attributes)
             file.units = ["dB"] * len(names)
             for number, (device, altitude_m) in enumerate(names, start=1):
                 file.set_band_description(number, f"{device} at {altitude_m:g} m")
                 file.update_tags(number, device=device, z_m=f"{altitude_m:g}")
+        with atomic_file(path) as out:
+            out.write(memory.getbuffer())
 
 
-def cell_size_m(radio_map: RadioMap, scene: Scene) -> float:
+def _put(file: Any, bands: np.ndarray | None, block: MapBlock, levels: int) -> None:
+    """Put a block, north up, to the bands in memory, or to those of a file that is large."""
+    row, z, y, x = block.where
+    first = row.start * levels + z.start
+    values = block.values["gain_db"].reshape(-1, y.stop - y.start, x.stop - x.start)
+    height = file.height if bands is None else bands.shape[1]
+    rows = slice(height - y.stop, height - y.start)
+    if bands is not None:
+        bands[first:first + len(values), rows, x] = values[:, ::-1]
+        return
+    window = ((rows.start, rows.stop), (x.start, x.stop))
+    file.write(values[:, ::-1].astype(np.float32),
+               indexes=list(range(first + 1, first + 1 + len(values))), window=window)
+
+
+def cell_size_m(radio_map: RadioMap | MapStream, scene: Scene) -> float:
     """Return the side of a cell: the lattice's step, or the scene's for a map of one position.
 
     Args:

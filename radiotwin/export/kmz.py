@@ -19,8 +19,9 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from PIL import Image
 
+from radiotwin.budgets import MAP_PICTURES
 from radiotwin.export.geotiff import cell_size_m
-from radiotwin.files import atomic_path
+from radiotwin.files import atomic_file
 from radiotwin.geodesy import to_geographic
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
@@ -52,7 +53,8 @@ def write_kmz(radio_map: RadioMap, scene: Scene, path: Path) -> None:
     norm = Normalize(low_db, max(high_db, low_db + 1e-3))
     document = ET.Element(f"{{{KML}}}kml")
     top = _add(document, "Document", name=scene.config.name)
-    pictures = {"legend.png": _legend(norm)}
+    pictures: dict[str, tuple[int, int]] = {}
+    MAP_PICTURES.check(np.prod(radio_map.gain_db.shape[:2]), path)
     _add_legend(top)
     corners = _corners(radio_map, scene)
     declared = {device.device: device for device in scene.config.devices}
@@ -65,17 +67,23 @@ def write_kmz(radio_map: RadioMap, scene: Scene, path: Path) -> None:
             _add(_add(mark, "Point"), "coordinates").text = f"{longitude:.8f},{latitude:.8f}"
         for level, altitude_m in enumerate(radio_map.lattice.z_m):
             name = f"overlays/{row:03d}-{level:02d}.png"
-            pictures[name] = _picture(radio_map.gain_db[row, level], norm)
+            pictures[name] = row, level
             overlay = _add(folder, "GroundOverlay", name=f"{device} at {altitude_m:g} m",
                            visibility="1" if row == level == 0 else "0")
             _add(_add(overlay, "Icon"), "href").text = name
             _add(_add(overlay, "LatLonQuad", GX), "coordinates").text = corners
     ET.indent(document)
     text = ET.tostring(document, encoding="utf-8", xml_declaration=True)
-    with atomic_path(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
-        for name, data in {"doc.kml": text, **pictures}.items():  # doc.kml must be the first
-            # Without the time of writing, so that equal maps give equal bytes
-            archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
+    with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
+        _store(archive, "doc.kml", text)  # which must be the first
+        _store(archive, "legend.png", _legend(norm))
+        for name, index in pictures.items():
+            _store(archive, name, _picture(radio_map.gain_db[index], norm))
+
+
+def _store(archive: zipfile.ZipFile, name: str, data: bytes) -> None:
+    """Add a file without the time of writing, so that equal maps give equal bytes."""
+    archive.writestr(zipfile.ZipInfo(name), data, zipfile.ZIP_DEFLATED)
 
 
 def _add(parent: ET.Element, tag: str, space: str = KML, **texts: str) -> ET.Element:

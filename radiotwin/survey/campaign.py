@@ -36,7 +36,8 @@ def fly_survey(scene: Scene, truth: RadioMap, *, flights: int, pattern: str, see
     """
     _check(scene, truth, flights, pattern, noise_db)
     limit_db = scene.config.gain_limit_db
-    rows = [truth.devices.index(device.device) for device in scene.config.devices]
+    row_of = {name: row for row, name in enumerate(truth.devices)}
+    rows = [row_of[device.device] for device in scene.config.devices]
     gain_db = truth.gain_db[rows].reshape(len(rows), -1).astype(float)
     shadowing_sd_db = None
     if "sigma_db" in truth.dataset:

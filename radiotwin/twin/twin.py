@@ -20,9 +20,10 @@ from radiotwin.inference.gaussian import detection_probability
 from radiotwin.links import LinkData
 from radiotwin.links.prediction import Prediction
 from radiotwin.localize import TwinDevice
-from radiotwin.progress import progress
+from radiotwin.map_file import MapStream
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
+from radiotwin.scene.lattice import Lattice
 from radiotwin.twin.store import decode_twin, encode_twin, read_twin, write_twin
 
 CHUNK, CHUNK_WITH_EFFECTS = 200_000, 20_000  # links predicted at once: bounds memory
@@ -126,33 +127,37 @@ class Twin:
         sensitivity, too; attribute `gain_limit_db` says where detection ends.
 
         Raises:
+            BadInput: the twin was fitted without a 3D map, or predicts what no link has.
+        """
+        return RadioMap.collect(self.map_stream(scene))
+
+    def map_stream(self, scene: Scene) -> MapStream:
+        """Return the map of `radio_map`, made block by block when it is written.
+
+        Raises:
             BadInput: the twin was fitted without a 3D map.
         """
         self.require_map(scene)
         scene_hash = scene.content_hash()
         self.warn_of_another_scene(scene, scene_hash)
         known = np.flatnonzero(np.isfinite(self.device_m).all(axis=1))
-        receiver_m = scene.lattice.positions_m
-        shape = (len(known), len(receiver_m))
-        mean_db, sd_db, los = np.empty(shape), np.empty(shape), np.empty(shape, dtype=bool)
-        with progress("mapping", total=len(known)) as advance:
-            for row, device in enumerate(known):
-                for start in range(0, len(receiver_m), CHUNK):
-                    part = slice(start, start + CHUNK)
-                    ends_m = receiver_m[part]
-                    links = self.links(ends_m, np.full(len(ends_m), device), scene)
-                    predicted = self.predict(links)
-                    mean_db[row, part], sd_db[row, part] = predicted.mean_db, predicted.sd_db
-                    los[row, part] = links.los
-                advance(1)
-        if self.level == "rssi_dbm":
-            mean_db -= scene.config.radio.tx_power_dbm
+        rows = {self.devices[i].device: int(i) for i in known}
+        offset_db = scene.config.radio.tx_power_dbm if self.level == "rssi_dbm" else 0.0
+
+        def make(device: str, lattice: Lattice) -> dict[str, np.ndarray]:
+            receiver_m = lattice.positions_m
+            links = self.links(receiver_m, np.full(len(receiver_m), rows[device]), scene)
+            predicted = self.predict(links)
+            values = {"gain_db": predicted.mean_db - offset_db, "los": links.los,
+                      "sigma_db": predicted.sd_db}
+            return {name: value.reshape(lattice.shape) for name, value in values.items()}
+
         attributes = {"source": f"twin:{self.description}",
                       "frequency_hz": scene.config.radio.frequency_hz,
                       "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene_hash,
                       "radiotwin_version": radiotwin.__version__}
-        names = [self.devices[i].device for i in known]
-        return RadioMap.build(names, scene.lattice, mean_db, los, sd_db, attributes)
+        return MapStream(list(rows), scene.lattice, attributes, ("gain_db", "los", "sigma_db"),
+                         make)
 
     def save(self, folder: Path | str) -> None:
         """Write the twin's folder, whole or not at all.

@@ -5,6 +5,7 @@ from pyproj import CRS, Transformer
 
 from radiotwin.errors import BadInput
 from radiotwin.export.geotiff import write_geotiff
+from radiotwin.export.tables import write_csv
 from radiotwin.geodesy import to_geographic
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene.lattice import Lattice
@@ -55,3 +56,26 @@ def test_missing_package_names_what_to_install(radio_map, scene, tmp_path, monke
     monkeypatch.setitem(__import__("sys").modules, "rasterio", None)
     with pytest.raises(BadInput, match=r"pip install 'radiotwin\[gis\]'"):
         write_geotiff(radio_map, scene, tmp_path / "map.tif")
+
+
+def test_a_large_map_is_written_in_parts(scene, tmp_path, monkeypatch):
+    monkeypatch.setattr("radiotwin.export.geotiff._WHOLE_VALUES", 1000)
+    monkeypatch.setattr("radiotwin.map_file.BLOCK_VALUES", 700)
+    gain_db = np.random.default_rng(0).uniform(-120, -60, (2, 2, 50, 90)).astype(np.float32)
+    lattice = Lattice(np.arange(90.0), np.arange(50.0), np.array([50.0, 60.0]))
+    radio_map = RadioMap.build(["d0", "d1"], lattice, gain_db, gain_db > -80)
+    write_geotiff(radio_map, scene, tmp_path / "map.tif")
+    with rasterio.open(tmp_path / "map.tif") as file:
+        np.testing.assert_array_equal(file.read(), gain_db.reshape(4, 50, 90)[:, ::-1])
+        assert file.interleaving.value == "BAND" and file.descriptions[3] == "d1 at 60 m"
+    many = RadioMap.build([f"d{i}" for i in range(70_000)], Lattice.over(0, 0, 0, 0, 20, [50]),
+                          np.zeros((70_000, 1)), np.ones((70_000, 1)))
+    with pytest.raises(BadInput, match="at most 65,535 bands, and the map has 70,000"):
+        write_geotiff(many, scene, tmp_path / "many.tif")
+
+
+def test_a_large_table_is_written_in_parts(radio_map, scene, tmp_path, monkeypatch):
+    write_csv(radio_map, scene, tmp_path / "whole.csv")
+    monkeypatch.setattr("radiotwin.map_file.BLOCK_VALUES", 3)
+    write_csv(radio_map, scene, tmp_path / "parts.csv")
+    assert (tmp_path / "parts.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()
