@@ -17,7 +17,7 @@ from radiotwin.scene.material_mapping import map_materials
 from radiotwin.scene.materials import Material
 from radiotwin.scene.meshes import clean, load_shape
 from radiotwin.scene.mitsuba_xml import DeclaredShape, read_mitsuba_xml
-from radiotwin.scene.names import RESERVED_NAMES, safe_name, unique_name
+from radiotwin.scene.names import RESERVED_NAMES, TakenNames, safe_name, unique_name
 from radiotwin.scene.problems import Problem, error, fixed, listed, warning
 from radiotwin.scene.surfaces import FLAT_M, Surfaces
 
@@ -98,7 +98,7 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
 
 
 def _safe_names(shapes: Sequence[DeclaredShape]) -> tuple[list[str], list[Problem]]:
-    taken = set(RESERVED_NAMES)
+    taken = TakenNames(RESERVED_NAMES)
     names, changed, double = [], [], []
     for shape in shapes:
         wanted = shape.name.removeprefix("mesh-")
@@ -200,8 +200,8 @@ def _joined(names: list[str], materials: list[Material | None], surfaces: Surfac
     graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(size, size))
     building = connected_components(graph, directed=False)[1]
     meshes, whole, first = surfaces.meshes(), [], []
-    for index in range(building.max() + 1):
-        members = np.flatnonzero(building == index)
+    order = np.argsort(building, kind="stable")
+    for members in np.split(order, np.cumsum(np.bincount(building))[:-1]):
         parts = [trimesh.Trimesh(*meshes[one], process=False) for one in members]
         mesh: Any = trimesh.util.concatenate(parts)
         whole.append(clean(mesh.vertices, mesh.faces)[:2] if len(members) > 1

@@ -1,6 +1,7 @@
 """Names of shapes and materials that Sionna RT, Mitsuba and file systems accept."""
 
 import re
+from collections.abc import Iterable
 
 RESERVED_NAMES = {"merged-shapes", "__root__"}  # of objects that Sionna RT adds to a scene
 
@@ -17,16 +18,31 @@ def safe_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9_-]", "_", text)[:100] or "unnamed"
 
 
+class TakenNames(set[str]):
+    """Names in use, in lower case, as some file systems ignore case.
+
+    Attributes:
+        last: name -> the number that was appended to it last, so that many equal names take no
+            time by their square.
+    """
+
+    def __init__(self, names: Iterable[str] = ()) -> None:
+        super().__init__(names)
+        self.last: dict[str, int] = {}
+
+
 def unique_name(name: str, taken: set[str]) -> str:
     """Return the name, with a number appended where it is taken, and add it to `taken`.
 
     Args:
         name: Name to use.
-        taken: Names in use, in lower case, as some file systems ignore case; grows by one.
+        taken: Names in use, in lower case; grows by one. `TakenNames` where they may be many.
     """
-    free, number = name, 1
+    last = taken.last if isinstance(taken, TakenNames) else {}
+    free, number = name, last.get(name.lower(), 1)
     while free.lower() in taken:
         number += 1
         free = f"{name}_{number}"
     taken.add(free.lower())
+    last[name.lower()] = number
     return free

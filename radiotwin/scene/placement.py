@@ -194,11 +194,7 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
     chosen: list[np.ndarray] = []
     while len(chosen) < count:
         drawn = rng.choice(len(free), min(len(free), 1000), replace=False, p=weight / weight.sum())
-        for index in drawn:
-            if all(np.hypot(*(free[index] - other)) >= apart_m for other in chosen):
-                chosen.append(free[index])
-                if len(chosen) == count:
-                    break
+        _add_apart(chosen, free[drawn], apart_m, count)
         apart_m *= 0.8
     positions = np.round(np.array(chosen), 1).reshape(-1, 2)
     bottom_m = np.zeros(count) if ground is None else ground.height_at(*positions.T)
@@ -209,11 +205,36 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
             for number, ((x, y), bottom) in enumerate(zip(positions, bottom_m))]
 
 
+def _add_apart(chosen: list[np.ndarray], drawn: np.ndarray, apart_m: float, count: int) -> None:
+    """Add each of (n, 2) points that is at least `apart_m` from all before, up to `count` points.
+
+    Points are kept in squares of that side, so that only those in the nine squares around matter.
+    """
+    squares: dict[tuple[int, int], list[np.ndarray]] = {}
+    side_m = max(apart_m, 1e-3)  # below, the squares of a far point have no exact number
+    for point in chosen:
+        squares.setdefault(_square(point, side_m), []).append(point)
+    for point in drawn:
+        if len(chosen) == count:
+            return
+        row, column = _square(point, side_m)
+        near = (other for i in (-1, 0, 1) for j in (-1, 0, 1)
+                for other in squares.get((row + i, column + j), ()))
+        if all(np.hypot(*(point - other)) >= apart_m for other in near):
+            chosen.append(point)
+            squares.setdefault((row, column), []).append(point)
+
+
+def _square(point: np.ndarray, side_m: float) -> tuple[int, int]:
+    return int(point[0] // side_m), int(point[1] // side_m)
+
+
 def _spread_out(positions: np.ndarray, count: int) -> set[int]:
     """Choose `count` positions, from the middle on each the farthest from those before."""
     chosen = [int(np.linalg.norm(positions - positions.mean(axis=0), axis=1).argmin())]
+    gaps = np.full(len(positions), np.inf)
     while len(chosen) < count:
-        gaps = np.linalg.norm(positions[:, None] - positions[None, chosen], axis=2).min(axis=1)
+        gaps = np.minimum(gaps, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
         chosen.append(int(gaps.argmax()))
     return set(chosen)
 
@@ -242,9 +263,8 @@ def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: Ci
     battery = max(20.0, float(round(0.8 * sum(x.shape))))
     offsets_m = _UAV_CLEARANCE_M * np.array(
         [[0, 0, 0], [1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]])
-    uavs = []
-    for number in range(count):
-        altitude_m = lattice.altitudes_m[number % len(lattice.altitudes_m)]
+    starts: dict[float, tuple[float, float]] = {}  # altitude -> x and y
+    for altitude_m in lattice.altitudes_m[:count]:
         points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, altitude_m)])[nearest]
         free = np.ones(len(points), dtype=bool)
         if buildings is not None:
@@ -254,6 +274,11 @@ def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: Ci
             raise BadInput(f"at {altitude_m:g} m every lattice position is inside a building; "
                            "choose higher altitudes")
         x_m, y_m, _ = (float(value) for value in points[free.argmax()])
+        starts[altitude_m] = x_m, y_m
+    uavs = []
+    for number in range(count):
+        altitude_m = lattice.altitudes_m[number % len(lattice.altitudes_m)]
+        x_m, y_m = starts[altitude_m]
         uavs.append(UavConfig(uav=f"uav{number + 1}", altitude_m=altitude_m, start_x_m=x_m,
                               start_y_m=y_m, terminal_x_m=x_m, terminal_y_m=y_m, battery=battery))
     return uavs
