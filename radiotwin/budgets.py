@@ -88,5 +88,6 @@ DEVICES = Budget("DEVICES", 100_000, "devices")
 UAVS = Budget("UAVS", 10_000, "UAVs")
 FEATURES = Budget("FEATURES", 5_000_000, "buildings")  # of a map file, before it is cut to a box
 OUTLINE_CORNERS = Budget("OUTLINE_CORNERS", 20_000, "corners")  # of one building of a map
-CROSSINGS = Budget("CROSSINGS", 100_000, "crossings of outlines with themselves")  # of a map
+CROSSINGS = Budget("CROSSINGS", 20_000, "crossings of outlines with themselves")  # of a map
+OVERLAPS = Budget("OVERLAPS", 200_000, "pairs of buildings that overlap")  # of a map
 TOUCHING_PAIRS = Budget("TOUCHING_PAIRS", 2_000_000, "pairs of buildings that touch")  # of a map

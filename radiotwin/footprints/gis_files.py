@@ -31,7 +31,7 @@ _OTHER_TAG = re.compile(r'[\s,]*+"((?:[^"\\]|\\.)*+)"\s*+=>\s*+"((?:[^"\\]|\\.)*
 _NAME_LENGTH = 200  # characters of an id that are kept
 # Names of systems that name no file: an authority and its code, or a title of the database. In
 # PROJ's own language, or in WKT with grids, a name can open any file.
-_CODE = re.compile(r"(?:urn:ogc:def:crs:)?([A-Za-z]+):[\d.]*:?(\w+)")
+_CODE = re.compile(r"(?:urn:ogc:def:crs:)?([A-Za-z]+):(?:[\d.]*:)?(\w+)")
 _TITLE = re.compile(r"[\w .,()/'-]+")
 _FILES_IN_WKT = ("PARAMETERFILE", "EXTENSION", "NADGRIDS", "+INIT")
 

@@ -8,7 +8,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from radiotwin.budgets import TOUCHING_PAIRS
+from radiotwin.budgets import OVERLAPS, TOUCHING_PAIRS
 from radiotwin.footprints.features import Feature, problems_of
 from radiotwin.footprints.heights import Height, height_of
 from radiotwin.footprints.material_table import MaterialTable
@@ -18,6 +18,7 @@ from radiotwin.scene.problems import Problem, Severity
 from radiotwin.tables import Origin
 
 GRID_M = 0.01  # [m], corners are rounded to it, so that walls meant to coincide do
+MIN_OVERLAP_M2 = 1.0  # [m²], that is reported
 _CHUNK = 64  # prisms: bounds the pairs that are found at once
 SLIVER_AREA_M2 = 1.0  # [m²]
 SLIVER_WIDTH_M = 0.3  # [m], mean width; the thickness of one wall
@@ -224,7 +225,7 @@ def find_contacts(prisms: Sequence[Prism]) -> Contacts:
     bottom_m = np.array([prism.height.bottom_m for prism in prisms])
     top_m = np.array([prism.height.top_m for prism in prisms])
     tree = shapely.STRtree(areas)
-    parts, found = [], 0
+    parts, found, overlapping = [], 0, 0
     for start in range(0, len(areas), _CHUNK):
         a, b = tree.query(areas[start:start + _CHUNK], predicate="intersects")
         a = a + start
@@ -234,7 +235,10 @@ def find_contacts(prisms: Sequence[Prism]) -> Contacts:
         found += len(a)
         TOUCHING_PAIRS.check(found, "the map")
         common = shapely.intersection(areas[a], areas[b])
-        parts.append((np.stack([a, b], axis=1), shapely.area(common), shapely.length(common)))
+        shared_m2 = shapely.area(common)
+        overlapping += np.count_nonzero(shared_m2 > MIN_OVERLAP_M2)
+        OVERLAPS.check(overlapping, "the map")
+        parts.append((np.stack([a, b], axis=1), shared_m2, shapely.length(common)))
     if not parts:
         return Contacts(np.zeros((0, 2), dtype=int), np.zeros(0), np.zeros(0))
     pairs, shared_m2, shared_m = (np.concatenate(each) for each in zip(*parts))
@@ -255,6 +259,6 @@ def find_overlaps(prisms: Sequence[Prism],
     found = []
     for (a, b), shared_m2 in zip(contacts.pairs.tolist(), contacts.shared_m2.tolist()):
         first, second = prisms[a], prisms[b]
-        if shared_m2 > 1.0 and first.name != second.name and first.overlaps_in_height(second):
+        if shared_m2 > MIN_OVERLAP_M2 and first.name != second.name and first.overlaps_in_height(second):
             found.append((first, second, shared_m2))
     return found

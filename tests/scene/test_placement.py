@@ -111,3 +111,14 @@ def test_step(side_m, step_m):
 
 def test_extent_lies_on_the_lattice():
     assert choose_extent((-755.2, 655.1, -648, 480)).bounds == (-760, 660, -660, 480)
+
+
+def test_many_devices_and_uavs_take_no_time_by_their_square():
+    grid = BuiltGrid(np.arange(0.5, 500), np.arange(0.5, 500), np.zeros((500, 500), dtype=bool))
+    devices = place_devices(3000, grid, None, np.random.default_rng(0))
+    positions = np.array([(device.x_m, device.y_m) for device in devices])
+    assert len(np.unique(positions, axis=0)) == 3000
+    assert sum(device.role == "anchor" for device in devices) == 900
+    extent = Extent(x_min_m=0, x_max_m=500, y_min_m=0, y_max_m=500)
+    uavs = place_uavs(9000, extent, LatticeConfig(step_m=20, altitudes_m=[30, 40]), None)
+    assert len(uavs) == 9000 and [uav.altitude_m for uav in uavs[:3]] == [30, 40, 30]
