@@ -237,7 +237,8 @@ def _bounds_m(prisms: list[Prism], origin: Origin, bbox_deg: Bounds | None) -> B
 def _check_sizes(features: list[Feature], origin: Origin, path: Path) -> None:
     """Raise BadInput if a building, or all together, are so wide that no projection is good."""
     bounds = np.array([feature.area.bounds for feature in features])
-    bounds = np.where(np.isfinite(bounds), bounds, [[origin.longitude_deg, origin.latitude_deg] * 2])
+    middle = [origin.longitude_deg, origin.latitude_deg]
+    bounds = np.where(np.isfinite(bounds), bounds, [middle * 2])
     corners = np.stack(to_local(origin, bounds[:, [0, 2, 2, 0]], bounds[:, [1, 1, 3, 3]]))
     widths_m = np.ptp(corners, axis=2).max(axis=0)
     widest = int(np.nan_to_num(widths_m, nan=np.inf).argmax())

@@ -94,8 +94,8 @@ def _crs_name(path: Path, data: Mapping) -> str:
     try:
         return str(crs["properties"]["name"])
     except (TypeError, KeyError):
-        raise BadInput(f"{path}: its crs is {crs!r:.60}, which names no system; remove it (longitude, "
-                       "latitude) or name one") from None
+        raise BadInput(f"{path}: its crs is {crs!r:.60}, which names no system; remove it "
+                       "(longitude, latitude) or name one") from None
 
 
 def map_file(
@@ -173,7 +173,8 @@ def _to_degrees(path: Path, features: list[Feature], crs: str | None) -> list[Fe
             raise CRSError("it is neither AUTHORITY:CODE, nor a title, nor WKT without grids")
         transformer = Transformer.from_crs(system, "EPSG:4326", always_xy=True)
     except CRSError as error:
-        raise BadInput(f"{path}: its coordinate reference system {crs[:60]!r} is unknown ({error}); "
+        raise BadInput(f"{path}: its coordinate reference system {crs[:60]!r} is unknown "
+                       f"({error}); "
                        "export it in EPSG:4326") from None
 
     def project(points: np.ndarray) -> np.ndarray:

@@ -89,12 +89,13 @@ def read_material_table(path: Path | str) -> MaterialTable:
     named: list[tuple[str, object]] = list(own.items())
     for key, values in data.items():
         if not isinstance(values, dict):
-            raise BadInput(f"{path}: {key} = {values!r:.60} is in no table; write it under the key of "
-                           f'its tag, for example ["{KEY}"]')
+            raise BadInput(f"{path}: {key} = {values!r:.60} is in no table; write it under the key "
+                           f'of its tag, for example ["{KEY}"]')
         named += [(f"[{key}] {value}", name) for value, name in values.items()]
     for entry, name in named:
         if not isinstance(name, str):
-            raise BadInput(f"{path}: {entry} = {name!r:.60}; allowed is the name of an ITU material")
+            raise BadInput(f"{path}: {entry} = {name!r:.60}; allowed is the name of an ITU "
+                           "material")
         try:
             itu_material(name)
         except BadInput as error:

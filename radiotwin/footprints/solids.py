@@ -259,6 +259,7 @@ def find_overlaps(prisms: Sequence[Prism],
     found = []
     for (a, b), shared_m2 in zip(contacts.pairs.tolist(), contacts.shared_m2.tolist()):
         first, second = prisms[a], prisms[b]
-        if shared_m2 > MIN_OVERLAP_M2 and first.name != second.name and first.overlaps_in_height(second):
+        if (shared_m2 > MIN_OVERLAP_M2 and first.name != second.name
+                and first.overlaps_in_height(second)):
             found.append((first, second, shared_m2))
     return found
