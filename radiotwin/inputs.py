@@ -167,12 +167,13 @@ def read_json(path: Path | str, what: str = "JSON file") -> Any:
     return parse_json(read_text(path, what), path)
 
 
-def parse_json(text: str, source: object) -> Any:
+def parse_json(text: str, source: object, allow_nan: bool = False) -> Any:
     """Parse a JSON document by the standard: NaN and infinity are refused.
 
     Args:
         text: of the document.
         source: it is from; the message begins with it.
+        allow_nan: read them, as some programs write them; the caller checks every number.
 
     Raises:
         BadInput: as `read_json`.
@@ -181,7 +182,7 @@ def parse_json(text: str, source: object) -> Any:
         raise ValueError(f"{constant} is no JSON number")
 
     try:
-        return json.loads(text, parse_constant=refuse)
+        return json.loads(text, parse_constant=None if allow_nan else refuse)
     except RecursionError:
         NESTING.refuse(source, f"more than {NESTING.limit} levels of nesting")
     except ValueError as error:

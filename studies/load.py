@@ -1,5 +1,6 @@
 """What large inputs cost: seconds and peak memory of whole commands, by size: `load`."""
 
+import json
 import math
 import os
 import subprocess
@@ -22,6 +23,7 @@ from radiotwin.twin import fit_twin
 from studies.runner import Study
 from studies.tables import markdown
 
+PLOT_M = 26.0  # [m], side of a plot of the town
 Make = Callable[[int, Path], dict[str, list[str]]]
 """Writes the inputs of a size to a folder; returns commands by name, in their order."""
 
@@ -112,8 +114,50 @@ def make_map_inputs(size: int, folder: Path) -> dict[str, list[str]]:
     return {f"map to {suffix}": [*command, f"map{suffix}"] for suffix in (".nc", ".tif", ".csv")}
 
 
+def make_town(size: int, folder: Path) -> dict[str, list[str]]:
+    """Write a map of a town: rectangles, L-shapes, courtyards, and rows of houses that touch."""
+    rng, side = np.random.default_rng(0), math.ceil(math.sqrt(size))
+    features = []
+    for number in range(size):
+        x_m, y_m = (PLOT_M * (place - side / 2) for place in divmod(number, side)[::-1])
+        outline, courtyard = _house(*rng.uniform(8, 20, 2), rng.random())
+        rings = [[_degrees(x_m + x, y_m + y) for x, y in [*ring, ring[0]]]
+                 for ring in (outline, courtyard) if ring]
+        tags = {"building": "yes"}
+        if rng.random() < 0.5:
+            tags["building:levels"] = str(rng.integers(1, 7))
+        if rng.random() < 0.2:
+            tags["building:material"] = str(rng.choice(["brick", "wood", "concrete"]))
+        features.append({"type": "Feature", "properties": tags,
+                         "geometry": {"type": "Polygon", "coordinates": rings}})
+    (folder / "town.geojson").write_text(
+        json.dumps({"type": "FeatureCollection", "features": features}), encoding="utf-8")
+    return {"build-scene": ["radiotwin.cli", "build-scene", "town.geojson", "-o", "scene",
+                            "--devices", "20", "--quiet"]}
+
+
+def _house(width_m: float, depth_m: float, kind: float) -> tuple[list, list]:
+    """Return outline and courtyard [m]; `kind` from 0 to 1 chooses the shape."""
+    if kind < 0.15:  # as wide as its plot: it touches the next
+        width_m = PLOT_M
+    corners = [(0, 0), (width_m, 0), (width_m, depth_m), (0, depth_m)]
+    if 0.5 < kind < 0.75:
+        return [*corners[:2], (width_m, depth_m / 2), (width_m / 2, depth_m / 2),
+                (width_m / 2, depth_m), corners[3]], []
+    if kind > 0.93:
+        return corners, [(0.3 * width_m, 0.3 * depth_m), (0.3 * width_m, 0.7 * depth_m),
+                         (0.7 * width_m, 0.7 * depth_m), (0.7 * width_m, 0.3 * depth_m)]
+    return corners, []
+
+
+def _degrees(x_m: float, y_m: float) -> list[float]:
+    """Return longitude and latitude, near 8.5° east and 47.4° north."""
+    return [round(8.5 + x_m / 75_300, 7), round(47.4 + y_m / 111_190, 7)]
+
+
 PARTS: dict[str, tuple[Make, tuple[int, ...]]] = {
     "import and fit": (make_import, (100_000, 1_000_000, 10_000_000)),
+    "build-scene": (make_town, (1_000, 10_000, 50_000)),
     "map": (make_map_inputs, (100_000, 1_000_000, 10_000_000)),
 }
 """Name of a part -> inputs and commands, and sizes from the smallest."""

@@ -7,23 +7,33 @@ from pathlib import Path
 import numpy as np
 import shapely
 
+from radiotwin.budgets import FEATURES, SHAPES
 from radiotwin.errors import BadInput
 from radiotwin.footprints.building_table import building_table, height_counts
 from radiotwin.footprints.extrude import make_blocks
 from radiotwin.footprints.features import Feature, MapFile, problems_of
-from radiotwin.footprints.gis_files import read_geojson, read_geopackage
+from radiotwin.footprints.geopackage import read_geopackage
+from radiotwin.footprints.gis_files import read_geojson
 from radiotwin.footprints.heights import LEVEL_M
 from radiotwin.footprints.material_table import STANDARD, MaterialTable
 from radiotwin.footprints.osm import assemble
 from radiotwin.footprints.osm_pbf import read_osm_pbf
 from radiotwin.footprints.osm_xml import read_osm_xml
-from radiotwin.footprints.solids import Prism, find_overlaps, make_prisms
+from radiotwin.footprints.outlines import OutlineBudget
+from radiotwin.footprints.solids import (
+    Contacts,
+    Prism,
+    find_contacts,
+    find_overlaps,
+    make_prisms,
+)
 from radiotwin.geodesy import to_local
+from radiotwin.inputs import check_input
 from radiotwin.scene import checks
 from radiotwin.scene.build import BuildOptions, Declared, check_target, finish_scene
 from radiotwin.scene.importer import ImportedCity
 from radiotwin.scene.materials import Material, itu_material
-from radiotwin.scene.names import RESERVED_NAMES, safe_name, unique_name
+from radiotwin.scene.names import RESERVED_NAMES, Names, safe_name, unique_name
 from radiotwin.scene.placement import choose_extent
 from radiotwin.scene.problems import Problem
 from radiotwin.scene.report import BuildReport
@@ -113,23 +123,26 @@ def build_scene_from_map(
     options.check()
     if not check_only:
         check_target(out_folder, source=path)
-    if not path.is_file():
-        raise BadInput(f"{path} is not a file; give a map ({', '.join(READERS)})")
+    check_input(path, f"map ({', '.join(READERS)})")
     suffix = map_suffix(path)
     if suffix is None:
         raise BadInput(f"{path} is not a map; allowed are {', '.join(READERS)}")
     found = READERS[suffix](path)
+    FEATURES.check(len(found.features), path)
     features = _within(found.features, map_options.bbox_deg, path)
+    SHAPES.check(len(features), path)
     origin = _origin(features, map_options.bbox_deg)
+    _check_sizes(features, origin, path)
     prisms, problems = make_prisms(features, origin, map_options.materials,
                                    map_options.default_height_m)
     problems = found.problems + problems
     if not prisms:
         raise BadInput("\n".join([f"{path}: none of its {len(features)} buildings can be used:",
                                   *(problem.message for problem in problems)]))
-    problems += _overlaps(prisms)
+    contacts = find_contacts(prisms)
+    problems += _overlaps(prisms, contacts)
     extent = choose_extent(_bounds_m(prisms, origin, map_options.bbox_deg))
-    city, shape_of = _city(prisms, extent.bounds, map_options.materials, problems)
+    city, shape_of = _city(prisms, contacts, extent.bounds, map_options.materials, problems)
     table = building_table(prisms, shape_of)
     counts = height_counts(table)
     declared = Declared(str(source), map_name(source), extent, origin,
@@ -172,13 +185,18 @@ def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> lis
             raise BadInput(f"{path}: {feature.name} lies at {bounds[0]:g}, {bounds[1]:g}, which is "
                            "no longitude and latitude in degrees; export the map in EPSG:4326, or "
                            "with the name of its system")
+    budget = OutlineBudget(path)
     if bbox_deg is None:
+        for feature in features:
+            budget.check(feature.name, feature.area)
         return features
     south, west, north, east = bbox_deg
     box = shapely.box(west, south, east, north)
-    kept = [feature for feature, (x0, y0, x1, y1) in zip(features, bounds_deg)
-            if x0 <= east and x1 >= west and y0 <= north and y1 >= south
-            and shapely.make_valid(feature.area).intersects(box)]
+    near = [feature for feature, (x0, y0, x1, y1) in zip(features, bounds_deg)
+            if x0 <= east and x1 >= west and y0 <= north and y1 >= south]
+    for feature in near:
+        budget.check(feature.name, feature.area)
+    kept = [feature for feature in near if shapely.make_valid(feature.area).intersects(box)]
     if not kept:
         west_, south_ = np.nanmin(bounds_deg[:, :2], axis=0)
         east_, north_ = np.nanmax(bounds_deg[:, 2:], axis=0)
@@ -212,22 +230,40 @@ def _bounds_m(prisms: list[Prism], origin: Origin, bbox_deg: Bounds | None) -> B
         bounds = np.array([prism.area.bounds for prism in prisms])
         x_m, y_m = bounds[:, [0, 2]], bounds[:, [1, 3]]
     box = float(np.min(x_m)), float(np.max(x_m)), float(np.min(y_m)), float(np.max(y_m))
-    width_m = max(box[1] - box[0], box[3] - box[2])
-    if not np.isfinite(box).all() or width_m > MAX_WIDTH_M:
-        raise BadInput(f"the area is {width_m / 1000:.0f} km wide, {MAX_WIDTH_M / 1000:g} km are "
-                       "allowed; choose a part with --bbox SOUTH,WEST,NORTH,EAST")
+    _check_width(max(box[1] - box[0], box[3] - box[2]), MAX_WIDTH_M)
     return box
 
 
-def _overlaps(prisms: list[Prism]) -> list[Problem]:
+def _check_sizes(features: list[Feature], origin: Origin, path: Path) -> None:
+    """Raise BadInput if a building, or all together, are so wide that no projection is good."""
+    bounds = np.array([feature.area.bounds for feature in features])
+    middle = [origin.longitude_deg, origin.latitude_deg]
+    bounds = np.where(np.isfinite(bounds), bounds, [middle * 2])
+    corners = np.stack(to_local(origin, bounds[:, [0, 2, 2, 0]], bounds[:, [1, 1, 3, 3]]))
+    widths_m = np.ptp(corners, axis=2).max(axis=0)
+    widest = int(np.nan_to_num(widths_m, nan=np.inf).argmax())
+    if not widths_m[widest] <= MAX_WIDTH_M:
+        raise BadInput(f"{path}: {features[widest].name} is {widths_m[widest] / 1000:.0f} km wide, "
+                       "as no building is; correct or remove it")
+    _check_width(float(np.ptp(corners, axis=(1, 2)).max()), 10 * MAX_WIDTH_M)
+
+
+def _check_width(width_m: float, most_m: float) -> None:
+    if not width_m <= most_m:  # NaN, too
+        raise BadInput(f"the area is {width_m / 1000:.0f} km wide, {MAX_WIDTH_M / 1000:g} km are "
+                       "allowed; choose a part with --bbox SOUTH,WEST,NORTH,EAST")
+
+
+def _overlaps(prisms: list[Prism], contacts: Contacts) -> list[Problem]:
     """Return a warning about buildings that overlap, the largest overlap first."""
-    overlaps = sorted(find_overlaps(prisms), key=lambda overlap: -overlap[2])
+    overlaps = sorted(find_overlaps(prisms, contacts), key=lambda overlap: -overlap[2])
     names = [f"{a.name} and {b.name}: {shared_m2:.0f} m²" for a, b, shared_m2 in overlaps]
     return problems_of(names, "pair(s) of buildings overlap: their common part is built once")
 
 
 def _city(
-    prisms: list[Prism], extent_m: Bounds, table: MaterialTable, problems: list[Problem]
+    prisms: list[Prism], contacts: Contacts, extent_m: Bounds, table: MaterialTable,
+    problems: list[Problem],
 ) -> tuple[ImportedCity, dict[int, str]]:
     """Return the city with its ground, and the name of the shape of each prism."""
     bounds = np.array([prism.area.bounds for prism in prisms])
@@ -236,9 +272,9 @@ def _city(
     corners = np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
     names, meshes = ["ground"], [(corners, np.array([[0, 1, 2], [0, 2, 3]]))]
     materials: list[Material | None] = [itu_material(table.ground)]
-    taken = {*RESERVED_NAMES, "ground"}
+    taken = Names({*RESERVED_NAMES, "ground"})
     shape_of: dict[int, str] = {}
-    for block in make_blocks(prisms):
+    for block in make_blocks(prisms, contacts):
         name = unique_name(safe_name(prisms[block.members[0]].name), taken)
         shape_of |= dict.fromkeys(block.members, name)
         names.append(name)

@@ -13,7 +13,7 @@ from manifold3d import Manifold, Mesh64, OpType
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from radiotwin.footprints.solids import Prism, neighbours
+from radiotwin.footprints.solids import GRID_M, Contacts, Prism
 from radiotwin.progress import progress
 from radiotwin.scene.materials import Material
 from radiotwin.scene.meshes import clean
@@ -38,18 +38,19 @@ class Block:
     mesh: trimesh.Trimesh
 
 
-def make_blocks(prisms: Sequence[Prism]) -> list[Block]:
+def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
     """Unite touching prisms of one material.
 
     Args:
         prisms: of all buildings.
+        contacts: of these prisms; a common wall or more joins them, a corner does not.
 
     Returns:
         The blocks; where blocks of different materials meet, the larger one stays whole.
     """
     if not prisms:
         return []
-    pairs = np.array(neighbours(prisms), dtype=int).reshape(-1, 2)
+    pairs = contacts.pairs[contacts.shared_m > GRID_M]
     same = np.array([prisms[a].material == prisms[b].material for a, b in pairs], dtype=bool)
     graph = coo_matrix((np.ones(same.sum()), pairs[same].T), shape=(len(prisms), len(prisms)))
     block_of = connected_components(graph, directed=False)[1]

@@ -1,11 +1,10 @@
-"""Readers of GeoJSON and GeoPackage: areas, with the columns of a table as tags.
+"""Reader of GeoJSON, and what it shares with that of GeoPackages: columns of a table as tags.
 
 Where a file has a column `building` or `building:part`, as exports of OpenStreetMap do, only such
 rows are buildings; else every polygon is one. `_` may stand for the `:` of a tag, and case does not
 matter. The tags in GDAL's column `other_tags` are read, too.
 """
 
-import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -23,11 +22,18 @@ from radiotwin.footprints.features import (
     is_building,
     problems_of,
 )
+from radiotwin.inputs import parse_json, read_text
 
 WGS84 = ("EPSG:4326", "OGC:CRS84", "urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:EPSG::4326")
 _ALIASES = {key.replace(":", "_"): key for key in (
     "building:part", "building:levels", "building:min_level", "building:material")}
-_OTHER_TAGS = re.compile(r'"((?:[^"\\]|\\.)*)"\s*=>\s*"((?:[^"\\]|\\.)*)"')
+_OTHER_TAG = re.compile(r'[\s,]*+"((?:[^"\\]|\\.)*+)"\s*+=>\s*+"((?:[^"\\]|\\.)*+)"', re.DOTALL)
+_NAME_LENGTH = 200  # characters of an id that are kept
+# Names of systems that name no file: an authority and its code, or a title of the database. In
+# PROJ's own language, or in WKT with grids, a name can open any file.
+_CODE = re.compile(r"(?:urn:ogc:def:crs:)?([A-Za-z]+):(?:[\d.]*:)?(\w+)")
+_TITLE = re.compile(r"[\w .,()/'-]+")
+_FILES_IN_WKT = ("PARAMETERFILE", "EXTENSION", "NADGRIDS", "+INIT")
 
 
 def read_geojson(path: Path) -> MapFile:
@@ -43,12 +49,7 @@ def read_geojson(path: Path) -> MapFile:
         BadInput: no such file, not GeoJSON, or coordinates that are not numbers; with the
             feature's number.
     """
-    try:
-        data = json.loads(path.read_bytes())
-    except OSError as error:
-        raise BadInput(f"{path} cannot be read ({error.strerror}); give a GeoJSON file") from None
-    except (ValueError, RecursionError) as error:
-        raise BadInput(f"{path} is not valid JSON ({error}); export the map again") from None
+    data = parse_json(read_text(path, "GeoJSON file"), path, allow_nan=True)
     features = data.get("features") if isinstance(data, dict) else None
     if not isinstance(features, list):
         raise BadInput(f"{path} is not a GeoJSON FeatureCollection; export polygons as GeoJSON")
@@ -59,50 +60,11 @@ def read_geojson(path: Path) -> MapFile:
         if not isinstance(geometry, dict) or not isinstance(tags, dict):
             raise BadInput(f"{path}: feature {number} is not a GeoJSON feature; export the map "
                            "again")
-        name = str(feature.get("id") or tags.get("@id") or f"feature {number}")
+        known = feature.get("id") or tags.get("@id")
+        name = (str(known)[:_NAME_LENGTH] if isinstance(known, str | int | float)
+                else f"feature {number}")
         rows.append((name, tags, _polygons(path, number, geometry)))
-    return _map_file(path, rows, _crs_name(path, data))
-
-
-def read_geopackage(path: Path) -> MapFile:
-    """Read the polygons of all layers of a GeoPackage, in any coordinate reference system.
-
-    Args:
-        path: `.gpkg` file.
-
-    Returns:
-        The buildings, layer by layer.
-
-    Raises:
-        BadInput: pyogrio is not installed, no such file, or not a GeoPackage.
-    """
-    try:
-        import pyogrio
-    except ImportError:
-        raise BadInput(
-            f"{path}: GeoPackages are read with the package pyogrio, which is not installed; "
-            "install it with `pip install 'radiotwin[gis]'`, or export the layer as GeoJSON"
-        ) from None
-    if not path.is_file():
-        raise BadInput(f"{path} does not exist; give a GeoPackage")
-    found = MapFile([])
-    try:
-        for layer, kind in pyogrio.list_layers(path):
-            if kind is None or "Polygon" not in kind and kind not in (
-                    "Unknown", "Geometry", "GeometryCollection"):
-                continue
-            meta, _, shapes, columns = pyogrio.raw.read(path, layer=layer)
-            names = [str(name) for name in meta["fields"]]
-            rows = [(f"{layer} {number}", dict(zip(names, values)), shape)
-                    for number, (shape, *values) in enumerate(
-                        zip(shapely.from_wkb(shapes), *columns), start=1)]
-            part = _map_file(path, rows, meta["crs"])
-            found.features += part.features
-            found.problems += part.problems
-    except (pyogrio.errors.DataSourceError, pyogrio.errors.DataLayerError,
-            shapely.errors.GEOSException) as error:
-        raise BadInput(f"{path} is not a readable GeoPackage ({error}); export it again") from None
-    return found
+    return map_file(path, rows, _crs_name(path, data))
 
 
 def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None:
@@ -120,7 +82,7 @@ def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None
         # RFC 7946 wants at least four points a ring; shorter ones have no area anyway
         return shapely.MultiPolygon([(polygon[0], [ring for ring in polygon[1:] if len(ring) > 3])
                                      for polygon in polygons if polygon and len(polygon[0]) > 3])
-    except (TypeError, ValueError, IndexError, OverflowError):
+    except (TypeError, ValueError, LookupError, OverflowError):
         raise BadInput(f"{path}: feature {number} has coordinates that are not rings of finite "
                        "numbers; export the map again") from None
 
@@ -132,14 +94,23 @@ def _crs_name(path: Path, data: Mapping) -> str:
     try:
         return str(crs["properties"]["name"])
     except (TypeError, KeyError):
-        raise BadInput(f"{path}: its crs is {crs!r}, which names no system; remove it (longitude, "
-                       "latitude) or name one") from None
+        raise BadInput(f"{path}: its crs is {crs!r:.60}, which names no system; remove it "
+                       "(longitude, latitude) or name one") from None
 
 
-def _map_file(
+def map_file(
     path: Path, rows: Iterable[tuple[str, Mapping, BaseGeometry | None]], crs: str | None
 ) -> MapFile:
-    """Return the buildings among rows of name, properties and area."""
+    """Return the buildings among the rows of a table.
+
+    Args:
+        path: file, for messages.
+        rows: name, properties and area of each.
+        crs: name of the coordinate reference system of the areas; None: not known.
+
+    Raises:
+        BadInput: no system, or one that is not known.
+    """
     tagged = [(name, _tags(properties), area) for name, properties, area in rows]
     marked = any(key in tags for _, tags, _ in tagged for key in BUILDING_KEYS)
     features, unusable = [], []
@@ -159,14 +130,28 @@ def _tags(properties: Mapping) -> dict[str, str]:
     """Return columns as tags, without empty cells."""
     tags: dict[str, str] = {}
     for key, value in properties.items():
-        if value is None or (isinstance(value, float) and not np.isfinite(value)):
+        if (value is None or isinstance(value, dict | list | bytes)
+                or (isinstance(value, float) and not np.isfinite(value))):
             continue
         key = str(key).lower()
         if key == "other_tags":
-            tags |= dict(_OTHER_TAGS.findall(str(value)))
+            tags |= _other_tags(str(value))
         else:
             is_float = isinstance(value, float | np.floating)
             tags[_ALIASES.get(key, key)] = f"{value:g}" if is_float else str(value)
+    return tags
+
+
+def _is_harmless_wkt(text: str) -> bool:
+    return "[" in text and not any(word in text.upper() for word in _FILES_IN_WKT)
+
+
+def _other_tags(text: str) -> dict[str, str]:
+    """Return the pairs of `"key"=>"value","key"=>"value"`, as GDAL writes rare tags."""
+    tags, found = {}, _OTHER_TAG.match(text)
+    while found:  # one after the other: a search would try every quotation mark of a long text
+        tags[found[1]] = found[2]
+        found = _OTHER_TAG.match(text, found.end())
     return tags
 
 
@@ -180,9 +165,16 @@ def _to_degrees(path: Path, features: list[Feature], crs: str | None) -> list[Fe
         raise BadInput(f"{path} has no coordinate reference system; assign one (in QGIS: Layer "
                        "CRS) and export it again")
     try:
-        transformer = Transformer.from_crs(CRS(crs), "EPSG:4326", always_xy=True)
+        if code := _CODE.fullmatch(crs):
+            system = CRS.from_authority(code[1].upper(), code[2])
+        elif _TITLE.fullmatch(crs) or _is_harmless_wkt(crs):
+            system = CRS.from_user_input(crs)
+        else:
+            raise CRSError("it is neither AUTHORITY:CODE, nor a title, nor WKT without grids")
+        transformer = Transformer.from_crs(system, "EPSG:4326", always_xy=True)
     except CRSError as error:
-        raise BadInput(f"{path}: its coordinate reference system {crs!r} is unknown ({error}); "
+        raise BadInput(f"{path}: its coordinate reference system {crs[:60]!r} is unknown "
+                       f"({error}); "
                        "export it in EPSG:4326") from None
 
     def project(points: np.ndarray) -> np.ndarray:

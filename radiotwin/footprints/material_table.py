@@ -1,11 +1,11 @@
 """Materials of buildings: tags of a map to materials of Recommendation ITU-R P.2040."""
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from radiotwin.errors import BadInput
+from radiotwin.inputs import read_toml
 from radiotwin.scene.materials import Material, itu_material
 
 KEY = "building:material"
@@ -84,23 +84,18 @@ def read_material_table(path: Path | str) -> MaterialTable:
         BadInput: no such file, not TOML, or a material that is not in ITU-R P.2040.
     """
     path = Path(path)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise BadInput(f"{path} cannot be read: {error}; give a TOML file with materials by tag"
-                       ) from None
-    except tomllib.TOMLDecodeError as error:
-        raise BadInput(f"{path} is not valid TOML: {error}") from None
+    data = read_toml(path, "TOML file with materials by tag")
     own = {name: data.pop(name) for name in ("default", "ground") if name in data}
     named: list[tuple[str, object]] = list(own.items())
     for key, values in data.items():
         if not isinstance(values, dict):
-            raise BadInput(f"{path}: {key} = {values!r} is in no table; write it under the key of "
-                           f'its tag, for example ["{KEY}"]')
+            raise BadInput(f"{path}: {key} = {values!r:.60} is in no table; write it under the key "
+                           f'of its tag, for example ["{KEY}"]')
         named += [(f"[{key}] {value}", name) for value, name in values.items()]
     for entry, name in named:
         if not isinstance(name, str):
-            raise BadInput(f"{path}: {entry} = {name!r}; allowed is the name of an ITU material")
+            raise BadInput(f"{path}: {entry} = {name!r:.60}; allowed is the name of an ITU "
+                           "material")
         try:
             itu_material(name)
         except BadInput as error:

@@ -6,6 +6,7 @@ A closed way is an area, and so is a relation of type multipolygon whose ways fo
 [1] https://wiki.openstreetmap.org/wiki/Relation:multipolygon
 """
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -13,7 +14,9 @@ from typing import Literal
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from radiotwin.budgets import OUTLINE_CORNERS
 from radiotwin.footprints.features import Feature, MapFile, is_building, problems_of
+from radiotwin.footprints.outlines import OutlineBudget
 
 MIN_RING_NODES = 4  # a triangle, with the first node again at the end
 
@@ -68,6 +71,7 @@ def assemble(elements: OsmElements) -> MapFile:
     Returns:
         The areas, ways first; incomplete or open outlines are left out and reported.
     """
+    budget = OutlineBudget("the map")
     incomplete: list[str] = []
     unclosed: list[str] = []
     relations: list[Feature] = []
@@ -76,7 +80,7 @@ def assemble(elements: OsmElements) -> MapFile:
         tags = _relation_tags(relation, elements)
         if tags is None:
             continue
-        area = _relation_area(relation, elements)
+        area = _relation_area(f"relation/{number}", relation, elements, budget)
         if isinstance(area, str):
             (incomplete if area == "incomplete" else unclosed).append(f"relation/{number}")
             continue
@@ -91,6 +95,7 @@ def assemble(elements: OsmElements) -> MapFile:
         elif len(way.nodes) < MIN_RING_NODES or way.nodes[0] != way.nodes[-1]:
             unclosed.append(f"way/{number}")
         else:
+            OUTLINE_CORNERS.check(len(way.nodes), f"way/{number}")
             ways.append(Feature(f"way/{number}", way.tags, _polygon(way.nodes, elements)))
     problems = problems_of(incomplete, "building(s) lack nodes or ways, as where an extract was "
                                        "cut off: left out; take a larger extract")
@@ -117,24 +122,29 @@ def _relation_tags(relation: Relation, elements: OsmElements) -> dict[str, str] 
 
 
 def _relation_area(
-    relation: Relation, elements: OsmElements
+    name: str, relation: Relation, elements: OsmElements, budget: OutlineBudget
 ) -> BaseGeometry | Literal["incomplete", "open"]:
     """Return the area, or that ways or nodes are missing, or that the ways do not close."""
     chains: dict[bool, list[Sequence[int]]] = {True: [], False: []}
+    corners = 0
     for number, role in relation.members:
         way = elements.ways.get(number)
+        corners += len(way.nodes) if way is not None else 0
+        OUTLINE_CORNERS.check(corners, name)
         if way is None or any(node not in elements.positions for node in way.nodes):
             return "incomplete"
         chains[role != "inner"].append(way.nodes)
     outer, inner = stitch(chains[True]), stitch(chains[False])
     if not outer or inner is None:
         return "open"
-    area = _union(outer, elements)
-    return area.difference(_union(inner, elements)) if inner else area
+    outlines, holes = ([_polygon(ring, elements) for ring in rings] for rings in (outer, inner))
+    budget.check(name, shapely.MultiPolygon([*outlines, *holes]))
+    area = _union(outlines)
+    return area.difference(_union(holes)) if holes else area
 
 
-def _union(rings: list[list[int]], elements: OsmElements) -> BaseGeometry:
-    return shapely.union_all([shapely.make_valid(_polygon(ring, elements)) for ring in rings])
+def _union(polygons: list[shapely.Polygon]) -> BaseGeometry:
+    return shapely.union_all([shapely.make_valid(polygon) for polygon in polygons])
 
 
 def stitch(chains: list[Sequence[int]]) -> list[list[int]] | None:
@@ -150,17 +160,19 @@ def stitch(chains: list[Sequence[int]]) -> list[list[int]] | None:
              if len(chain) >= MIN_RING_NODES and chain[0] == chain[-1]]
     loose = {number: list(chain) for number, chain in enumerate(chains)
              if len(chain) > 1 and chain[0] != chain[-1]}
-    at_node: dict[int, list[int]] = {}
+    at_node: dict[int, deque[int]] = {}
     for number, chain in loose.items():
         for node in (chain[0], chain[-1]):
-            at_node.setdefault(node, []).append(number)
+            at_node.setdefault(node, deque()).append(number)
     while loose:
         _, ring = loose.popitem()
         while ring[0] != ring[-1]:
-            following = next((number for number in at_node[ring[-1]] if number in loose), None)
-            if following is None:
+            waiting = at_node[ring[-1]]
+            while waiting and waiting[0] not in loose:
+                waiting.popleft()
+            if not waiting:
                 return None
-            chain = loose.pop(following)
+            chain = loose.pop(waiting.popleft())
             ring += (chain if chain[0] == ring[-1] else chain[::-1])[1:]
         if len(ring) >= MIN_RING_NODES:
             rings.append(ring)

@@ -10,9 +10,13 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from radiotwin.budgets import FEATURES, VERTICES
 from radiotwin.errors import BadInput
 from radiotwin.footprints.features import BUILDING_KEYS
 from radiotwin.footprints.osm import OsmElements, Relation, Way
+from radiotwin.inputs import check_input
+
+_IDS_PER_BLOCK = 100  # elements: 40 kB of the filter for each that is looked for
 
 
 def read_osm_pbf(path: Path) -> OsmElements:
@@ -34,13 +38,19 @@ def read_osm_pbf(path: Path) -> OsmElements:
             f"{path}: .osm.pbf is read with the package osmium, which is not installed; install it "
             "with `pip install 'radiotwin[gis]'`, or convert the file: `osmium cat area.osm.pbf -o "
             "area.osm`") from None
-    if not path.is_file():
-        raise BadInput(f"{path} does not exist; give a map in OpenStreetMap's PBF format")
-    file = osmium.io.File(str(path), "pbf")
+    check_input(path, "map in OpenStreetMap's PBF format")
+    # An absolute path: what begins with `http:` would be fetched, `-` is standard input
+    file = osmium.io.File(str(path.absolute()), "pbf")
     kinds, filters = osmium.osm, osmium.filter
 
     def matching(kind: Any, selected: Any) -> Iterable[Any]:
         return osmium.FileProcessor(file, kind).with_filter(selected)
+
+    def selected(kind: Any, ids: set[int]) -> Iterable[Any]:
+        # The filter takes 4 MiB for every 2^25 numbers of which there is one, and no negative ones
+        if min(ids) > 0 and len({number >> 25 for number in ids}) * _IDS_PER_BLOCK <= len(ids):
+            return matching(kind, filters.IdFilter(ids))
+        return (each for each in osmium.FileProcessor(file, kind) if each.id in ids)
 
     elements = OsmElements()
     try:
@@ -54,21 +64,26 @@ def read_osm_pbf(path: Path) -> OsmElements:
                        for way, _ in relation.members}
         missing = member_ids - elements.ways.keys()
         if missing:
-            _add_ways(elements, matching(kinds.WAY, filters.IdFilter(missing)))
+            _add_ways(elements, selected(kinds.WAY, missing))
         nodes = {node for way in elements.ways.values() for node in way.nodes}
         if nodes:
-            for node in matching(kinds.NODE, filters.IdFilter(nodes)):
+            for node in selected(kinds.NODE, nodes):
                 if node.location.valid():
                     elements.positions[node.id] = node.location.lon, node.location.lat
-    except RuntimeError as error:
+    except (RuntimeError, ValueError, IndexError, OverflowError, MemoryError) as error:
         raise BadInput(f"{path} is not a readable .osm.pbf file ({error}); download it again"
                        ) from None
     return elements
 
 
 def _add_ways(elements: OsmElements, ways: Iterable[Any]) -> None:
+    corners = sum(len(way.nodes) for way in elements.ways.values())
     for way in ways:
-        elements.ways[way.id] = Way([node.ref for node in way.nodes], dict(way.tags))
+        nodes = [node.ref for node in way.nodes]
+        corners += len(nodes)
+        VERTICES.check(corners, "the map")
+        elements.ways[way.id] = Way(nodes, dict(way.tags))
+    FEATURES.check(len(elements.ways), "the map")
 
 
 def _drop_other_relations(elements: OsmElements) -> None:

@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+from radiotwin.budgets import VERTICES
 from radiotwin.errors import BadInput
 from radiotwin.footprints.osm import OsmElements, Relation, Way
 from radiotwin.safe_xml import parse_elements
@@ -33,6 +34,7 @@ class _Reader:
         self.path = path
         self.elements = OsmElements()
         self.depth = 0
+        self.most = VERTICES.limit  # read once: there are millions of nodes
         self.open: Way | Relation | None = None
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
@@ -56,6 +58,8 @@ class _Reader:
             position = (self._degrees(attributes, "lon", 180, line),
                         self._degrees(attributes, "lat", 90, line))
             self.elements.positions[self._integer(attributes, "id", line)] = position
+            if len(self.elements.positions) > self.most:
+                VERTICES.check(len(self.elements.positions), self.path)
         elif tag == "way":
             self.open = self.elements.ways[self._integer(attributes, "id", line)] = Way([])
         elif tag == "relation":

@@ -3,18 +3,21 @@
 [1] https://wiki.openstreetmap.org/wiki/Overpass_API
 """
 
-import shutil
-import urllib.error
+import http.client
+import time
 import urllib.parse
 import urllib.request
 from pathlib import Path
+from typing import IO, Any
 
+from radiotwin.budgets import FILE_BYTES
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.files import atomic_path
+from radiotwin.files import atomic_file
 from radiotwin.footprints.features import BUILDING_KEYS
 
 SERVER = "https://overpass-api.de/api/interpreter"
 TIMEOUT_S = 180  # [s], the default of Overpass itself
+MAX_DOWNLOAD_S = 1800.0  # [s], chosen: some 100 MB on a slow line
 MAX_AREA_KM2 = 100.0  # [km²], chosen so that one request does not burden a public server
 
 
@@ -55,9 +58,22 @@ def download_osm(
         {"User-Agent": "radiotwin (https://pypi.org/project/radiotwin)"})
     try:
         with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer, \
-                atomic_path(path) as temporary, open(temporary, "wb") as file:
-            shutil.copyfileobj(answer, file)
-    except (urllib.error.URLError, TimeoutError, ConnectionError) as error:
+                atomic_file(path) as file:
+            _copy(answer, file, path)
+    except (OSError, http.client.HTTPException) as error:
         reason = getattr(error, "reason", error)
         raise RunFailed(f"--overpass needs a network, and {server} did not answer ({reason}); try "
                         "again later, or download an extract and give the file") from None
+
+
+def _copy(answer: Any, file: IO[bytes], path: Path) -> None:
+    """Copy an answer that ends in time, is not too large, and is complete."""
+    read, deadline = 0, time.monotonic() + MAX_DOWNLOAD_S
+    while part := answer.read1(2**16):
+        read += len(part)
+        FILE_BYTES.check(read, f"{path}, as the server sends it")
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"its answer has not ended after {MAX_DOWNLOAD_S:g} s")
+        file.write(part)
+    if getattr(answer, "length", None):  # bytes that were announced and did not come
+        raise ConnectionError("its answer was cut off")

@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
+from radiotwin.budgets import OVERLAPS, TOUCHING_PAIRS
 from radiotwin.footprints.features import Feature, problems_of
 from radiotwin.footprints.heights import Height, height_of
 from radiotwin.footprints.material_table import MaterialTable
@@ -17,6 +18,8 @@ from radiotwin.scene.problems import Problem, Severity
 from radiotwin.tables import Origin
 
 GRID_M = 0.01  # [m], corners are rounded to it, so that walls meant to coincide do
+MIN_OVERLAP_M2 = 1.0  # [m²], that is reported
+_CHUNK = 64  # prisms: bounds the pairs that are found at once
 SLIVER_AREA_M2 = 1.0  # [m²]
 SLIVER_WIDTH_M = 0.3  # [m], mean width; the thickness of one wall
 MIN_COVERED_SHARE = 0.9  # of an outline that its parts cover for it to be left out
@@ -42,10 +45,10 @@ class Prism:
     material: Material
     material_from: str
 
-    def overlaps_in_height(self, other: "Prism", slack_m: float = 0.0) -> bool:
-        """Return whether both share some height; with slack, also where one is on the other."""
+    def overlaps_in_height(self, other: "Prism") -> bool:
+        """Return whether both share some height."""
         top_m = min(self.height.top_m, other.height.top_m)
-        return top_m - max(self.height.bottom_m, other.height.bottom_m) > -slack_m
+        return top_m > max(self.height.bottom_m, other.height.bottom_m)
 
 
 def make_prisms(
@@ -63,8 +66,7 @@ def make_prisms(
         The prisms, parts first, and the defects that were found.
     """
     defects = _Defects()
-    areas = [(feature, area) for feature in features
-             if (area := _clean(feature, origin, defects)) is not None]
+    areas = _clean(features, origin, defects)
     wholes = [(feature, area) for feature, area in areas if not feature.is_part]
     parts = [(feature, area) for feature, area in areas if feature.is_part]
     prisms = []
@@ -114,12 +116,19 @@ class _Defects:
                 for problem in problems_of(self.names.get(kind, ()), text, severity)]
 
 
-def _clean(feature: Feature, origin: Origin, defects: _Defects) -> shapely.MultiPolygon | None:
-    """Return the valid area in the local frame; None where nothing is left."""
+def _clean(features: Sequence[Feature], origin: Origin, defects: _Defects) -> list[Area]:
+    """Return the features of which something is left, with their areas in the local frame."""
     def to_metres(points: np.ndarray) -> np.ndarray:
         return np.column_stack(to_local(origin, *points.T))
 
-    area = shapely.transform(feature.area, to_metres)
+    areas = shapely.transform([feature.area for feature in features], to_metres)
+    return [(feature, kept) for feature, area in zip(features, areas)
+            if (kept := _clean_one(feature, area, defects)) is not None]
+
+
+def _clean_one(feature: Feature, area: BaseGeometry,
+               defects: _Defects) -> shapely.MultiPolygon | None:
+    """Return the valid polygons of an area that are no slivers; None where nothing is left."""
     invalid = not area.is_valid
     area = _polygons(shapely.make_valid(area))
     if area.area < GRID_M**2:
@@ -153,14 +162,17 @@ def _touches_itself(polygon: shapely.Polygon) -> bool:
 
 def _resolve_parts(wholes: list[Area], parts: list[Area], defects: _Defects) -> list[Area]:
     """Return parts with inherited tags, and buildings without the areas of their parts."""
-    tree = shapely.STRtree([area for _, area in wholes])
+    tree, found = shapely.STRtree([area for _, area in wholes]), 0
+    whole_m2 = [area.area for _, area in wholes]
     parts_of: dict[int, list[shapely.MultiPolygon]] = {}
     resolved = []
     for feature, area in parts:
         inside = area.representative_point()
         owners = [int(index) for index in tree.query(inside, predicate="within")]
+        found += len(owners)
+        TOUCHING_PAIRS.check(found, "the map")
         if owners:
-            owner = min(owners, key=lambda index: wholes[index][1].area)
+            owner = min(owners, key=whole_m2.__getitem__)
             parts_of.setdefault(owner, []).append(area)
             feature = _inherit(feature, wholes[owner][0])
         resolved.append((feature, area))
@@ -185,41 +197,69 @@ def _inherit(part: Feature, whole: Feature) -> Feature:
     return replace(part, tags=tags | dict(part.tags))
 
 
-def find_overlaps(prisms: Sequence[Prism]) -> list[tuple[Prism, Prism, float]]:
+@dataclass(frozen=True, eq=False)
+class Contacts:
+    """Pairs of prisms that touch or overlap in the plane, and in height touch or overlap.
+
+    Attributes:
+        pairs: (n, 2) indices of prisms, the lower one first.
+        shared_m2: (n,) area of their common part [m²].
+        shared_m: (n,) length of its outline, or of the common wall [m].
+    """
+
+    pairs: np.ndarray
+    shared_m2: np.ndarray
+    shared_m: np.ndarray
+
+
+def find_contacts(prisms: Sequence[Prism]) -> Contacts:
+    """Find prisms that touch or overlap.
+
+    Args:
+        prisms: of all buildings.
+
+    Raises:
+        BadInput: there are too many such pairs.
+    """
+    areas = np.array([prism.area for prism in prisms], dtype=object)
+    bottom_m = np.array([prism.height.bottom_m for prism in prisms])
+    top_m = np.array([prism.height.top_m for prism in prisms])
+    tree = shapely.STRtree(areas)
+    parts, found, overlapping = [], 0, 0
+    for start in range(0, len(areas), _CHUNK):
+        a, b = tree.query(areas[start:start + _CHUNK], predicate="intersects")
+        a = a + start
+        slack_m = np.minimum(top_m[a], top_m[b]) - np.maximum(bottom_m[a], bottom_m[b])
+        kept = (a < b) & (slack_m > -GRID_M)
+        a, b = a[kept], b[kept]
+        found += len(a)
+        TOUCHING_PAIRS.check(found, "the map")
+        common = shapely.intersection(areas[a], areas[b])
+        shared_m2 = shapely.area(common)
+        overlapping += np.count_nonzero(shared_m2 > MIN_OVERLAP_M2)
+        OVERLAPS.check(overlapping, "the map")
+        parts.append((np.stack([a, b], axis=1), shared_m2, shapely.length(common)))
+    if not parts:
+        return Contacts(np.zeros((0, 2), dtype=int), np.zeros(0), np.zeros(0))
+    pairs, shared_m2, shared_m = (np.concatenate(each) for each in zip(*parts))
+    return Contacts(pairs, shared_m2, shared_m)
+
+
+def find_overlaps(prisms: Sequence[Prism],
+                  contacts: Contacts) -> list[tuple[Prism, Prism, float]]:
     """Find prisms of different buildings that overlap.
 
     Args:
         prisms: of all buildings.
+        contacts: of these prisms.
 
     Returns:
         Pairs of prisms, with the area they share, if it is more than 1 m² [m²].
     """
     found = []
-    for a, b in _touching_pairs(prisms):
+    for (a, b), shared_m2 in zip(contacts.pairs.tolist(), contacts.shared_m2.tolist()):
         first, second = prisms[a], prisms[b]
-        if first.name == second.name or not first.overlaps_in_height(second):
-            continue
-        shared_m2 = first.area.intersection(second.area).area
-        if shared_m2 > 1.0:
+        if (shared_m2 > MIN_OVERLAP_M2 and first.name != second.name
+                and first.overlaps_in_height(second)):
             found.append((first, second, shared_m2))
     return found
-
-
-def neighbours(prisms: Sequence[Prism]) -> list[tuple[int, int]]:
-    """Find prisms that share part of a wall, a roof or their inside, and not only a corner.
-
-    Args:
-        prisms: of all buildings.
-
-    Returns:
-        Pairs of indices, the lower one first.
-    """
-    return [(a, b) for a, b in _touching_pairs(prisms)
-            if prisms[a].overlaps_in_height(prisms[b], slack_m=GRID_M)
-            and prisms[a].area.intersection(prisms[b].area).length > GRID_M]
-
-
-def _touching_pairs(prisms: Sequence[Prism]) -> list[tuple[int, int]]:
-    areas = [prism.area for prism in prisms]
-    a, b = shapely.STRtree(areas).query(areas, predicate="intersects") if areas else ([], [])
-    return [(int(i), int(j)) for i, j in zip(a, b) if i < j]

@@ -1,5 +1,6 @@
 """Any Mitsuba or Sionna RT city into a checked scene folder that needs nothing outside itself."""
 
+import os
 from collections import Counter
 from collections.abc import Mapping, Set
 from dataclasses import dataclass
@@ -9,6 +10,7 @@ import numpy as np
 import pandas as pd
 import trimesh
 
+from radiotwin.budgets import DEVICES, UAVS
 from radiotwin.cells import write_csv
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder
@@ -82,6 +84,8 @@ class BuildOptions:
         if self.devices < 0 or self.uavs < 0:
             raise BadInput(f"{min(self.devices, self.uavs)} devices or UAVs are not possible; give "
                            "0 or more")
+        DEVICES.check(self.devices, "devices to place")
+        UAVS.check(self.uavs, "UAVs to place")
         if self.bbox is not None:
             x_min, y_min, x_max, y_max = self.bbox
             if not (np.isfinite(self.bbox).all() and x_min < x_max and y_min < y_max):
@@ -186,7 +190,14 @@ def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | N
         allowed: Names that it may hold.
         source: File that must not lie in it.
     """
-    foreign = sorted({path.name for path in folder.iterdir()} - allowed) if folder.is_dir() else []
+    try:
+        held = os.listdir(folder)
+    except (FileNotFoundError, NotADirectoryError):
+        held = []
+    except (OSError, ValueError) as error:  # ValueError: a null character in the name
+        raise BadInput(f"cannot write {folder}: {getattr(error, 'strerror', None) or error}; "
+                       "choose another output folder") from None
+    foreign = sorted(set(held) - allowed)
     if foreign:
         raise BadInput(f"{folder} holds {', '.join(foreign[:5])}, which the new content would "
                        "erase; move it away or choose another output folder")

@@ -98,7 +98,7 @@ def _write_obj(shapes: list[CityShape], path: Path) -> None:
     library = [line for name, rgb in colours.items()
                for line in (f"newmtl {name}",
                             "Kd " + " ".join(f"{value / 255:.3f}" for value in rgb), "")]
-    with atomic_path(path.with_suffix(".mtl")) as temporary:
-        temporary.write_text("\n".join(library) + "\n", encoding="utf-8")
-    with atomic_path(path) as temporary:
-        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    with atomic_path(path) as model, atomic_path(path.with_suffix(".mtl")) as colour_file:
+        # Neither is renamed before both are written
+        model.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        colour_file.write_text("\n".join(library) + "\n", encoding="utf-8")

@@ -200,8 +200,8 @@ def _joined(names: list[str], materials: list[Material | None], surfaces: Surfac
     graph = coo_matrix((np.ones(len(pairs)), pairs.T), shape=(size, size))
     building = connected_components(graph, directed=False)[1]
     meshes, whole, first = surfaces.meshes(), [], []
-    for index in range(building.max() + 1):
-        members = np.flatnonzero(building == index)
+    order = np.argsort(building, kind="stable")
+    for members in np.split(order, np.cumsum(np.bincount(building))[:-1]):
         parts = [trimesh.Trimesh(*meshes[one], process=False) for one in members]
         mesh: Any = trimesh.util.concatenate(parts)
         whole.append(clean(mesh.vertices, mesh.faces)[:2] if len(members) > 1

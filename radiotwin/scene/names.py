@@ -31,7 +31,7 @@ def unique_name(name: str, taken: set[str]) -> str:
 
     Args:
         name: Name to use.
-        taken: Names in use, in lower case, as some file systems ignore case; grows by one.
+        taken: Names in use, in lower case; grows by one. `Names` where they may be many.
     """
     numbers = taken.last_numbers if isinstance(taken, Names) else {}
     free, number = name, numbers.get(name.lower(), 1)

@@ -2,13 +2,12 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 import trimesh
 
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_folder
+from radiotwin.files import atomic_folder, scratch_folder
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions, build_scene, check_target
 from radiotwin.scene.config import (
@@ -170,8 +169,8 @@ def build_preset_scene(name: str, folder: Path | str, check_only: bool = False) 
         BadInput: No such preset, or the folder cannot be written or holds something else.
     """
     if check_only:
-        with TemporaryDirectory() as temporary:
-            return replace(build_preset_scene(name, Path(temporary) / name), folder=None)
+        with scratch_folder() as temporary:
+            return replace(build_preset_scene(name, temporary / name), folder=None)
     build_preset(name, folder)
     config = preset_config(name)
     report = build_scene(Path(folder) / "city.xml", folder,

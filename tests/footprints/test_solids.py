@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from radiotwin.footprints.extrude import SLOT_M, make_blocks
 from radiotwin.footprints.features import Feature
 from radiotwin.footprints.material_table import STANDARD
-from radiotwin.footprints.solids import find_overlaps, make_prisms
+from radiotwin.footprints.solids import find_contacts, find_overlaps, make_prisms
 from radiotwin.geodesy import to_geographic
 from radiotwin.tables import Origin
 
@@ -34,7 +34,7 @@ def total_volume(blocks):
 def test_a_courtyard_stays_open():
     area = shapely.box(0, 0, 40, 30).difference(shapely.box(10, 10, 30, 20))
     prisms, problems = prisms_of(feature(area))
-    (block,) = make_blocks(prisms)
+    (block,) = make_blocks(prisms, find_contacts(prisms))
     assert block.mesh.is_watertight and block.mesh.euler_number == 0  # a ring: one hole
     assert block.mesh.volume == pytest.approx(10 * (1200 - 200), rel=1e-3) and not problems
 
@@ -42,7 +42,7 @@ def test_a_courtyard_stays_open():
 def test_a_bow_tie_becomes_two_triangles():
     prisms, problems = prisms_of(feature(shapely.Polygon([(0, 0), (20, 10), (20, 0), (0, 10)])))
     assert len(prisms) == 2 and problems[0].severity == "fixed" and "way/1" in problems[0].message
-    blocks = make_blocks(prisms)
+    blocks = make_blocks(prisms, find_contacts(prisms))
     assert len(blocks) == 2 and all(block.mesh.is_watertight for block in blocks)
     assert total_volume(blocks) == pytest.approx(10 * 100, rel=5e-3)
 
@@ -50,7 +50,7 @@ def test_a_bow_tie_becomes_two_triangles():
 def test_a_courtyard_that_touches_the_outside_wall():
     area = shapely.Polygon([(0, 0), (20, 0), (20, 20), (0, 20)], [[(0, 10), (10, 5), (10, 15)]])
     prisms, problems = prisms_of(feature(area))
-    blocks = make_blocks(prisms)
+    blocks = make_blocks(prisms, find_contacts(prisms))
     assert all(block.mesh.is_watertight for block in blocks) and problems
     assert total_volume(blocks) == pytest.approx(10 * 350, rel=0.01)
 
@@ -68,7 +68,7 @@ def test_omissions_are_reported(area, message):
 
 def test_row_houses_become_one_solid_without_inner_walls():
     prisms, _ = prisms_of(feature(shapely.box(0, 0, 10, 12)), feature(shapely.box(10, 0, 20, 12), height="14"))
-    (block,) = make_blocks(prisms)
+    (block,) = make_blocks(prisms, find_contacts(prisms))
     assert block.mesh.is_watertight and block.mesh.volume == pytest.approx(120 * 24, rel=1e-3)
     # ground and roofs, walls around, and the 4 m step between the roofs
     assert block.mesh.area == pytest.approx(2 * 240 + 2 * 10 * 10 + 2 * 10 * 14 + 12 * 10 + 12 * 14 + 12 * 4, rel=2e-3)
@@ -77,7 +77,7 @@ def test_row_houses_become_one_solid_without_inner_walls():
 def test_neighbours_of_other_materials_have_a_slot_between_them():
     prisms, _ = prisms_of(feature(shapely.box(0, 0, 10, 12)),
                           feature(shapely.box(10, 0, 14, 12), building__material="wood"))
-    wall, other = sorted(make_blocks(prisms), key=lambda block: -block.mesh.volume)
+    wall, other = sorted(make_blocks(prisms, find_contacts(prisms)), key=lambda block: -block.mesh.volume)
     assert {wall.material.name, other.material.name} == {"concrete", "wood"}
     assert wall.mesh.is_watertight and other.mesh.is_watertight
     assert other.mesh.bounds[0, 0] - wall.mesh.bounds[1, 0] == pytest.approx(SLOT_M, abs=2e-3)
@@ -85,15 +85,15 @@ def test_neighbours_of_other_materials_have_a_slot_between_them():
 
 def test_buildings_that_meet_in_a_corner_stay_apart():
     prisms, _ = prisms_of(feature(shapely.box(0, 0, 10, 10)), feature(shapely.box(10, 10, 20, 20)))
-    assert [block.mesh.is_watertight for block in make_blocks(prisms)] == [True, True]
+    assert [block.mesh.is_watertight for block in make_blocks(prisms, find_contacts(prisms))] == [True, True]
 
 
 def test_overlaps_are_found_and_built_once():
     prisms, _ = prisms_of(feature(shapely.box(0, 0, 10, 10)), feature(shapely.box(8, 0, 18, 10), "way/2"),
                           feature(shapely.box(8, 0, 18, 10), "way/3", min_height="12", height="15"))
-    ((a, b, shared_m2),) = find_overlaps(prisms)
+    ((a, b, shared_m2),) = find_overlaps(prisms, find_contacts(prisms))
     assert {a.name, b.name} == {"way/1", "way/2"} and shared_m2 == pytest.approx(20, rel=0.01)
-    assert total_volume(make_blocks(prisms)) == pytest.approx(180 * 10 + 100 * 3, rel=5e-3)
+    assert total_volume(make_blocks(prisms, find_contacts(prisms))) == pytest.approx(180 * 10 + 100 * 3, rel=5e-3)
 
 
 def part(area, name, **tags):
@@ -109,7 +109,7 @@ def test_parts_replace_their_outline():
     heights = {prism.name: (prism.height.bottom_m, prism.height.top_m) for prism in prisms}
     assert heights == {"way/2": (0, 40), "way/3": (5, 9), "way/4": (0, 9)} and not problems
     assert {prism.material.name for prism in prisms} == {"glass"}  # inherited
-    (block,) = make_blocks(prisms)
+    (block,) = make_blocks(prisms, find_contacts(prisms))
     assert block.mesh.is_watertight and block.mesh.volume == pytest.approx(100 * (40 + 4 + 9), rel=2e-3)
     assert not block.mesh.contains([[15, 5, 2]])[0]  # the passage
 
@@ -137,7 +137,7 @@ def test_any_heap_of_boxes_becomes_watertight_solids(boxes):
     """Walls, corners and roofs that touch in every way; the volume is that of the union, counted cell by cell."""
     prisms, _ = prisms_of(*(feature(shapely.box(x, y, x + w, y + d), f"way/{i}", height=str(3 * h),
                                     building__material=m) for i, (x, y, w, d, h, m) in enumerate(boxes)))
-    blocks = make_blocks(prisms)
+    blocks = make_blocks(prisms, find_contacts(prisms))
     grid = np.zeros((20, 20))
     for x, y, w, d, h, _ in boxes:
         part = grid[x:x + w, y:y + d]
