@@ -85,7 +85,9 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
     learner = make_learner(run, learner_settings, reality.mission(known), run.real_episodes,
                            device)
     checkpoint = folder / NAME if folder else None
-    rows, blocks, twin = [], [], None
+    rows: list[dict] = []
+    blocks: list[dict] = []
+    twin: Twin | None = None
     try:
         # A run that was stopped before its first checkpoint starts again.
         if resume and folder and has_checkpoint(folder):

@@ -7,7 +7,7 @@ begins with `$` marks what JSON has no form for.
 import json
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 import pandas as pd
@@ -63,7 +63,7 @@ def load_checkpoint(path: Path) -> dict:
         refuse_damaged(path, error)
 
 
-def refuse_damaged(path: Path, error: Exception) -> Any:
+def refuse_damaged(path: Path, error: Exception) -> NoReturn:
     """Raise the message of a damaged checkpoint.
 
     Raises:
@@ -73,7 +73,7 @@ def refuse_damaged(path: Path, error: Exception) -> Any:
                    "run's folder and start again") from None
 
 
-def refuse_old(path: Path) -> Any:
+def refuse_old(path: Path) -> NoReturn:
     """Raise the message of a checkpoint of another version.
 
     Raises:

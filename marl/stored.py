@@ -50,9 +50,9 @@ def require_array(value: Any, like: np.ndarray, low: ArrayLike, high: ArrayLike)
         Damaged: it differs.
     """
     if not isinstance(value, np.ndarray) or value.dtype != like.dtype or value.shape != like.shape:
-        raise Damaged(f"an array should be {like.dtype} of the shape {like.shape}")
+        raise Damaged(f"an array should be {like.dtype.name} of the shape {like.shape}")
     if not ((value >= low) & (value <= high)).all():
-        raise Damaged(f"an array should hold numbers from {low} to {high}")
+        raise Damaged(f"an array should hold numbers from {low!s} to {high!s}")
     return value
 
 

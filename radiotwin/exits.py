@@ -28,7 +28,7 @@ from radiotwin.errors import BadInput, RunFailed
 
 NOBODY_READS = 141  # as the shell has it for a command that SIGPIPE has ended
 MAX_ERROR_CHARACTERS = 300
-_ClickError = typer.BadParameter.__mro__[2]  # Typer has no name of its own for it
+_ClickError: Any = typer.BadParameter.__mro__[2]  # Typer has no name of its own for it
 
 
 class _OutputLost(Exception):

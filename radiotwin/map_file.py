@@ -168,7 +168,7 @@ def write_blocks(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[
         BadInput: `path` cannot be written.
         RunFailed: the disk is full or failed; an older file is unchanged.
     """
-    import h5netcdf
+    import h5netcdf  # type: ignore[import-untyped]
 
     shape = tuple(top.sizes[name] for name in DIMS)
     options = {"compression": "gzip", "compression_opts": 4}

@@ -120,7 +120,7 @@ def make_town(size: int, folder: Path) -> dict[str, list[str]]:
     features = []
     for number in range(size):
         x_m, y_m = (PLOT_M * (place - side / 2) for place in divmod(number, side)[::-1])
-        outline, courtyard = _house(*rng.uniform(8, 20, 2), rng.random())
+        outline, courtyard = _house(rng.uniform(8, 20), rng.uniform(8, 20), rng.random())
         rings = [[_degrees(x_m + x, y_m + y) for x, y in [*ring, ring[0]]]
                  for ring in (outline, courtyard) if ring]
         tags = {"building": "yes"}
@@ -171,7 +171,8 @@ def load_cases(seed: int) -> dict[str, dict]:
 
 def load_table(rows: pd.DataFrame) -> str:
     """Return time and memory of each command, and their ratios to those of the smallest size."""
-    lines, first = [], {}
+    lines: list[list[str]] = []
+    first: dict[tuple, dict[str, float]] = {}
     for row in rows.sort_values(["part", "size"]).to_dict("records"):
         for name, cost in row["commands"].items():
             least = first.setdefault((row["part"], name), cost)

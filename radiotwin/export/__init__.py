@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Collection
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -22,7 +21,6 @@ EXPORTERS: dict[str, Callable[[RadioMap, Scene, Path], None]] = {
 STREAMED: dict[str, Callable[[RadioMap | MapStream, Scene, Path], None]] = {
     ".nc": write_netcdf, ".csv": write_csv, ".tif": write_geotiff}
 """Formats that a map is written to while it is made."""
-_Map = TypeVar("_Map", RadioMap, MapStream)
 _NAMED = 20  # devices, or altitudes, in a message
 
 
@@ -70,8 +68,8 @@ def check_format(path: Path, scene: Scene,
                        "and longitude_deg of x = y = 0")
 
 
-def select(radio_map: _Map, devices: list[str] | None,
-           altitudes_m: list[float] | None) -> _Map:
+def select(radio_map: RadioMap | MapStream, devices: list[str] | None,
+           altitudes_m: list[float] | None) -> RadioMap | MapStream:
     """Select devices and altitudes of a map.
 
     Args:

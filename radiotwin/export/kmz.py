@@ -54,7 +54,7 @@ def write_kmz(radio_map: RadioMap, scene: Scene, path: Path) -> None:
     document = ET.Element(f"{{{KML}}}kml")
     top = _add(document, "Document", name=scene.config.name)
     pictures: dict[str, tuple[int, int]] = {}
-    MAP_PICTURES.check(np.prod(radio_map.gain_db.shape[:2]), path)
+    MAP_PICTURES.check(int(np.prod(radio_map.gain_db.shape[:2])), path)
     _add_legend(top)
     corners = _corners(radio_map, scene)
     declared = {device.device: device for device in scene.config.devices}

@@ -4,6 +4,8 @@ To take apart an outline that crosses itself costs time and memory by the number
 which can be the square of the number of corners.
 """
 
+from typing import Any
+
 import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
@@ -47,7 +49,7 @@ class OutlineBudget:
         rings = shapely.get_rings(shapely.get_parts(shapely.get_parts(area)))
         points = [shapely.get_coordinates(ring) for ring in rings]
         ends = [np.stack([ring[:-1], ring[1:]], axis=1) for ring in points]
-        segments = shapely.linestrings(np.concatenate([np.zeros((0, 2, 2)), *ends]))
+        segments: Any = shapely.linestrings(np.concatenate([np.zeros((0, 2, 2)), *ends]))
         tree, found = shapely.STRtree(segments), 0
         for start in range(0, len(segments), _CHUNK):
             part = segments[start:start + _CHUNK]

@@ -236,7 +236,7 @@ def find_contacts(prisms: Sequence[Prism]) -> Contacts:
         TOUCHING_PAIRS.check(found, "the map")
         common = shapely.intersection(areas[a], areas[b])
         shared_m2 = shapely.area(common)
-        overlapping += np.count_nonzero(shared_m2 > MIN_OVERLAP_M2)
+        overlapping += int(np.count_nonzero(shared_m2 > MIN_OVERLAP_M2))
         OVERLAPS.check(overlapping, "the map")
         parts.append((np.stack([a, b], axis=1), shared_m2, shapely.length(common)))
     if not parts:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 
 from radiotwin.budgets import DEVICES
 from radiotwin.cells import listed
@@ -52,8 +53,10 @@ def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
                              index=names.to_numpy(dtype=object))
     others = {name: source.numbers(name, name) for name in DEVICE_OPTIONAL if name in source.table}
     for name, numbers in others.items():
-        refuse_limits(lambda bad, reason, name=name: source.refuse(name, source.table[name], bad,
-                                                                   reason), name, numbers)
+        def refuse(bad: ArrayLike, reason: str, name: str = name) -> None:
+            source.refuse(name, source.table[name], bad, reason)
+
+        refuse_limits(refuse, name, numbers)
     return to_geographic(positions, settings.crs).assign(**others)
 
 

@@ -131,7 +131,8 @@ def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,
               tally: Tally) -> PositionedLinks:
     """Apply the limits of distance and level; a link whose value is unknown passes."""
     links = positioned.links
-    distance_m, level_db = None, links["level_db"].to_numpy()
+    distance_m: Any = None
+    level_db = links["level_db"].to_numpy()
     if settings.min_distance_m is not None or settings.max_distance_m is not None:
         difference_m = (links[[f"receiver_{axis}_m" for axis in "xyz"]].to_numpy()
                         - positioned.device_m)

@@ -202,7 +202,7 @@ def _joined(names: list[str], materials: list[Material | None], surfaces: Surfac
     meshes, whole, first = surfaces.meshes(), [], []
     order = np.argsort(building, kind="stable")
     for members in np.split(order, np.cumsum(np.bincount(building))[:-1]):
-        parts = [trimesh.Trimesh(*meshes[one], process=False) for one in members]
+        parts = [trimesh.Trimesh(meshes[one][0], meshes[one][1], process=False) for one in members]
         mesh: Any = trimesh.util.concatenate(parts)
         whole.append(clean(mesh.vertices, mesh.faces)[:2] if len(members) > 1
                      else meshes[members[0]])
