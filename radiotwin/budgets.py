@@ -85,3 +85,5 @@ VERTICES = Budget("VERTICES", 20_000_000, "vertices")  # of a city, as is the ne
 FACES = Budget("FACES", 40_000_000, "faces")
 SHAPES = Budget("SHAPES", 200_000, "shapes")
 DEVICES = Budget("DEVICES", 100_000, "devices")
+PIECE_BYTES = Budget("PIECE_BYTES", 256 * 2**20, "bytes")  # of one finished part in the cache
+CACHE_BYTES = Budget("CACHE_BYTES", 2 * 2**30, "bytes")  # of all; the oldest are removed

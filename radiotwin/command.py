@@ -17,7 +17,7 @@ from radiotwin import progress
 from radiotwin.console import collected, complain, console
 from radiotwin.errors import BadInput, RunFailed
 
-TABLES = ("build-scene", "import", "fit", "compare", "close-loop", "locate", "demo", "doctor")
+TABLES = ("build-scene", "import", "fit", "compare", "close-loop", "locate", "demo", "doctor", "cache")
 """Commands of `radiotwin` that print tables."""
 QUIET = Annotated[bool, typer.Option(
     "--quiet", "-q", help="Print nothing but warnings and errors.")]
@@ -102,12 +102,13 @@ def _terminate(*_: Any) -> NoReturn:
     sys.exit(143)  # an exception, so that open files are cleaned up
 
 
-def exit_status(work: Callable[[], Any], kept: str) -> int:
+def exit_status(work: Callable[[], Any], kept: str | Callable[[], str]) -> int:
     """Do the work of a command; print one message for an error that the user can mend.
 
     Args:
         work: a Typer app, which may also end the process itself, or any function.
-        kept: part of the message after Ctrl-C: what is kept and how to go on.
+        kept: part of the message after Ctrl-C: what is kept and how to go on; or a function that
+            returns it.
 
     Returns:
         0 done, 1 failed while running, 2 bad input, 130 interrupted; SIGTERM ends the process
@@ -125,7 +126,7 @@ def exit_status(work: Callable[[], Any], kept: str) -> int:
         complain(str(error))
         return 1
     except _Interrupted:
-        complain(f"interrupted; {kept}")
+        complain(f"interrupted; {kept if isinstance(kept, str) else kept()}")
         return 130
     except BrokenPipeError:  # the reader of a pipe has gone, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -44,11 +44,12 @@ def require_writable(path: Path | str) -> None:
 
 
 @contextmanager
-def atomic_path(path: Path | str) -> Iterator[Path]:
+def atomic_path(path: Path | str, flush: bool = True) -> Iterator[Path]:
     """Write a file atomically, by code that raises OSError where a write or a close fails.
 
     Args:
         path: of the file; missing folders are made.
+        flush: wait for the disk; without, a power failure may leave a damaged file.
 
     Yields:
         a temporary path in the same folder with the same suffixes; it is flushed to the disk and
@@ -63,7 +64,8 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     with _parent_of(path), _reported(path, only_disk=True), _temporary_file(path) as temporary:
         yield temporary
         with _reported(path):
-            _flush(temporary)
+            if flush:
+                _flush(temporary)
             umask = os.umask(0)
             os.umask(umask)
             temporary.chmod(0o666 & ~umask)  # mkstemp makes private files

@@ -28,8 +28,9 @@ LAYERS = (
     {"scene"},
     {"antennas", "measurements", "command", "doctor"},
     {"geodesy", "llvm", "safe_xml", "cells", "console", "progress", "published"},
-    {"files", "inputs", "plugins", "tables"},
-    {"budgets"},
+    {"pieces"},
+    {"content_hash", "files", "inputs", "plugins", "tables"},
+    {"budgets", "interruption"},
     {"errors"},
 )
 DEPTH = {part: depth for depth, row in enumerate(LAYERS) for part in row}

@@ -13,6 +13,8 @@ from radiotwin.channel.base import ChannelModel
 from radiotwin.channel.registry import channel_models
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
+from radiotwin.links import LinkGeometry
+from radiotwin.pieces import kept
 
 
 def save_channel(model: ChannelModel, path: str | Path) -> None:
@@ -28,6 +30,24 @@ def save_channel(model: ChannelModel, path: str | Path) -> None:
     with atomic_path(Path(path)) as temporary:
         save_file({name: np.ascontiguousarray(array) for name, array in arrays.items()}, temporary,
                   header)
+
+
+def fit_once(kind: type[ChannelModel], links: LinkGeometry, level_db: np.ndarray,
+             limit_db: float | None, seed: int) -> ChannelModel:
+    """Fit a new model, or take it from an earlier run that was to fit the same.
+
+    Args:
+        kind: of model.
+        links: n links.
+        level_db: (n,) [dB]; NaN: not detected.
+        limit_db: level below which the receiver does not detect [dB]; None: unknown.
+        seed: as of `ChannelModel.fit`.
+
+    Raises:
+        BadInput: as of `ChannelModel.fit`.
+    """
+    return kept("channel", (kind, links, level_db, limit_db, seed),
+                lambda: kind().fit(links, level_db, limit_db, seed), kind.state, kind.from_state)
 
 
 def load_channel(path: str | Path) -> ChannelModel:

@@ -11,6 +11,7 @@ from radiotwin import __version__
 from radiotwin.cli import importing, loop, model, report, scenes, tools, world
 from radiotwin.command import add_output_options, exit_status
 from radiotwin.console import show_warnings_plainly
+from radiotwin.interruption import after_interrupt
 
 app = typer.Typer(
     name="radiotwin", no_args_is_help=True, pretty_exceptions_enable=False,
@@ -38,4 +39,4 @@ def _options(version: bool = typer.Option(False, "--version", callback=_show_ver
 
 def main() -> None:
     """Run the command line and end the process; see `exit_status`."""
-    sys.exit(exit_status(app, "finished parts are kept; run the same command again to go on"))
+    sys.exit(exit_status(app, after_interrupt))

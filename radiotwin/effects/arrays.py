@@ -22,6 +22,9 @@ class LinkCache:
             known[key] = derive()
         return known[key]
 
+    def state(self) -> None:
+        """Decide nothing: what is remembered could be derived again."""
+
 
 def subsample(rows: np.ndarray, maximum: int) -> np.ndarray:
     """Return at most `maximum` of the rows (n,), in order, drawn at random and always the same.

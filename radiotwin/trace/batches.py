@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from radiotwin.files import atomic_path
+from radiotwin.interruption import note_finished
 
 
 class BatchStore:
@@ -44,7 +45,10 @@ class BatchStore:
             array = np.load(self.folder / f"{name}.npy", allow_pickle=False)
         except (OSError, ValueError, EOFError):
             return None
-        return array if array.shape == (size,) else None
+        if array.shape != (size,):
+            return None
+        note_finished()
+        return array
 
     def put(self, name: str, array: np.ndarray) -> None:
         """Save an array, completely or not at all.
@@ -55,3 +59,4 @@ class BatchStore:
         """
         with atomic_path(self.folder / f"{name}.npy") as temporary:
             np.save(temporary, array, allow_pickle=False)
+        note_finished()
