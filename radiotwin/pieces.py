@@ -41,7 +41,6 @@ LEFT_SHARE = 0.9  # of the limit, after the oldest parts were removed
 LIBRARIES = ("numpy", "scipy", "numba", "embreex", "torch", "sionna-rt", "mitsuba", "drjit")
 _DAMAGE = (BadInput, OSError, ValueError, KeyError, TypeError, IndexError, AttributeError,
            EOFError, zipfile.BadZipFile)
-_warned_at: dict[str, dict] = {}  # as modules' `__warningregistry__`: each warning is shown once
 
 
 def pieces_folder() -> Path:
@@ -63,6 +62,7 @@ class PieceStore:
         made: parts that it made.
         saved: of these, those that were written.
         failed: why nothing more is written; empty while all is well.
+        shown: warnings of parts that this run has shown.
     """
 
     folder: Path
@@ -70,6 +70,7 @@ class PieceStore:
     made: int = 0
     saved: int = 0
     failed: str = ""
+    shown: set[str] = field(default_factory=set)
     _own: set[str] = field(default_factory=set)
     _bytes: int | None = None
 
@@ -208,19 +209,17 @@ def kept_with_name(kind: str, inputs: tuple, make: Callable[[], T],
             store.earlier += 1
             note_finished()
         for message in messages:
-            _warn_again(message, UserWarning, __file__, 1)
+            if message not in store.shown:
+                store.shown.add(message)
+                warnings.warn(message, stacklevel=1)
         return value, name
     started = time.perf_counter()
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
+    with _warnings_noted() as messages:
         value = make()
     seconds = time.perf_counter() - started
-    for each in caught:
-        _warn_again(each.message, each.category, each.filename, each.lineno)
+    store.shown.update(messages)
     store.made += 1
     if seconds >= MIN_SECONDS:
-        # Others, such as numpy's of a division by zero, are for developers.
-        messages = [str(each.message) for each in caught if each.category is UserWarning]
         piece = pack(value)
         if piece is not None:
             store.put(name, piece, messages)
@@ -244,10 +243,22 @@ def versions() -> tuple[str, ...]:
                                        for path in sources)))
 
 
-def _warn_again(message: Warning | str, category: type[Warning], filename: str,
-                line: int) -> None:
-    warnings.warn_explicit(message, category, filename, line,
-                           registry=_warned_at.setdefault(filename, {}))
+@contextmanager
+def _warnings_noted() -> Iterator[list[str]]:
+    """Yield a list that gets the texts of the warnings that are shown meanwhile."""
+    # `warnings.catch_warnings` would forget which ones were shown before.
+    show, messages = warnings.showwarning, list[str]()
+
+    def note(message: Warning | str, category: type[Warning], *args: Any, **options: Any) -> None:
+        if category is UserWarning:  # others, as numpy's of a division by zero, are no messages
+            messages.append(str(message))
+        show(message, category, *args, **options)
+
+    warnings.showwarning = note
+    try:
+        yield messages
+    finally:
+        warnings.showwarning = show
 
 
 def _encode(arrays: dict[str, np.ndarray], content: Any) -> bytes:
