@@ -23,6 +23,7 @@ from radiotwin.closeloop.cross_validation import (
 from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.residual_tests import ResidualDependence, residual_dependences
 from radiotwin.closeloop.selection import SelectionResult, add_shadowing, forward_selection
+from radiotwin.closeloop.thinning import thin_links
 from radiotwin.effects.params import Parameter
 from radiotwin.effects.registry import catalogue
 from radiotwin.effects.unexplained_trend import UnexplainedTrend
@@ -40,7 +41,7 @@ class Loop:
 
     Attributes:
         base: name of the base.
-        links: that were used.
+        links: that were used: all, or a sample of very many.
         folds: how they were held out.
         before: the base alone.
         selection: base and effects.
@@ -125,7 +126,8 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         raise BadInput("base 'raytrace' follows paths over a 3D map; give --scene, or take the "
                        "base log-distance")
     criteria = criteria or SelectionCriteria()
-    links = prepare_links(measurements, scene)
+    all_links = prepare_links(measurements, scene)
+    links = thin_links(all_links, seed)
     folds = make_folds(links, seed, hold_out)
     names = [base]
     if base == "auto":
@@ -157,7 +159,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         add_shadowing(selection, seed)
     on_progress("other models")
     return Loop(best, links, folds, before, selection, dependences_before, dependences_after,
-                _baselines(before, criteria), _noise_floor_db(links, criteria))
+                _baselines(before, criteria), _noise_floor_db(all_links, criteria))
 
 
 def _dependences(model: CrossValidatedModel, seed: int) -> list[ResidualDependence]:
