@@ -17,7 +17,8 @@ from radiotwin import progress
 from radiotwin.console import collected, complain, console
 from radiotwin.errors import BadInput, RunFailed
 
-TABLES = ("build-scene", "import", "fit", "compare", "close-loop", "locate", "demo", "doctor", "cache")
+TABLES = ("build-scene", "import", "fit", "compare", "close-loop", "locate", "demo", "doctor",
+          "cache")
 """Commands of `radiotwin` that print tables."""
 QUIET = Annotated[bool, typer.Option(
     "--quiet", "-q", help="Print nothing but warnings and errors.")]

@@ -62,11 +62,12 @@ def _add(digest: Any, value: Any) -> None:
             _add(digest, each)
     elif isinstance(value, dict):
         digest.update(f"d{len(value)};".encode())
-        for name, each in value.items():
-            _add(digest, name)
-            _add(digest, each)
+        for pair in sorted(content_hash(pair) for pair in value.items()):  # in any order
+            digest.update(pair.encode())
     elif isinstance(value, set | frozenset):
-        _add(digest, sorted(value))
+        digest.update(f"e{len(value)};".encode())
+        for each in sorted(map(content_hash, value)):
+            digest.update(each.encode())
     elif isinstance(value, type):
         _add_class(digest, value)
     else:
@@ -87,9 +88,9 @@ def _add_class(digest: Any, kind: type) -> None:
 def _of_object(value: Any) -> bytes:
     """Return the hash of an object; that of one that cannot change is remembered."""
     kind = type(value)
-    by_identity = kind.__hash__ is object.__hash__
-    remembered = by_identity and (getattr(kind, "never_changes", False) or (
-        is_dataclass(value) and getattr(kind, "__dataclass_params__").frozen))
+    parameters = getattr(kind, "__dataclass_params__", None)
+    remembered = kind.__hash__ is object.__hash__ and (
+        getattr(kind, "never_changes", False) or (parameters is not None and parameters.frozen))
     if remembered and value in _hashed:
         return _hashed[value]
     digest = hashlib.blake2b(digest_size=HASH_BYTES)

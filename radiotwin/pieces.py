@@ -264,7 +264,7 @@ def _warnings_noted() -> Iterator[list[str]]:
 def _encode(arrays: dict[str, np.ndarray], content: Any) -> bytes:
     buffer = io.BytesIO()
     text = np.frombuffer(json.dumps(content).encode(), dtype=np.uint8)
-    np.savez(buffer, _json=text, **arrays)
+    np.savez(buffer, **{**arrays, "_json": text})  # type: ignore[arg-type]  # not its options
     return buffer.getvalue()
 
 

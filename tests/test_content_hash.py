@@ -30,6 +30,7 @@ def test_equal_content_has_one_hash():
     assert content_hash(array.T) == content_hash(np.ascontiguousarray(array.T))
     assert content_hash([1, 2]) == content_hash((1, 2))
     assert content_hash({"b", "a", "c"}) == content_hash({"c", "a", "b"})
+    assert content_hash({"b": 1, "a": 2}) == content_hash({"a": 2, "b": 1})
     assert content_hash(np.float64(0.1)) == content_hash(0.1)
 
 

@@ -72,8 +72,8 @@ def cache(
     result("cache", {"folder": str(store.folder), "bytes": total, "limit_bytes": CACHE_BYTES.limit,
                      "parts": {kind: len(sizes) for kind, sizes in sorted(by_kind.items())}})
     if by_kind:
-        print_rows("Finished parts", {"of": "left", "parts": "right", "size [MB]": "right"},
-                   [[kind, len(sizes), sum(sizes) / 1e6] for kind, sizes in sorted(by_kind.items())])
+        rows = [[kind, len(sizes), sum(sizes) / 1e6] for kind, sizes in sorted(by_kind.items())]
+        print_rows("Finished parts", {"of": "left", "parts": "right", "size [MB]": "right"}, rows)
     say(f"{store.folder}: {total / 1e6:.1f} MB of at most {CACHE_BYTES.limit / 1e6:,.0f} MB")
     if clear:
         say(f"removed {store.clear():,} parts")

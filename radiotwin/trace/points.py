@@ -2,6 +2,7 @@
 
 from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -57,10 +58,13 @@ def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settin
                 gain_db[row, part] = kept(
                     "gains", (*decided_by, one_m, batch_m, ends),
                     partial(solver.solve, one_m, batch_m, ends),
-                    lambda found: ({"gain_db": found}, None),
-                    lambda arrays, _, n=len(batch_m): arrays["gain_db"].reshape(n))
+                    lambda found: ({"gain_db": found}, len(found)), _read_gains)
                 advance(len(batch_m))
     return gain_db
+
+
+def _read_gains(arrays: dict[str, np.ndarray], count: Any) -> np.ndarray:
+    return arrays["gain_db"].reshape(count)
 
 
 class _LateSolver:

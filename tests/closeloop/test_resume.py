@@ -44,7 +44,8 @@ def measured(open_ground):
     world = open_ground.fly(2)
     world.gain_db[world.receiver == 1] += 5.0
     world.gain_db[(world.receiver == 0) & (world.time_s > 530)] -= 6.0
-    return open_ground.measured(world)
+    every = open_ground.measured(world)
+    return every.select(every.table["device"].isin(every.devices["device"][:3]).to_numpy())
 
 
 def everything(measured, scene=None, base="log-distance"):
@@ -67,10 +68,12 @@ def test_a_killed_loop_goes_on_and_ends_equal_to_the_bit(measured, kill_after, s
         assert everything(measured) == whole
     assert 0 < before < total and len(searches) <= total - before + 1
     assert store.earlier == 30
-    searches.clear()
+    for number, (_, _, path) in enumerate(sorted(store.files())):
+        if number % 4 == 0:  # damaged
+            path.write_bytes(path.read_bytes()[:-number - 1])
     with keep_pieces() as store:
         assert everything(measured) == whole
-    assert not searches and store.made == 0
+    assert store.made and store.earlier
 
 
 def test_other_data_or_another_seed_take_nothing(measured, kill_after):
@@ -84,18 +87,6 @@ def test_other_data_or_another_seed_take_nothing(measured, kill_after):
         with keep_pieces() as store, pytest.raises(Killed):
             close_loop(**others, base="log-distance")
         assert store.earlier == 0
-
-
-def test_damaged_parts_are_made_again(measured, kill_after):
-    kill_after(np.inf)
-    with keep_pieces() as store:
-        whole = everything(measured)
-    for number, (_, _, path) in enumerate(sorted(store.files())):
-        if number % 3 == 0:
-            path.write_bytes(path.read_bytes()[:-number - 1])
-    with keep_pieces() as store:
-        assert everything(measured) == whole
-    assert store.made and store.earlier
 
 
 @pytest.mark.slow
