@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from radiotwin import pieces
 from radiotwin.compare import predict
 from radiotwin.errors import BadInput
 from radiotwin.localize import Relocation
@@ -86,3 +87,30 @@ def test_what_was_not_heard_is_not_invented(narrow_street):
     assert los_db == nlos_db == pytest.approx(6.0, abs=0.6)
     device = next(each for each in twin.devices if each.device == name)
     assert not device.located or device.credible_radius_m > 15
+
+
+@pytest.mark.slow
+def test_a_killed_fit_goes_on_and_ends_equal_to_the_bit(narrow_street, tmp_path, monkeypatch):
+    monkeypatch.setattr(pieces, "MIN_SECONDS", 0.0)
+    put = pieces.PieceStore.put
+
+    def files(folder):
+        fit_twin(narrow_street.measured, narrow_street.scene, model="raytrace", seed=0).save(folder)
+        return [(folder / name).read_bytes() for name in ("twin.json", "channel.safetensors")]
+
+    whole = files(tmp_path / "whole")
+    earlier = []
+    for count in (2, 8, 10**9):
+        def put_some(self, *args, count=count):
+            if self.saved == count:
+                raise KeyboardInterrupt
+            put(self, *args)
+        monkeypatch.setattr(pieces.PieceStore, "put", put_some)
+        with pieces.keep_pieces() as store:
+            if count < 10**9:
+                with pytest.raises(KeyboardInterrupt):
+                    files(tmp_path / "killed")
+            else:
+                assert files(tmp_path / "resumed") == whole
+        earlier.append(store.earlier)
+    assert earlier == [0, 2, 10]
