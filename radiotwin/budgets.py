@@ -111,3 +111,5 @@ OUTLINE_CORNERS = Budget("OUTLINE_CORNERS", 20_000, "corners")  # of one buildin
 CROSSINGS = Budget("CROSSINGS", 20_000, "crossings of outlines with themselves")  # of a map
 OVERLAPS = Budget("OVERLAPS", 200_000, "pairs of buildings that overlap")  # of a map
 TOUCHING_PAIRS = Budget("TOUCHING_PAIRS", 2_000_000, "pairs of buildings that touch")  # of a map
+PIECE_BYTES = Budget("PIECE_BYTES", 256 * 2**20, "bytes")  # of one finished part in the cache
+CACHE_BYTES = Budget("CACHE_BYTES", 2 * 2**30, "bytes")  # of all; the oldest are removed

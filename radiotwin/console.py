@@ -59,6 +59,12 @@ def complain(message: str) -> None:
         error_console.print(printable(message), markup=False, soft_wrap=True)
 
 
+def notice(message: str) -> None:
+    """Print one line about the run itself on standard error; nothing if it is empty."""
+    if message and not console.quiet:
+        error_console.print(f"radiotwin: {message}", markup=False, soft_wrap=True)
+
+
 def say(message: str) -> None:
     """Print one line on standard output."""
     collected.setdefault("messages", []).append(message)

@@ -57,7 +57,7 @@ class _Output:
             raise _OutputLost from error
 
 
-def exit_status(work: Callable[[], Any], kept: str) -> int:
+def exit_status(work: Callable[[], Any], kept: str | Callable[[], str]) -> int:
     """Do the work of a command; print one message for whatever keeps it from being done.
 
     With `--json` on the command line the message is also on standard output:
@@ -65,7 +65,8 @@ def exit_status(work: Callable[[], Any], kept: str) -> int:
 
     Args:
         work: a Typer app, or any function; it may end the process itself.
-        kept: part of the message after a signal: what is kept and how to go on.
+        kept: part of the message after a signal: what is kept and how to go on; or a function that
+            returns it.
 
     Returns:
         exit status, as this module has them.
@@ -82,7 +83,7 @@ def exit_status(work: Callable[[], Any], kept: str) -> int:
             signals.end()
         status, message = done if isinstance(done, int) else 0, ""
     except BaseException as error:  # noqa: BLE001  # the one place that knows what to say
-        status, message = _explained(error, kept)
+        status, message = _explained(error, kept if isinstance(kept, str) else kept())
     finally:
         signals.end()
         sys.stdout = before

@@ -51,11 +51,12 @@ def require_writable(path: Path | str) -> None:
 
 
 @contextmanager
-def atomic_path(path: Path | str) -> Iterator[Path]:
+def atomic_path(path: Path | str, flush: bool = True) -> Iterator[Path]:
     """Write a file atomically, by code that raises OSError where a write or a close fails.
 
     Args:
         path: of the file; missing folders are made.
+        flush: wait for the disk; without, a power failure may leave a damaged file.
 
     Yields:
         a temporary path with the same name in a folder beside `path`; it is flushed to the disk
@@ -73,7 +74,8 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
             temporary.touch()
         yield temporary
         with _reported(path):
-            _flush(temporary)
+            if flush:
+                _flush(temporary)
             os.replace(temporary, path)
 
 

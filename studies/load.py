@@ -155,10 +155,58 @@ def _degrees(x_m: float, y_m: float) -> list[float]:
     return [round(8.5 + x_m / 75_300, 7), round(47.4 + y_m / 111_190, 7)]
 
 
+def make_close_loop(links: int, folder: Path) -> dict[str, list[str]]:
+    """Write flights over a small city with one receiver that reads 5 dB too much; see `Make`.
+
+    Five flights of two UAVs; half of the devices are anchors. Levels follow a law of distance and
+    line of sight, with shadowing that changes over 40 m along the way.
+    """
+    run_measured(["radiotwin.cli", "build-scene", "preset:small", "-o", "scene"], folder)
+    scene, rng = Scene.load(folder / "scene"), np.random.default_rng(0)
+    device_m, flights, uavs = scene.device_m, 5, 2
+    slots = -(-links // (len(device_m) * flights * uavs))
+    low, high = np.array(scene.config.extent.bounds).reshape(2, 2).T
+    names = np.array([device.device for device in scene.config.devices])
+    for flight, uav in np.ndindex(flights, uavs):
+        speed_m, away_m = 4000.0 / slots, np.cumsum(rng.normal(0, 0.3 / np.sqrt(slots), slots))
+        angle = rng.uniform(0, 2 * np.pi) + 12 * away_m
+        way_m = np.cumsum(speed_m * np.column_stack([np.cos(angle), np.sin(angle)]), axis=0)
+        place_m = low + np.abs((way_m + rng.uniform(low, high)) % (2 * (high - low)) - (high - low))
+        receiver_m = np.column_stack([place_m, np.full(slots, 50.0 + 10 * uav)])
+        keep = np.exp(-speed_m / 40.0)
+        step_db = rng.normal(0, 3 * np.sqrt(1 - keep**2), (slots, len(device_m)))
+        shadowing_db = step_db.copy()
+        for slot in range(1, slots):
+            shadowing_db[slot] += keep * shadowing_db[slot - 1]
+        ends_m = np.repeat(receiver_m, len(device_m), axis=0)
+        from_m = np.tile(device_m, (slots, 1))
+        los = scene.city.line_of_sight(from_m, ends_m)
+        distance_m = np.linalg.norm(ends_m - from_m, axis=1)
+        gain_db = np.where(los, -32 - 22 * np.log10(distance_m), -35 - 30 * np.log10(distance_m))
+        gain_db += shadowing_db.ravel() + rng.normal(0, 1.0, len(los)) + 5.0 * uav
+        gain_db[gain_db < scene.config.gain_limit_db] = np.nan
+        part = pd.DataFrame({
+            "time_s": (600.0 * (flight + np.arange(slots) / slots)).repeat(len(device_m)).round(3),
+            "flight": f"f{flight}", "receiver": f"r{uav}", "receiver_x_m": ends_m[:, 0].round(2),
+            "receiver_y_m": ends_m[:, 1].round(2), "receiver_z_m": ends_m[:, 2],
+            "device": np.tile(names, slots), "gain_db": gain_db.round(2),
+        })
+        with open(folder / "measurements.csv", "ab") as file:
+            write_csv(part, file, header=not flight + uav)
+    known = np.arange(len(device_m)) % 2 == 0
+    write_csv(pd.DataFrame({
+        "device": names, "x_m": np.where(known, device_m[:, 0], np.nan),
+        "y_m": np.where(known, device_m[:, 1], np.nan), "z_m": device_m[:, 2],
+        "role": np.where(known, "anchor", "unknown")}), folder / "devices.csv")
+    loop = ["radiotwin.cli", "close-loop", "measurements.csv", "--scene", "scene"]
+    return {"close-loop": [*loop, "--out", "loop"]}
+
+
 PARTS: dict[str, tuple[Make, tuple[int, ...]]] = {
     "import and fit": (make_import, (100_000, 1_000_000, 10_000_000)),
     "build-scene": (make_town, (1_000, 10_000, 50_000)),
     "map": (make_map_inputs, (100_000, 1_000_000, 10_000_000)),
+    "close-loop": (make_close_loop, (10_000, 100_000, 1_000_000)),
 }
 """Name of a part -> inputs and commands, and sizes from the smallest."""
 

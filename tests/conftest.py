@@ -1,5 +1,7 @@
 """Skips what a machine cannot run, with the reason."""
 
+import uuid
+
 import pytest
 
 from radiotwin import llvm
@@ -10,6 +12,14 @@ def pytest_collection_modifyitems(items):
     if needs_llvm and not llvm.available():
         for item in needs_llvm:
             item.add_marker(pytest.mark.skip(reason="no working libLLVM >= 17; `radiotwin doctor` says what to do"))
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory, monkeypatch):
+    """A folder for finished parts that no other test uses, nor the user; it is made when it is needed."""
+    folder = tmp_path_factory.getbasetemp() / f"cache-{uuid.uuid4().hex}"
+    monkeypatch.setenv("RADIOTWIN_CACHE", str(folder))
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -137,3 +137,33 @@ def test_devices_of_unknown_position_are_in_neither_class(small_scene, flown):
     scores = compare_models(*split_flights(flown, 1), bare, None, seed=0, models=("log_distance",)).scores
     n = scores.set_index("links")["n"]
     assert 0 < n["LoS"] and 0 < n["NLoS"] and n["LoS"] + n["NLoS"] < n["all"]
+
+
+def test_a_killed_comparison_goes_on_with_the_models_that_were_fitted(small_scene, truth, flown, monkeypatch):
+    from radiotwin import pieces
+    from radiotwin.channel.segmented_nn import SegmentedNN
+    from radiotwin.localize import on_map
+
+    monkeypatch.setattr(pieces, "MIN_SECONDS", 0.0)
+    train, test = split_flights(flown, 1)
+    models = ("log_distance", "segmented_nn", "regression_kriging")
+
+    def tables():
+        found = compare_models(train, test, small_scene, truth, seed=0, models=models)
+        return found.scores.to_csv(), found.locations.to_csv(), found.predictions.to_csv()
+
+    whole = tables()
+    with monkeypatch.context() as killed, pieces.keep_pieces() as store, pytest.raises(KeyboardInterrupt):
+        def kill(*_, **__):
+            raise KeyboardInterrupt
+        killed.setattr("radiotwin.channel.regression_kriging.RegressionKriging.fit", kill)
+        tables()
+    assert store.saved >= 4
+    monkeypatch.setattr(SegmentedNN, "fit", lambda *_: pytest.fail("fitted again"))
+    with pieces.keep_pieces() as store:
+        assert tables() == whole
+    assert store.earlier >= 4  # two channels, and the devices located with each
+    monkeypatch.setattr(on_map, "localize", lambda *_, **__: pytest.fail("located again"))
+    with pieces.keep_pieces() as store:
+        assert tables() == whole
+    assert store.made == 0

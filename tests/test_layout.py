@@ -29,9 +29,10 @@ LAYERS = (
     {"scene"},
     {"antennas", "measurements", "command", "doctor", "exits"},
     {"array_file", "geodesy", "llvm", "safe_xml", "cells", "progress", "published", "records", "hdf5"},
+    {"pieces"},
     {"console"},
-    {"files", "inputs", "plugins", "tables"},
-    {"budgets"},
+    {"content_hash", "files", "inputs", "plugins", "tables"},
+    {"budgets", "interruption"},
     {"errors", "signals"},
 )
 DEPTH = {part: depth for depth, row in enumerate(LAYERS) for part in row}

@@ -2,7 +2,7 @@
 
 from radiotwin.channel.base import ChannelModel, check_fit_data
 from radiotwin.channel.registry import channel_models, channel_named, register
-from radiotwin.channel.store import load_channel, save_channel
+from radiotwin.channel.store import fit_once, load_channel, save_channel
 
-__all__ = ["ChannelModel", "channel_models", "channel_named", "check_fit_data", "load_channel",
-           "register", "save_channel"]
+__all__ = ["ChannelModel", "channel_models", "channel_named", "check_fit_data", "fit_once",
+           "load_channel", "register", "save_channel"]

@@ -2,13 +2,14 @@
 
 from collections import OrderedDict
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkData, LinkGeometry
+from radiotwin.pieces import kept
 from radiotwin.scene.citymap import CityMap
 
 GRID_M = 1.0  # estimated positions of devices are rounded to it, and share their paths
@@ -119,7 +120,7 @@ def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, 
 def _follow(city: CityMap, position_m: tuple[float, float, float], ends_m: np.ndarray,
             frequency_hz: float) -> tuple[_Followed, np.ndarray]:
     """Return the paths from one position to ends (n, 3), and the row of each end."""
-    from radiotwin.paths.powers import COMPONENTS, SECTORS, path_powers
+    from radiotwin.paths.powers import COMPONENTS, SECTORS
 
     key = (city, position_m, frequency_hz)
     wanted = _keys(ends_m)
@@ -131,12 +132,9 @@ def _follow(city: CityMap, position_m: tuple[float, float, float], ends_m: np.nd
     if unknown.any():
         new, first = np.unique(wanted[unknown], return_index=True)
         new_m = ends_m[unknown][first]
-        found = path_powers(city, np.array([position_m]), new_m, np.zeros(len(new_m), int),
-                            frequency_hz, "vertical")
         order = np.argsort(np.concatenate([known.ends, new]))
-        powers = np.column_stack([getattr(found, name) for name in COMPONENTS])
-        more = (new, powers, found.departures, found.arrivals)
-        known = _Followed(*(np.concatenate([old, each.astype(old.dtype)])[order]
+        more = (new, *_new_paths(city, position_m, new_m, frequency_hz))
+        known = _Followed(*(np.concatenate([old, each])[order]
                             for old, each in zip(known, more, strict=True)))
         index = np.searchsorted(known.ends, wanted)
     _remembered[key] = known
@@ -144,6 +142,32 @@ def _follow(city: CityMap, position_m: tuple[float, float, float], ends_m: np.nd
             and sum(len(each.ends) for each in _remembered.values()) > MAX_REMEMBERED:
         _remembered.popitem(last=False)
     return known, index
+
+
+_NewPaths = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def _new_paths(city: CityMap, position_m: tuple[float, float, float], ends_m: np.ndarray,
+               frequency_hz: float) -> _NewPaths:
+    """Return powers, departures and arrivals as of `_Followed` to ends (n, 3)."""
+    from radiotwin.paths.powers import COMPONENTS, SECTORS, path_powers
+
+    shapes = [(len(ends_m), len(COMPONENTS)), *[(len(ends_m), SECTORS, 3)] * 2]
+
+    def follow() -> _NewPaths:
+        found = path_powers(city, np.array([position_m]), ends_m, np.zeros(len(ends_m), int),
+                            frequency_hz, "vertical")
+        powers = np.column_stack([getattr(found, name) for name in COMPONENTS])
+        return powers, found.departures.astype(np.float32), found.arrivals.astype(np.float32)
+
+    def read(arrays: dict[str, np.ndarray], _: Any) -> _NewPaths:
+        values = arrays["powers"], arrays["departures"], arrays["arrivals"]
+        if [each.shape for each in values] != shapes:
+            raise ValueError("other shapes")
+        return values
+
+    return kept("paths", (city, position_m, ends_m, frequency_hz), follow,
+                lambda found: (dict(zip(("powers", "departures", "arrivals"), found)), None), read)
 
 
 def _keys(positions_m: np.ndarray) -> np.ndarray:

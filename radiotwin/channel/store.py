@@ -15,6 +15,7 @@ from radiotwin.errors import BadInput
 from radiotwin.files import atomic_file
 from radiotwin.inputs import parse_json, read_bytes
 from radiotwin.links import LinkGeometry
+from radiotwin.pieces import kept
 
 # Distances and heights [m] at which a model that is read must predict numbers.
 _TRIED_M = np.array([(1.0, 0.0), (30.0, 10.0), (300.0, -50.0), (3e3, 100.0), (1e5, 3e3)])
@@ -29,6 +30,24 @@ def save_channel(model: ChannelModel, path: str | Path) -> None:
     """
     with atomic_file(path) as file:
         file.write(encode_channel(model))
+
+
+def fit_once(kind: type[ChannelModel], links: LinkGeometry, level_db: np.ndarray,
+             limit_db: float | None, seed: int) -> ChannelModel:
+    """Fit a new model, or take it from an earlier run that was to fit the same.
+
+    Args:
+        kind: of model.
+        links: n links.
+        level_db: (n,) [dB]; NaN: not detected.
+        limit_db: level below which the receiver does not detect [dB]; None: unknown.
+        seed: as of `ChannelModel.fit`.
+
+    Raises:
+        BadInput: as of `ChannelModel.fit`.
+    """
+    return kept("channel", (kind, links, level_db, limit_db, seed),
+                lambda: kind().fit(links, level_db, limit_db, seed), kind.state, kind.from_state)
 
 
 def load_channel(path: str | Path) -> ChannelModel:

@@ -8,5 +8,6 @@ def main() -> None:
     signals.handle()  # before anything that takes time
     from radiotwin.cli.commands import app
     from radiotwin.exits import exit_status
+    from radiotwin.interruption import after_interrupt
 
-    signals.leave(exit_status(app, "finished parts are kept; run the same command again to go on"))
+    signals.leave(exit_status(app, after_interrupt))

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from radiotwin.cli.options import DeviceTable, MeasurementFile, OptionalScene
-from radiotwin.console import print_rows, say
+from radiotwin.console import notice, print_rows, say
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -46,6 +46,7 @@ def close_loop(
     from radiotwin.closeloop.run import close_loop as run
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
+    from radiotwin.pieces import keep_pieces
     from radiotwin.progress import progress
     from radiotwin.report import closeloop_summary, write_closeloop_figures, write_closeloop_page
     from radiotwin.scene import Scene
@@ -57,11 +58,15 @@ def close_loop(
     check_twin_target(out / "twin")
     if write_scene is not None:
         check_corrected_target(write_scene, world, out)
-    with progress("closing the loop", total=None) as advance:
-        loop = run(data, world, base, seed, lambda text: advance(1, text), hold_out)
-    report = make_report(loop) | {
-        "inputs": {"measurements": str(measurements), "scene": scene and str(scene)}}
-    write_closeloop_figures(loop, world, report, out)
+    with keep_pieces() as pieces:
+        with progress("closing the loop", total=None) as advance:
+            loop = run(data, world, base, seed,
+                       lambda text: advance(1, "; ".join(filter(None, [text, pieces.progress]))),
+                       hold_out)
+        report = make_report(loop) | {
+            "inputs": {"measurements": str(measurements), "scene": scene and str(scene)}}
+        write_closeloop_figures(loop, world, report, out)
+    notice(pieces.progress)
     write_report(report, out / "closeloop.json")
     write_residuals(loop, out / "residuals.csv.gz")
     corrected_twin(loop, world).save(out / "twin")

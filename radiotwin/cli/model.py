@@ -14,7 +14,7 @@ from radiotwin.cli.options import (
     SceneOption,
     split_names,
 )
-from radiotwin.console import print_rows, result, say
+from radiotwin.console import notice, print_rows, result, say
 from radiotwin.errors import BadInput
 
 if TYPE_CHECKING:
@@ -52,13 +52,17 @@ def fit(
     The channel is learnt from the anchors; then the unknown devices are located with it.
     """
     from radiotwin.measurements import read_measurements
+    from radiotwin.pieces import keep_pieces
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin, check_twin_target, fit_twin
 
     check_twin_target(out)
     data, world = read_measurements(measurements, devices), Scene.load(scene)
     earlier = Twin.load(start) if start else None
-    twin = fit_twin(data, world, model=model, seed=seed, start=earlier, allow_indoor=allow_indoor)
+    with keep_pieces() as pieces:
+        twin = fit_twin(data, world, model=model, seed=seed, start=earlier,
+                        allow_indoor=allow_indoor)
+    notice(pieces.progress)
     twin.save(out)
     print_rows(f"Twin {out} ({model})",
                {"device": "left", "role": "left", "x [m]": "right", "y [m]": "right",
@@ -168,6 +172,7 @@ def compare(
     from radiotwin.comparison_output import judge_also, write_comparison
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
+    from radiotwin.pieces import keep_pieces
     from radiotwin.report import write_comparison_figures
     from radiotwin.scene import Scene
     from radiotwin.survey import read_truth
@@ -178,8 +183,10 @@ def compare(
     truth_map = read_truth(world, truth) if truth else None
     twins, maps = judge_also(also or [], truth_map, test.flights)
     models = (*DEFAULT_MODELS, *["raytrace"] * raytrace)
-    comparison = compare_models(train, test, world, truth_map, seed=seed, models=models,
-                                twins=twins, maps=maps)
+    with keep_pieces() as pieces:
+        comparison = compare_models(train, test, world, truth_map, seed=seed, models=models,
+                                    twins=twins, maps=maps)
+    notice(pieces.progress)
     write_comparison(comparison, world, out)
     write_comparison_figures(comparison, world, truth_map, out)
     print_comparison(comparison)

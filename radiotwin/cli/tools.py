@@ -1,4 +1,4 @@
-"""The commands demo and doctor."""
+"""The commands demo, doctor and cache."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -6,13 +6,14 @@ from typing import Annotated
 
 import typer
 
-from radiotwin.console import console, result, say
+from radiotwin.console import console, notice, print_rows, result, say
 
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module to the app."""
     app.command("demo")(demo)
     app.command("doctor")(doctor)
+    app.command("cache")(cache)
 
 
 def demo(
@@ -29,8 +30,11 @@ def demo(
     """
     from radiotwin.cli.model import print_comparison
     from radiotwin.demo import run_demo
+    from radiotwin.pieces import keep_pieces
 
-    comparison = run_demo(scene, out, seed=seed, on_progress=say)
+    with keep_pieces() as pieces:
+        comparison = run_demo(scene, out, seed=seed, on_progress=say)
+    notice(pieces.progress)
     print_comparison(comparison)
     say(f"look at {out / 'report.html'}")
 
@@ -46,3 +50,30 @@ def doctor() -> None:
     result("doctor", {"healthy": diagnosis.healthy, **asdict(diagnosis)})
     if not diagnosis.healthy:
         raise typer.Exit(1)
+
+
+def cache(
+    clear: Annotated[bool, typer.Option("--clear", help="Remove all of it.")] = False,
+) -> None:
+    """Show what is kept of finished and of killed runs.
+
+    close-loop, fit, compare, gains and demo keep finished parts there, so that a killed run goes on
+    where it was. The folder is that of the environment variable RADIOTWIN_CACHE, and the oldest
+    parts are removed when there are more bytes than RADIOTWIN_MAX_CACHE_BYTES.
+    """
+    from radiotwin.budgets import CACHE_BYTES
+    from radiotwin.pieces import PieceStore, pieces_folder
+
+    store = PieceStore(pieces_folder())
+    by_kind: dict[str, list[int]] = {}
+    for _, size, path in store.files():
+        by_kind.setdefault(path.stem.rpartition("-")[0], []).append(size)
+    total = sum(map(sum, by_kind.values()))
+    result("cache", {"folder": str(store.folder), "bytes": total, "limit_bytes": CACHE_BYTES.limit,
+                     "parts": {kind: len(sizes) for kind, sizes in sorted(by_kind.items())}})
+    if by_kind:
+        rows = [[kind, len(sizes), sum(sizes) / 1e6] for kind, sizes in sorted(by_kind.items())]
+        print_rows("Finished parts", {"of": "left", "parts": "right", "size [MB]": "right"}, rows)
+    say(f"{store.folder}: {total / 1e6:.1f} MB of at most {CACHE_BYTES.limit / 1e6:,.0f} MB")
+    if clear:
+        say(f"removed {store.clear():,} parts")

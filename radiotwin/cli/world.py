@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from radiotwin.cli.options import Combining, OnlyDevices, Quality, RaySeed, SceneFolder, split_names
-from radiotwin.console import say
+from radiotwin.console import notice, say
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -64,13 +64,16 @@ def gains(
 
     An empty gain has a reason, such as no path.
     """
+    from radiotwin.pieces import keep_pieces
     from radiotwin.scene import Scene
     from radiotwin.trace import SolverSettings, read_points, trace_points
 
     scene = Scene.load(folder)
     settings = SolverSettings.of_quality(quality, combining=combining, seed=seed)
     points_m = read_points(points, scene.config.origin)
-    table = trace_points(scene, points_m, settings, out, split_names(devices))
+    with keep_pieces() as pieces:
+        table = trace_points(scene, points_m, settings, out, split_names(devices))
+    notice(pieces.progress)
     reasons = table.loc[table["reason"] != "", "reason"].value_counts()
     say(f"wrote {out}: {len(table)} links, {len(table) - reasons.sum()} with a gain"
         + "".join(f", {count} {reason}" for reason, count in reasons.items()))

@@ -53,7 +53,7 @@ class LogDistanceBase(Base):
     @override
     def fit(self, links: LinkData) -> Twin:
         if np.isfinite(links.device_m).all():
-            return fit_known(links, LogDistance(), self._seed)
+            return fit_known(links, LogDistance, self._seed)
         assert self._scene is not None  # without one, links of unlocated devices are left out
         return fit_links(links, self._scene, LogDistance, self._seed)
 
@@ -73,7 +73,7 @@ class TwinBase(Base):
     def fit(self, links: LinkData) -> Twin:
         if links not in self._fitted:
             if self.scene is None:
-                self._fitted[links] = fit_known(links, SegmentedLogDistance(), self._seed)
+                self._fitted[links] = fit_known(links, SegmentedLogDistance, self._seed)
             else:
                 self._fitted[links] = fit_links(links, self.scene, SegmentedLogDistance, self._seed)
         return self._fitted[links]

@@ -1,11 +1,13 @@
 """Dependences of the residual: one permutation test for each variable."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 
 from radiotwin.inference.dependence import Series, holm, levels_of, permutation_p_value
 from radiotwin.links import LinkData, residual_variables
+from radiotwin.pieces import kept
 
 MAX_LINKS = 20_000  # more are thinned to whole series
 MAX_Z = 4.0  # an outlier counts as this many scales
@@ -40,6 +42,18 @@ def residual_dependences(links: LinkData, residual_db: np.ndarray, scale_db: np.
     Returns:
         the strongest first.
     """
+    inputs = links, residual_db, scale_db, mean_db, seed
+    return kept("dependences", inputs, lambda: _tested(*inputs),
+                lambda found: ({}, [asdict(each) for each in found]), _read)
+
+
+def _read(_: dict[str, np.ndarray], content: Any) -> list[ResidualDependence]:
+    return [ResidualDependence(str(each["variable"]), float(each["p_value"]),
+                               float(each["effect_db"])) for each in content]
+
+
+def _tested(links: LinkData, residual_db: np.ndarray, scale_db: np.ndarray, mean_db: np.ndarray,
+            seed: int) -> list[ResidualDependence]:
     rng = np.random.default_rng(seed)
     rows = np.flatnonzero(np.isfinite(residual_db))
     if len(rows) > MAX_LINKS:

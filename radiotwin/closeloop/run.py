@@ -23,13 +23,15 @@ from radiotwin.closeloop.cross_validation import (
 from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.residual_tests import ResidualDependence, residual_dependences
 from radiotwin.closeloop.selection import SelectionResult, add_shadowing, forward_selection
+from radiotwin.closeloop.thinning import thin_links
 from radiotwin.effects.params import Parameter
 from radiotwin.effects.registry import catalogue
 from radiotwin.effects.unexplained_trend import UnexplainedTrend
 from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import mean_if_detected
-from radiotwin.links import LinkData, prepare_links, residual_variables
+from radiotwin.links import LinkData, LinkGeometry, prepare_links, residual_variables
 from radiotwin.measurements import Measurements
+from radiotwin.pieces import kept
 from radiotwin.scene import Scene
 
 
@@ -39,7 +41,7 @@ class Loop:
 
     Attributes:
         base: name of the base.
-        links: that were used.
+        links: that were used: all, or a sample of very many.
         folds: how they were held out.
         before: the base alone.
         selection: base and effects.
@@ -124,7 +126,8 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         raise BadInput("base 'raytrace' follows paths over a 3D map; give --scene, or take the "
                        "base log-distance")
     criteria = criteria or SelectionCriteria()
-    links = prepare_links(measurements, scene)
+    all_links = prepare_links(measurements, scene)
+    links = thin_links(all_links, seed)
     folds = make_folds(links, seed, hold_out)
     names = [base]
     if base == "auto":
@@ -156,7 +159,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         add_shadowing(selection, seed)
     on_progress("other models")
     return Loop(best, links, folds, before, selection, dependences_before, dependences_after,
-                _baselines(before, criteria), _noise_floor_db(links, criteria))
+                _baselines(before, criteria), _noise_floor_db(all_links, criteria))
 
 
 def _dependences(model: CrossValidatedModel, seed: int) -> list[ResidualDependence]:
@@ -178,15 +181,28 @@ def _baselines(model: CrossValidatedModel, criteria: SelectionCriteria) -> dict[
         mean_db = np.full(len(model.links), np.nan)
         for number, fold in enumerate(model.folds):
             test, train, links = (model.index == number) & fold.usable, fold.train, fold.links
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of classes with few links
-                fitted = kind().fit(links.geometry.select(train), links.level_db[train],
-                                    links.limit_db, 0)
-            own_db, sd_db = fitted.predict(links.geometry.select(test))
+            own_db, sd_db = _learnt_and_predicted(
+                kind, links.geometry.select(train), links.level_db[train], links.limit_db,
+                links.geometry.select(test))
             mean_db[test] = own_db if links.limit_db is None else mean_if_detected(
                 own_db, sd_db, links.limit_db)
         result[kind.name] = mean_db
     return result
+
+
+def _learnt_and_predicted(kind: type[ChannelModel], train: LinkGeometry, level_db: np.ndarray,
+                          limit_db: float | None, test: LinkGeometry,
+                          ) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and standard deviation of n links by a model that is fitted to others [dB]."""
+    def predict() -> tuple[np.ndarray, np.ndarray]:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of classes with few links
+            fitted = kind().fit(train, level_db, limit_db, 0)
+        return fitted.predict(test)
+
+    return kept("baseline", (kind, train, level_db, limit_db, test), predict,
+                lambda found: ({"mean_db": found[0], "sd_db": found[1]}, None),
+                lambda arrays, _: (arrays["mean_db"], arrays["sd_db"]))
 
 
 def _noise_floor_db(links: LinkData, criteria: SelectionCriteria) -> float:

@@ -24,6 +24,9 @@ class LinkCache:
             known[key] = derive()
         return known[key]
 
+    def state(self) -> None:
+        """Decide nothing: what is remembered could be derived again."""
+
 
 def city_of(links: LinkData, effect: str) -> CityMap:
     """Return the 3D map that an effect needs.

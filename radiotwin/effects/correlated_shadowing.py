@@ -9,7 +9,7 @@ stand for.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from radiotwin.channel.residual_field import ResidualField
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.links import LinkData
+from radiotwin.pieces import kept
 
 NAME = "correlated_shadowing"
 MAX_Z = 6.0  # an outlier counts as this many scales
@@ -60,8 +61,10 @@ class CorrelatedShadowing:
         relative_sd = max(float(z.std()), 1e-6)
         shadowing = cls(ResidualField(), relative_sd, receivers_move(model.links))
         series, position_m, kind = shadowing._points(model.links.select(model.train))
-        shadowing.field.fit(series, position_m, (z - z.mean()) / relative_sd, seed, kind)
-        return shadowing
+        points = series, position_m, (z - z.mean()) / relative_sd, seed, kind
+        field = kept("shadowing", points, lambda: shadowing.field.fit(*points),
+                     ResidualField.state, ResidualField.from_state)
+        return replace(shadowing, field=field)
 
     def at(self, links: LinkData) -> tuple[np.ndarray, np.ndarray]:
         """Return what it adds (n,) [error scales], and the share (n,) left of the error scale."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -17,6 +18,7 @@ from radiotwin.effects.params import Variation
 from radiotwin.inference import censored_regression
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.links import LinkData
+from radiotwin.pieces import Piece, kept
 
 EVALUATIONS = 25  # of the objective for each number, in one descent
 DESCENTS = 2  # a simplex that has collapsed too early starts anew
@@ -41,6 +43,42 @@ def add_effect(model: FoldModel, effect: Effect, result: FitResult,
         the model with the effect, and its fit; None where nothing in the residual looks like the
         effect.
     """
+    def read(arrays: dict[str, np.ndarray], content: Any) -> tuple[FoldModel, FitResult] | None:
+        if content is None:
+            return None
+        before = [*model.effects, None]
+        effects = [_read_applied(model, each.effect if each else effect, each, params)
+                   for each, params in zip(before, content["params"], strict=True)]
+        fitted = FitResult(arrays["coefficients"], arrays["scale_db"], content["objective"])
+        return model.with_effects(effects), fitted
+
+    return kept("effect", (model, effect, result, like),
+                lambda: _best_addition(model, effect, result, like), _write_addition, read)
+
+
+def _write_addition(found: tuple[FoldModel, FitResult] | None) -> Piece | None:
+    """Return what `add_effect` found, without the terms; None if JSON cannot hold it."""
+    if found is None:
+        return {}, None
+    model, fitted = found
+    params = [each.params.model_dump(mode="json") for each in model.effects]
+    for each, written in zip(model.effects, params, strict=True):
+        if each.params.model_validate(json.loads(json.dumps(written))) != each.params:
+            return None
+    return ({"coefficients": fitted.coefficients, "scale_db": fitted.scale_db},
+            {"params": params, "objective": float(fitted.objective)})
+
+
+def _read_applied(model: FoldModel, effect: Effect, before: AppliedEffect | None,
+                  written: Any) -> AppliedEffect:
+    """Return an effect with its parameters; that of before where they are the same."""
+    params = effect.Params.model_validate(written)
+    same = before is not None and before.params == params
+    return before if before is not None and same else model.apply(effect, params)
+
+
+def _best_addition(model: FoldModel, effect: Effect, result: FitResult,
+                   like: Any) -> tuple[FoldModel, FitResult] | None:
     view = model.view(result)
     proposals = effect.propose(view) if like is None else effect.propose_like(view, like)
     applied = [model.apply(effect, params) for params in proposals]

@@ -9,7 +9,9 @@ the best of these and on the way down from there.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -20,7 +22,8 @@ from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.inference.censored_regression import CensoredRegression, FitResult
 from radiotwin.links import LinkData
-from radiotwin.localize.estimate import TwinDevice
+from radiotwin.localize.estimate import TwinDevice, read_device
+from radiotwin.pieces import Piece, kept_with_name
 from radiotwin.progress import progress
 from radiotwin.scene.citymap import CityMap
 
@@ -50,6 +53,7 @@ class Relocation:
             parts of the links use the same ones.
         positions: where each device was found before, which is worth trying with other links, too.
         powers: map -> position -> hash of the other end's position -> power.
+        history: hash of all searches so far, which decide what is remembered.
     """
 
     bounds: tuple[float, float, float, float]
@@ -58,6 +62,7 @@ class Relocation:
     positions: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
     powers: WeakKeyDictionary[CityMap, dict[tuple[float, ...], dict[int, float]]] = field(
         default_factory=WeakKeyDictionary)
+    history: str = ""
 
     def relocate(self, links: LinkData, devices: list[TwinDevice],
                  channel: ImagePaths) -> list[TwinDevice]:
@@ -89,9 +94,30 @@ class Relocation:
                     by_law, by_paths = (_Likelihood(model, fit, rows, number)
                                         for model, fit in zip(models, fits, strict=True))
                     before = self.positions.setdefault(device.device, [])
-                    found[number] = _Search(by_law, by_paths, self).from_law(device, before)
+                    found[number] = self._search(_Search(by_law, by_paths, self), device, before)
                     before.append((found[number].x_m, found[number].y_m))
                 advance()
+        return found
+
+    def _search(self, search: _Search, device: TwinDevice,
+                before: list[tuple[float, float]]) -> TwinDevice:
+        """Return a device where paths put it, and remember what was followed for that."""
+        city = search.by_law.model.links.city
+        assert city is not None
+        followed = self.powers.setdefault(city, {})
+        known = {position_m: len(powers) for position_m, powers in followed.items()}
+
+        def write(found: TwinDevice) -> Piece:
+            return _followed_since(known, followed), asdict(found)
+
+        def read(arrays: dict[str, np.ndarray], content: Any) -> TwinDevice:
+            found = read_device(content)
+            _add_followed(arrays, followed)
+            return found
+
+        inputs = self.history, self.bounds, search.by_law, search.by_paths, device, before
+        found, self.history = kept_with_name(
+            "position", inputs, partial(search.from_law, device, before), write, read)
         return found
 
     def _rows(self, links: LinkData, device: int) -> np.ndarray:
@@ -287,6 +313,31 @@ class _Search:
         order = np.argsort(from_best_m)
         held = np.searchsorted(np.cumsum(share[order]) / share.sum(), CREDIBLE)
         return float(from_best_m[order][min(held, len(order) - 1)] + STEPS_M[-1])
+
+
+def _followed_since(known: dict[tuple[float, ...], int],
+                    followed: dict[tuple[float, ...], dict[int, float]]) -> dict[str, np.ndarray]:
+    """Return positions (p, 3), numbers (p,) of ends, and hashes and powers of those, new ones."""
+    new = {position_m: list(powers.items())[known.get(position_m, 0):]
+           for position_m, powers in followed.items() if len(powers) > known.get(position_m, 0)}
+    ends = [end for powers in new.values() for end in powers]
+    return {"position_m": np.array(list(new)).reshape(-1, 3),
+            "count": np.array([len(powers) for powers in new.values()], dtype=int),
+            "hash": np.array([key for key, _ in ends], dtype=np.uint64),
+            "power": np.array([power for _, power in ends], dtype=float)}
+
+
+def _add_followed(arrays: dict[str, np.ndarray],
+                  followed: dict[tuple[float, ...], dict[int, float]]) -> None:
+    """Add what `_followed_since` returned."""
+    ends = list(zip(arrays["hash"].tolist(), arrays["power"].tolist(), strict=True))
+    if arrays["count"].sum() != len(ends):
+        raise ValueError("other counts")
+    last = np.cumsum(arrays["count"]).tolist()
+    for position_m, end, count in zip(arrays["position_m"].tolist(), last,
+                                      arrays["count"].tolist(), strict=True):
+        if count:
+            followed.setdefault(tuple(position_m), {}).update(ends[end - count:end])
 
 
 def _apart(positions_m: np.ndarray, apart_m: float, maximum: int) -> list[np.ndarray]:

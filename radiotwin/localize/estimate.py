@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from radiotwin.localize.likelihood import CHUNK_LINKS
 
@@ -57,6 +58,12 @@ class TwinDevice:
     def anchor(cls, device: str, x_m: float, y_m: float, z_m: float) -> TwinDevice:
         """Return a device of declared position [m]."""
         return cls(device, float(x_m), float(y_m), float(z_m), "anchor", True, 0.0, None)
+
+
+def read_device(content: dict[str, Any]) -> TwinDevice:
+    """Return the device whose attributes JSON has held."""
+    mode = content["second_mode"]
+    return TwinDevice(**content | {"second_mode": None if mode is None else (*mode,)})
 
 
 @dataclass(frozen=True)

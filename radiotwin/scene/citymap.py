@@ -40,6 +40,8 @@ class CityMap:
         faces: (f, 3) indices of vertices, counter-clockwise seen from outside.
     """
 
+    never_changes = True
+
     def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
         self.vertices = np.asarray(vertices, dtype=float)
         self.faces = np.asarray(faces, dtype=int)
@@ -64,6 +66,10 @@ class CityMap:
         starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
         return cls(np.concatenate([mesh.vertices for mesh in meshes]),
                    np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts)]))
+
+    def state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return all that decides the answers of a map."""
+        return self.vertices, self.faces
 
     def line_of_sight(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
         """Return whether no surface lies between points.

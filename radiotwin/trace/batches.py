@@ -11,6 +11,7 @@ import numpy as np
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 from radiotwin.inputs import read_bytes
+from radiotwin.interruption import note_finished
 
 
 class BatchStore:
@@ -50,7 +51,10 @@ class BatchStore:
         if len(data) < 8 * size:
             return None
         array = np.frombuffer(data[len(data) - 8 * size:], dtype=float)
-        return array if data == _file_content(array) else None
+        if data != _file_content(array):
+            return None
+        note_finished()
+        return array
 
     def put(self, name: str, array: np.ndarray) -> None:
         """Save an array, completely or not at all.
@@ -61,6 +65,7 @@ class BatchStore:
         """
         with atomic_path(self.folder / f"{name}.npy") as temporary:
             temporary.write_bytes(_file_content(array))
+        note_finished()
 
 
 def _file_content(array: np.ndarray) -> bytes:

@@ -1,6 +1,8 @@
 """Gains at any points in space."""
 
+from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -12,17 +14,20 @@ from radiotwin.cells import read_cells, write_csv
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path, require_writable
 from radiotwin.geodesy import to_local
+from radiotwin.pieces import kept
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
 from radiotwin.tables import MAX_COORDINATE_M, Origin
 from radiotwin.trace.run import device_indices
 from radiotwin.trace.settings import SolverSettings
-from radiotwin.trace.solver import PathGains
+from radiotwin.trace.solver import Antennas, PathGains
 
 
 def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settings: SolverSettings,
                 antennas: list[Antenna | None] | None = None) -> np.ndarray:
     """Trace the gains between positions; receivers have the antenna of the scene's UAVs.
+
+    Within `keep_pieces` each finished batch is kept.
 
     Args:
         scene: City and frequency.
@@ -41,12 +46,42 @@ def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settin
     if settings.solver != "paths":
         raise BadInput(f"the solver {settings.solver!r} averages over lattice cells; points need "
                        "the solver 'paths'")
-    solver = PathGains(scene.xml_path, scene.config.radio.frequency_hz, settings)
     gain_db = np.full((len(device_m), len(points_m)), np.nan)
+    step = settings.batch_receivers
+    parts = [slice(start, start + step) for start in range(0, len(points_m), step)]
+    decided_by = scene.content_hash(), settings.attributes()
+    solver = _LateSolver(scene, settings)
     with progress("tracing", total=gain_db.size) as advance:
         for row, (one_m, antenna) in enumerate(zip(device_m, antennas or [None] * len(device_m))):
-            gain_db[row] = solver.gains(one_m, points_m, (antenna, scene.uav_antenna), advance)
+            ends = antenna, scene.uav_antenna
+            for part in parts:
+                batch_m = points_m[part]
+                gain_db[row, part] = kept(
+                    "gains", (*decided_by, one_m, batch_m, ends),
+                    partial(solver.solve, one_m, batch_m, ends),
+                    lambda found: ({"gain_db": found}, len(found)), _read_gains)
+                advance(len(batch_m))
     return gain_db
+
+
+def _read_gains(arrays: dict[str, np.ndarray], count: Any) -> np.ndarray:
+    return arrays["gain_db"].reshape(count)
+
+
+class _LateSolver:
+    """A solver that is made when it is first needed: that takes seconds."""
+
+    def __init__(self, scene: Scene, settings: SolverSettings) -> None:
+        self._scene, self._settings = scene, settings
+
+    @cached_property
+    def _solver(self) -> PathGains:
+        return PathGains(self._scene.xml_path, self._scene.config.radio.frequency_hz,
+                         self._settings)
+
+    def solve(self, device_m: np.ndarray, points_m: np.ndarray, ends: Antennas) -> np.ndarray:
+        """Return the gains (n,) from a device to points (n, 3) [dB]."""
+        return self._solver.solve(device_m, points_m, ends)
 
 
 def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings,

@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 
 import radiotwin
-from radiotwin.channel import ChannelModel, channel_named, check_fit_data
+from radiotwin.channel import ChannelModel, channel_named, check_fit_data, fit_once
 from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkData, join_links, link_geometry, prepare_links
-from radiotwin.localize import LocalizeSettings, Relocation, TwinDevice, localize
+from radiotwin.localize import (
+    DeviceEstimate,
+    LocalizeSettings,
+    Relocation,
+    TwinDevice,
+    localize,
+    read_device,
+)
 from radiotwin.localize.along_paths import MAX_DEVICES
 from radiotwin.measurements import MAX_APART_M, Measurements
+from radiotwin.pieces import kept
 from radiotwin.scene import Scene
 from radiotwin.twin.twin import Twin
 
@@ -96,7 +104,7 @@ def fit_links(links: LinkData, scene: Scene, channel: type[ChannelModel], seed: 
     _check_limit(links)
     is_anchor = np.isin(np.arange(len(links.device_m)), sorted(links.anchors))
     anchors_m = np.where(is_anchor[:, None], links.device_m, np.nan)
-    fitted = _fit_channel(links, anchors_m, channel(), seed)
+    fitted = _fit_channel(links, anchors_m, channel, seed)
     devices: list[Any] = [TwinDevice.anchor(name, *position_m) if anchor else None
                           for name, position_m, anchor in
                           zip(links.device_names, links.device_m, is_anchor, strict=True)]
@@ -104,15 +112,13 @@ def fit_links(links: LinkData, scene: Scene, channel: type[ChannelModel], seed: 
     if len(unknown):
         found = _locate(links, scene, fitted.trend, unknown, seed, start, settings)
         for index, each in zip(unknown, found, strict=True):
-            devices[index] = TwinDevice(
-                links.device_names[index], each.x_m, each.y_m, each.z_m, "unknown", each.located,
-                each.credible_radius_m, each.second_mode)
+            devices[index] = each
     if fitted.trend is not fitted:
-        fitted = _fit_channel(links, reliable_m(devices), channel(), seed)
+        fitted = _fit_channel(links, reliable_m(devices), channel, seed)
     return Twin(fitted, devices, _level(links), links.limit_db, _provenance(links, scene))
 
 
-def fit_known(links: LinkData, channel: ChannelModel, seed: int) -> Twin:
+def fit_known(links: LinkData, channel: type[ChannelModel], seed: int) -> Twin:
     """Learn a channel from links whose devices all have declared positions; no scene is needed.
 
     Raises:
@@ -121,10 +127,10 @@ def fit_known(links: LinkData, channel: ChannelModel, seed: int) -> Twin:
     geometry = links.geometry
     check_fit_data(geometry, links.level_db,
                    needs_los=channel.uses_map and links.city is not None)
-    channel.fit(geometry, links.level_db, links.limit_db, seed)
+    fitted = fit_once(channel, geometry, links.level_db, links.limit_db, seed)
     devices = [TwinDevice.anchor(name, *position_m)
                for name, position_m in zip(links.device_names, links.device_m, strict=True)]
-    return Twin(channel, devices, _level(links), links.limit_db, _provenance(links, None))
+    return Twin(fitted, devices, _level(links), links.limit_db, _provenance(links, None))
 
 
 def fit_paths(links: LinkData, scene: Scene, law: Twin, relocation: Relocation) -> Twin:
@@ -231,7 +237,7 @@ def _image_paths(links: LinkData, law: Twin, device_m: np.ndarray) -> ImagePaths
     return channel.fit_diffuse(located.geometry, located.level_db, links.limit_db)
 
 
-def _fit_channel(links: LinkData, device_m: np.ndarray, channel: ChannelModel,
+def _fit_channel(links: LinkData, device_m: np.ndarray, channel: type[ChannelModel],
                  seed: int) -> ChannelModel:
     """Fit to the links of all devices whose position in `device_m` (k, 3) is known."""
     if not links.anchors:
@@ -244,20 +250,32 @@ def _fit_channel(links: LinkData, device_m: np.ndarray, channel: ChannelModel,
                        "fly nearer to them")
     geometry = link_geometry(device_m, links.receiver_m[known], links.device[known], links.city)
     check_fit_data(geometry, links.level_db[known], needs_los=channel.uses_map)
-    return channel.fit(geometry, links.level_db[known], links.limit_db, seed)
+    return fit_once(channel, geometry, links.level_db[known], links.limit_db, seed)
 
 
 def _locate(links: LinkData, scene: Scene, channel: ChannelModel, unknown: np.ndarray, seed: int,
-            start: Twin | None, settings: LocalizeSettings | None) -> list[Any]:
+            start: Twin | None, settings: LocalizeSettings | None) -> list[TwinDevice]:
     start_m = None
     if start is not None:
         before = {device.device: (device.x_m, device.y_m) for device in start.devices}
         start_m = np.array([before.get(links.device_names[i], (np.nan, np.nan)) for i in unknown])
     rows = np.isin(links.device, unknown)
-    return localize(
-        links.receiver_m[rows], links.device[rows], links.level_db[rows], channel, devices=unknown,
-        bounds=scene.config.extent.bounds, z_m=links.device_m[unknown, 2], city=scene.city,
-        limit_db=links.limit_db, seed=seed, start_m=start_m, settings=settings)
+    measured = links.receiver_m[rows], links.device[rows], links.level_db[rows], channel
+    options: dict[str, Any] = {
+        "devices": unknown, "bounds": scene.config.extent.bounds, "city": scene.city,
+        "z_m": links.device_m[unknown, 2], "limit_db": links.limit_db, "seed": seed,
+        "start_m": start_m, "settings": settings}
+    names = [links.device_names[index] for index in unknown]
+    return kept("positions", (*measured, options, names),
+                lambda: [_device(name, each) for name, each in
+                         zip(names, localize(*measured, **options), strict=True)],
+                lambda found: ({}, [asdict(each) for each in found]),
+                lambda _, content: [read_device(each) for each in content])
+
+
+def _device(name: str, found: DeviceEstimate) -> TwinDevice:
+    return TwinDevice(name, found.x_m, found.y_m, found.z_m, "unknown", bool(found.located),
+                      float(found.credible_radius_m), found.second_mode)
 
 
 def _thinned(measurements: Measurements, seed: int) -> Measurements:

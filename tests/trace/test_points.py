@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from radiotwin import pieces
 from radiotwin.errors import BadInput
 from radiotwin.tables import Origin
 from radiotwin.trace import SolverSettings, read_points, trace_gains, trace_points
@@ -115,3 +116,35 @@ def test_links_have_a_budget(small_scene, law, monkeypatch):
     with pytest.raises(BadInput, match="points times devices: 6 rows; at most 5"):
         trace_points(small_scene, np.ones((3, 3)), SETTINGS, devices=["d0", "d1"])
     assert law.calls == 0
+def test_killed_gains_go_on_after_the_last_batch(small_scene, law, tmp_path, monkeypatch):
+    monkeypatch.setattr(pieces, "MIN_SECONDS", 0.0)
+    points_m = small_scene.lattice.positions_m[:30]
+    trace_points(small_scene, points_m, SETTINGS, tmp_path / "whole.csv", ["d0", "d3"])
+    total, solve = law.calls, law.solve
+
+    def killed(self, *args):
+        if law.calls == 5:
+            raise KeyboardInterrupt
+        return solve(self, *args)
+
+    law.calls, law.solve = 0, killed
+    with pieces.keep_pieces(), pytest.raises(KeyboardInterrupt):
+        trace_points(small_scene, points_m, SETTINGS, tmp_path / "killed.csv", ["d0", "d3"])
+    assert not (tmp_path / "killed.csv").exists()
+    law.calls, law.solve = 0, solve
+    with pieces.keep_pieces() as store:
+        trace_points(small_scene, points_m, SETTINGS, tmp_path / "killed.csv", ["d0", "d3"])
+    assert law.calls == total - 5 and store.earlier == 5
+    assert (tmp_path / "killed.csv").read_bytes() == (tmp_path / "whole.csv").read_bytes()
+
+
+def test_gains_of_another_scene_or_other_rays_are_others(own_scene, law, monkeypatch):
+    monkeypatch.setattr(pieces, "MIN_SECONDS", 0.0)
+    points_m, device_m = own_scene.lattice.positions_m[:4], own_scene.device_m[:1]
+    mesh = next(own_scene.folder.glob("meshes/*"))
+    with pieces.keep_pieces() as store:
+        trace_gains(own_scene, device_m, points_m, SETTINGS)
+        trace_gains(own_scene, device_m, points_m, SolverSettings(batch_receivers=4, seed=7))
+        mesh.write_bytes(mesh.read_bytes() + b"\n")
+        trace_gains(own_scene, device_m, points_m, SETTINGS)
+    assert store.made == 3

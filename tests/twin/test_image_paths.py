@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from radiotwin import pieces
 from radiotwin.compare import predict
 from radiotwin.errors import BadInput
 from radiotwin.localize import Relocation
@@ -86,3 +87,27 @@ def test_what_was_not_heard_is_not_invented(narrow_street):
     assert los_db == nlos_db == pytest.approx(6.0, abs=0.6)
     device = next(each for each in twin.devices if each.device == name)
     assert not device.located or device.credible_radius_m > 15
+
+
+@pytest.mark.slow
+def test_a_killed_fit_goes_on_and_ends_equal_to_the_bit(narrow_street, tmp_path, monkeypatch):
+    monkeypatch.setattr(pieces, "MIN_SECONDS", 0.0)
+    put = pieces.PieceStore.put
+
+    def files(folder):
+        fit_twin(narrow_street.measured, narrow_street.scene, model="raytrace", seed=0).save(folder)
+        return [(folder / name).read_bytes() for name in ("twin.json", "channel.safetensors")]
+
+    def killed(self, name, *args):
+        put(self, name, *args)
+        if name.startswith("position-"):
+            raise KeyboardInterrupt
+
+    whole = files(tmp_path / "whole")
+    with monkeypatch.context() as patched, pieces.keep_pieces() as store, pytest.raises(KeyboardInterrupt):
+        patched.setattr(pieces.PieceStore, "put", killed)
+        files(tmp_path / "killed")
+    monkeypatch.setattr(Relocation, "follow", lambda *_: pytest.fail("searched for again"))
+    with pieces.keep_pieces() as again:
+        assert files(tmp_path / "resumed") == whole
+    assert again.earlier == store.saved >= 3

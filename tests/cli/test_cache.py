@@ -1,0 +1,79 @@
+"""What the command line keeps of a run, shows and removes, and what it says after Ctrl-C."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from radiotwin.pieces import PieceStore, pieces_folder
+from radiotwin.survey import fly_survey, segmented_truth
+
+MAIN = "from radiotwin.cli import main; main()"
+
+
+@pytest.fixture
+def parts():
+    """A store of three parts."""
+    store = PieceStore(pieces_folder())
+    for name in ("channel-1", "channel-2", "position-1"):
+        store.put(name, ({"value": np.zeros(1000)}, None), [])
+    return store
+
+
+def test_it_shows_folder_size_and_kinds(parts, run, tmp_path):
+    shown = json.loads(run("cache --json", tmp_path).stdout)["cache"]
+    assert shown["folder"] == str(parts.folder) and shown["parts"] == {"channel": 2, "position": 1}
+    assert 24_000 < shown["bytes"] < shown["limit_bytes"] == 2 * 2**30
+    text = run("cache", tmp_path).stdout
+    assert str(parts.folder) in text.replace("\n", "") and "position" in text
+
+
+def test_it_removes_parts_and_nothing_else(parts, run, tmp_path):
+    other = parts.folder / "notes.txt"
+    other.write_text("mine")
+    assert "removed 3 parts" in run("cache --clear", tmp_path).stdout
+    assert not parts.files() and other.read_text() == "mine"
+    assert "removed 0 parts" in run("cache --clear", tmp_path).stdout
+
+
+def test_without_a_cache_it_is_empty(run, own_cache, tmp_path):
+    assert json.loads(run("cache --json", tmp_path).stdout)["cache"]["bytes"] == 0
+    assert not own_cache.exists()
+
+
+@pytest.fixture
+def flown(small_scene, tmp_path):
+    fly_survey(small_scene, segmented_truth(small_scene), flights=2, pattern="random-waypoint", seed=0,
+               noise_db=0.0).write(tmp_path / "m.csv")
+    return tmp_path / "m.csv"
+
+
+def test_the_next_run_says_what_it_took_and_writes_the_same(small_scene, flown, tmp_path, own_cache):
+    command = [sys.executable, "-c", MAIN, "fit", str(flown), "--scene", str(small_scene.folder), "-o"]
+    subprocess.run([*command, "whole"], cwd=tmp_path, check=True, capture_output=True)
+    kept = sorted(own_cache.glob("pieces/*.npz"))
+    assert kept
+    again = subprocess.run([*command, "again"], cwd=tmp_path, check=True, capture_output=True, text=True)
+    assert f"{len(kept)} of " in again.stderr and "parts were kept from an earlier run" in again.stderr
+    for name in ("twin.json", "channel.safetensors"):
+        assert (tmp_path / "again" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    assert again.stdout.replace("again", "whole") == subprocess.run(
+        [*command, "whole"], cwd=tmp_path, check=True, capture_output=True, text=True).stdout
+
+
+def test_ctrl_c_in_what_keeps_nothing_says_so():
+    text = ("import radiotwin.cli.tools as tools, radiotwin.doctor, time;"
+            "radiotwin.doctor.print_diagnosis = lambda *_: (print('ready', flush=True), time.sleep(60));" + MAIN)
+    child = subprocess.Popen([sys.executable, "-c", text, "doctor"], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+                             text=True, env=os.environ)
+    assert child.stdout is not None and child.stdout.readline() == "ready\n"
+    time.sleep(0.1)
+    child.send_signal(signal.SIGINT)
+    _, message = child.communicate()
+    assert child.returncode == 130
+    assert message.strip() == "radiotwin: interrupted; nothing is kept; run the same command again"

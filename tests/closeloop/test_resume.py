@@ -1,0 +1,105 @@
+"""A loop that was killed goes on with the parts that it had finished, and ends with the same bytes."""
+
+import json
+
+import numpy as np
+import pytest
+
+from radiotwin import pieces
+from radiotwin.closeloop.result_file import make_report
+from radiotwin.closeloop.run import close_loop
+from radiotwin.effects import fitting
+from radiotwin.pieces import PieceStore, keep_pieces
+
+
+class Killed(BaseException):
+    """Stands in for SIGKILL: no handler of errors sees it."""
+
+
+@pytest.fixture
+def kill_after(monkeypatch):
+    """Return a function: kill the process, as it were, after so many parts."""
+    monkeypatch.setattr(pieces, "MIN_SECONDS", 0.0)
+    put = PieceStore.put
+
+    def after(count):
+        def put_some(self, *args):
+            if self.saved >= count:
+                raise Killed
+            put(self, *args)
+        monkeypatch.setattr(PieceStore, "put", put_some)
+    return after
+
+
+@pytest.fixture
+def searches(monkeypatch):
+    """Count the searches for an effect's parameters."""
+    found, search = [], fitting._best_addition
+    monkeypatch.setattr(fitting, "_best_addition", lambda *args: found.append(args[1].name) or search(*args))
+    return found
+
+
+@pytest.fixture
+def measured(open_ground):
+    world = open_ground.fly(2)
+    world.gain_db[world.receiver == 1] += 5.0
+    world.gain_db[(world.receiver == 0) & (world.time_s > 530)] -= 6.0
+    every = open_ground.measured(world)
+    return every.select(every.table["device"].isin(every.devices["device"][:3]).to_numpy())
+
+
+def everything(measured, scene=None, base="log-distance"):
+    loop = close_loop(measured, scene, base)
+    return json.dumps(make_report(loop), sort_keys=True), loop.after.held_out_mean_db.tobytes(), \
+        loop.before.held_out_mean_db.tobytes()
+
+
+def test_a_killed_loop_goes_on_and_ends_equal_to_the_bit(measured, kill_after, searches):
+    whole = everything(measured)
+    total = len(searches)
+    searches.clear()
+    kill_after(30)
+    with keep_pieces(), pytest.raises(Killed):
+        everything(measured)
+    before = len(searches)
+    searches.clear()
+    kill_after(np.inf)
+    with keep_pieces() as store:
+        assert everything(measured) == whole
+    assert 0 < before < total and len(searches) <= total - before + 1
+    assert store.earlier == 30
+    for number, (_, _, path) in enumerate(sorted(store.files())):
+        if number % 4 == 0:  # damaged
+            path.write_bytes(path.read_bytes()[:-number - 1])
+    with keep_pieces() as store:
+        assert everything(measured) == whole
+    assert store.made and store.earlier
+
+
+def test_other_data_or_another_seed_take_nothing(measured, kill_after):
+    kill_after(5)
+    with keep_pieces(), pytest.raises(Killed):
+        close_loop(measured, base="log-distance")
+    changed = measured.table.copy()
+    changed.loc[0, "gain_db"] += 0.25
+    kill_after(0)
+    for others in ({"measurements": type(measured)(changed, measured.devices)}, {"measurements": measured, "seed": 1}):
+        with keep_pieces() as store, pytest.raises(Killed):
+            close_loop(**others, base="log-distance")
+        assert store.earlier == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", ["nothing", "foliage"])
+def test_a_killed_loop_over_a_city_ends_equal_to_the_bit(family, kill_after):
+    from tests.undeclared.cases import case
+
+    given = case(family, 1)
+    whole = everything(given.measurements, given.scene, "auto")
+    for count in (3, 20, 60, np.inf):
+        kill_after(count)
+        with keep_pieces():
+            try:
+                assert everything(given.measurements, given.scene, "auto") == whole
+            except Killed:
+                continue
