@@ -19,11 +19,13 @@ class Budget:
         name: of the environment variable that changes it, without `RADIOTWIN_MAX_`.
         default: limit where that variable is not set.
         unit: plural noun, for the message.
+        of: has so many of it, for the table in SECURITY.md.
     """
 
     name: str
     default: int
     unit: str
+    of: str
 
     @property
     def variable(self) -> str:
@@ -73,43 +75,54 @@ class Budget:
                        f"be so large, set {self.variable} to a larger number")
 
 
-FILE_BYTES = Budget("FILE_BYTES", 2 * 2**30, "bytes")  # after decompression
-DOCUMENT_BYTES = Budget("DOCUMENT_BYTES", 128 * 2**20, "bytes")  # JSON: tenfold in memory
-RECORD_BYTES = Budget("RECORD_BYTES", 32 * 2**20, "bytes")  # JSON of a run that a page shows
-ENTRIES = Budget("ENTRIES", 100_000, "entries")  # of one list or object in it
-SETTINGS_BYTES = Budget("SETTINGS_BYTES", 4 * 2**20, "bytes")  # TOML
-NESTING = Budget("NESTING", 100, "levels of nesting")
-ROWS = Budget("ROWS", 50_000_000, "rows")
-ROW_BYTES = Budget("ROW_BYTES", 16 * 2**20, "bytes in one row")  # of a CSV file
-COLUMNS = Budget("COLUMNS", 5_000, "columns")
-CELLS = Budget("CELLS", 1_000_000_000, "cells")  # rows times columns of a table
-MAP_VALUES = Budget("MAP_VALUES", 500_000_000, "values")  # of one variable of a radio map
-VERTICES = Budget("VERTICES", 20_000_000, "vertices")  # of a city, as is the next
-FACES = Budget("FACES", 40_000_000, "faces")
-SHAPES = Budget("SHAPES", 200_000, "shapes")
-DEVICES = Budget("DEVICES", 100_000, "devices")
-PAGE_VALUES = Budget("PAGE_VALUES", 1_000_000_000, "values")  # of all maps that a page is made of
-PAGE_MAPS = Budget("PAGE_MAPS", 200, "radio maps")
-PICTURE_BYTES = Budget("PICTURE_BYTES", 8 * 2**20, "bytes")  # a figure inside a page
-PICTURE_PIXELS = Budget("PICTURE_PIXELS", 50_000_000, "pixels")
-UAVS = Budget("UAVS", 10_000, "UAVs")
-POSITIONS = Budget("POSITIONS", 100_000_000, "positions")  # of a lattice
-ELEMENTS = Budget("ELEMENTS", 2_000_000, "XML elements")  # of a city
-TAG_BYTES = Budget("TAG_BYTES", 8 * 2**20, "bytes in one tag")  # of XML
-FILES = Budget("FILES", 1_000, "files that include each other")  # of a Mitsuba file
-SEARCH_FOLDERS = Budget("SEARCH_FOLDERS", 100, "folders to search")  # of a Mitsuba file
-CORNERS = Budget("CORNERS", 10_000, "corners in one face")  # cutting it takes their square
-FIELD_PAIRS = Budget("FIELD_PAIRS", 200_000_000, "pairs of points")  # 8 bytes each
-TRAINING_BYTES = Budget("TRAINING_BYTES", 64 * 2**30, "bytes of memory")  # of a learner
-CHECKPOINT_BYTES = Budget("CHECKPOINT_BYTES", 64 * 2**30, "bytes")
-MAP_AXIS = Budget("MAP_AXIS", 20_000_000, "coordinates")  # of one axis of a radio map
-MAP_CHUNKS = Budget("MAP_CHUNKS", 1_000_000, "pieces")  # that HDF5 stores a variable in
-MAP_ATTRIBUTES = Budget("MAP_ATTRIBUTES", 1_000, "attributes")  # of one variable
-MAP_PICTURES = Budget("MAP_PICTURES", 2_000, "pictures")  # in one file
-FEATURES = Budget("FEATURES", 5_000_000, "buildings")  # of a map file, before it is cut to a box
-OUTLINE_CORNERS = Budget("OUTLINE_CORNERS", 20_000, "corners")  # of one building of a map
-CROSSINGS = Budget("CROSSINGS", 20_000, "crossings of outlines with themselves")  # of a map
-OVERLAPS = Budget("OVERLAPS", 200_000, "pairs of buildings that overlap")  # of a map
-TOUCHING_PAIRS = Budget("TOUCHING_PAIRS", 2_000_000, "pairs of buildings that touch")  # of a map
-PIECE_BYTES = Budget("PIECE_BYTES", 256 * 2**20, "bytes")  # of one finished part in the cache
-CACHE_BYTES = Budget("CACHE_BYTES", 2 * 2**30, "bytes")  # of all; the oldest are removed
+# Files
+FILE_BYTES = Budget("FILE_BYTES", 2 * 2**30, "bytes", "any file, after decompression")
+DOCUMENT_BYTES = Budget("DOCUMENT_BYTES", 128 * 2**20, "bytes",
+                        "a JSON document, which is tenfold in memory")
+RECORD_BYTES = Budget("RECORD_BYTES", 32 * 2**20, "bytes",
+                      "a JSON record of a run that a page shows")
+ENTRIES = Budget("ENTRIES", 100_000, "entries", "one list or object in such a record")
+SETTINGS_BYTES = Budget("SETTINGS_BYTES", 4 * 2**20, "bytes", "a TOML file")
+NESTING = Budget("NESTING", 100, "levels of nesting", "JSON, TOML and XML")
+# Tables
+ROWS = Budget("ROWS", 50_000_000, "rows", "a table")
+ROW_BYTES = Budget("ROW_BYTES", 16 * 2**20, "bytes in one row", "a CSV file")
+COLUMNS = Budget("COLUMNS", 5_000, "columns", "a table")
+CELLS = Budget("CELLS", 1_000_000_000, "cells", "a table: rows times columns")
+# Cities
+DEVICES = Budget("DEVICES", 100_000, "devices", "a scene, or a table of devices")
+UAVS = Budget("UAVS", 10_000, "UAVs", "a scene")
+POSITIONS = Budget("POSITIONS", 100_000_000, "positions", "a lattice")
+SHAPES = Budget("SHAPES", 200_000, "shapes", "a city")
+VERTICES = Budget("VERTICES", 20_000_000, "vertices", "a city")
+FACES = Budget("FACES", 40_000_000, "faces", "a city")
+CORNERS = Budget("CORNERS", 10_000, "corners in one face", "a mesh; cutting it takes their square")
+ELEMENTS = Budget("ELEMENTS", 2_000_000, "XML elements", "a city")
+TAG_BYTES = Budget("TAG_BYTES", 8 * 2**20, "bytes in one tag", "an XML file")
+FILES = Budget("FILES", 1_000, "files that include each other", "a Mitsuba file")
+SEARCH_FOLDERS = Budget("SEARCH_FOLDERS", 100, "folders to search", "a Mitsuba file")
+FEATURES = Budget("FEATURES", 5_000_000, "buildings", "a map file, before it is cut to a box")
+OUTLINE_CORNERS = Budget("OUTLINE_CORNERS", 20_000, "corners", "one building of a map")
+CROSSINGS = Budget("CROSSINGS", 20_000, "crossings of outlines with themselves", "a map")
+OVERLAPS = Budget("OVERLAPS", 200_000, "pairs of buildings that overlap", "a map")
+TOUCHING_PAIRS = Budget("TOUCHING_PAIRS", 2_000_000, "pairs of buildings that touch", "a map")
+# Radio maps
+MAP_VALUES = Budget("MAP_VALUES", 500_000_000, "values", "one variable of a radio map")
+MAP_AXIS = Budget("MAP_AXIS", 20_000_000, "coordinates", "one axis of a radio map")
+MAP_CHUNKS = Budget("MAP_CHUNKS", 1_000_000, "pieces", "a variable as HDF5 stores it")
+MAP_ATTRIBUTES = Budget("MAP_ATTRIBUTES", 1_000, "attributes", "one variable")
+MAP_PICTURES = Budget("MAP_PICTURES", 2_000, "pictures", "a KMZ file")
+# Pages
+PAGE_VALUES = Budget("PAGE_VALUES", 1_000_000_000, "values", "all radio maps of a page")
+PAGE_MAPS = Budget("PAGE_MAPS", 200, "radio maps", "a page")
+PICTURE_BYTES = Budget("PICTURE_BYTES", 8 * 2**20, "bytes", "a figure in a page")
+PICTURE_PIXELS = Budget("PICTURE_PIXELS", 50_000_000, "pixels", "a figure in a page")
+# Twins and learners
+FIELD_PAIRS = Budget("FIELD_PAIRS", 200_000_000, "pairs of points",
+                     "a residual field: 8 bytes each")
+TRAINING_BYTES = Budget("TRAINING_BYTES", 64 * 2**30, "bytes of memory", "a learner")
+CHECKPOINT_BYTES = Budget("CHECKPOINT_BYTES", 64 * 2**30, "bytes", "a checkpoint")
+# Cache
+PIECE_BYTES = Budget("PIECE_BYTES", 256 * 2**20, "bytes", "one finished part")
+CACHE_BYTES = Budget("CACHE_BYTES", 2 * 2**30, "bytes",
+                     "all finished parts; the oldest are removed")
