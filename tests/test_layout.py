@@ -29,8 +29,8 @@ LAYERS = (
     {"scene"},
     {"antennas", "measurements", "command", "doctor", "exits"},
     {"array_file", "geodesy", "llvm", "safe_xml", "cells", "progress", "published", "records", "hdf5"},
-    {"console"},
-    {"files", "inputs", "plugins", "tables"},
+    {"console", "csv_layout"},
+    {"files", "inputs", "plugins", "spreadsheet", "tables"},
     {"budgets"},
     {"errors", "signals"},
 )
