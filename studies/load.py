@@ -181,10 +181,12 @@ def load_table(rows: pd.DataFrame) -> str:
     """Return time and memory of each command, and their ratios to those of the smallest size."""
     lines: list[list[str]] = []
     first: dict[tuple, dict[str, float]] = {}
-    for row in rows.sort_values(["part", "size"]).to_dict("records"):
-        for name, cost in row["commands"].items():
-            least = first.setdefault((row["part"], name), cost)
-            lines.append([row["part"], f"{row['size']:,}", name, f"{cost['wall_s']:.1f}",
+    for part, size, commands in sorted(
+            (settings["part"], settings["size"], commands)
+            for settings, commands in zip(rows["settings"], rows["commands"])):
+        for name, cost in commands.items():
+            least = first.setdefault((part, name), cost)
+            lines.append([part, f"{size:,}", name, f"{cost['wall_s']:.1f}",
                           f"{cost['wall_s'] / least['wall_s']:.1f}", f"{cost['peak_mib']:,.0f}",
                           f"{cost['peak_mib'] / least['peak_mib']:.2f}"])
     return markdown(["part", "size", "command", "wall [s]", "ratio", "peak memory [MiB]", "ratio"],

@@ -1,7 +1,8 @@
 """What strangers sent to 0.1, through the real command line: one message, and nothing read, run, written or fetched.
 
 Each command runs in a forked child with 20 seconds and 2 GiB, and only the command's own words and files are judged, so
-that the whole file runs on older code, too: at commit 0f68f2a every test here fails but those marked "held before".
+that the whole file runs on older code, too. At commit 0f68f2a all fail but six: the three meshes, the two effects without
+freedom and with null inside, and the long output.
 """
 
 import contextlib
@@ -123,13 +124,14 @@ def names(folder):
 def judge(run, command, folder, message, status):
     before = names(folder)
     found, said = forked(run, command, folder)
+    if status:
+        assert names(folder) == before, f"{found}: a command that fails writes nothing"
     assert "Traceback" not in said and found >= 0, f"{found}: {said[-2000:]}"
     assert SECRET not in said and "\x1b" not in said
     assert found == status, said[-2000:]
     assert re.search(message, " ".join(said.split())), said[-2000:]
     if status:
         assert len(said) < 4000
-        assert names(folder) == before, "a command that fails writes nothing"
 
 
 def edit(path, old, new):
@@ -164,8 +166,10 @@ def code_from_a_plugin_by_its_path(folder):
     plugin(folder, f"{folder}/scene/plugins/evil")
 
 
-@stranger("trace scene --quality fast -o out.nc", "city.xml")
+@stranger(SURVEY, "city.xml.*default")
 def a_mesh_by_a_variable(folder):
+    (folder / "scene" / "$x").mkdir()  # a decoy, which a check of the text alone would find
+    shutil.copy(folder / "scene" / "meshes" / "ground.ply", folder / "scene" / "$x" / "a.ply")
     shutil.copy(folder / "scene" / "meshes" / "ground.ply", folder.parent / "outside" / "a.ply")
     city = folder / "scene" / "city.xml"
     edit(city, '<scene version="2.1.0">', '<scene version="2.1.0"><default name="x" value="../../outside"/>')
@@ -177,7 +181,7 @@ def a_checkpoint_that_writes_files(folder):
     forked(None, f"marl.fedqmix {PLANNING}", folder, until=folder / "run" / "config.json")
     assert json.loads((folder / "run" / "config.json").read_text())
     table = pd.read_csv(folder / "m.csv")
-    columns = {name: {"__array__": torch.from_numpy(column.to_numpy())} if column.dtype.kind in "fiub" else list(column)
+    columns = {name: {"__array__": torch.tensor(column.to_numpy())} if column.dtype.kind in "fiub" else list(column)
                for name, column in table.items()}
     data = {"__array__": torch.frombuffer(bytearray(b"written"), dtype=torch.uint8)}
     torch.save({"format": 3, "state": {"rows": [{}], "blocks": [], "tables": [{"__table__": columns}], "strategy": {},
