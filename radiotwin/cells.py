@@ -1,10 +1,7 @@
 """The cells of a table in a file: text from .csv and .csv.gz, typed columns from .parquet."""
 
-import csv
 import gzip
-import re
-from collections.abc import Collection, Iterable, Iterator
-from itertools import chain
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import IO, Any
 
@@ -12,20 +9,18 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from radiotwin.budgets import CELLS, COLUMNS, FILE_BYTES, ROW_BYTES, ROWS
+from radiotwin.budgets import CELLS, COLUMNS, FILE_BYTES, ROWS
+from radiotwin.csv_layout import CsvLayout
 from radiotwin.errors import BadInput
 from radiotwin.inputs import open_gzip, open_input
+from radiotwin.spreadsheet import with_quotes, without_quotes
 
 _WHAT = "table (.csv, .csv.gz, .parquet)"
-_BLOCK_BYTES = 2**20  # of a CSV file that are checked at a time
 _CHUNK_CELLS = 2_000_000  # that are parsed at a time
 _NUMBERS_AT_ONCE = 1_000_000  # pandas makes an object of each
 _MAX_DIGITS = 1000  # of a number
 _PARQUET_ROWS, _NESTED_ROWS = 2**17, 2**10  # that are decoded at a time
 _SHOWN_CHARACTERS, _SHOWN_COLUMNS = 80, 50  # of a cell, and of a table, in a message
-# A spreadsheet takes a cell for a formula that begins so; the last four are full-width.
-_FORMULA = re.compile("'*[=+\\-@\t\r\n\uff1d\uff0b\uff0d\uff20]")
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 def read_cells(path: Path, required: Collection[str] = (),
@@ -71,13 +66,7 @@ def write_csv(table: pd.DataFrame, target: Path | IO[bytes], float_format: str |
         float_format: such as `%.4f`; all digits by default.
         header: whether to write the names of the columns.
     """
-    table = table.rename(columns=_quoted)
-    for name in table.columns:
-        if table[name].dtype.kind not in "biufmM":
-            texts = table[name]
-            odd = {text: _quoted(text) for text in texts.unique() if _quoted(text) is not text}
-            if odd:
-                table[name] = texts.astype(object).map(lambda text, odd=odd: odd.get(text, text))
+    table = with_quotes(table)
     if not isinstance(target, Path) or target.suffix != ".gz":
         table.to_csv(target, index=False, float_format=float_format, header=header)
         return
@@ -165,31 +154,6 @@ def listed(names: Iterable[object]) -> str:
     return ", ".join(texts[:_SHOWN_COLUMNS]) + more
 
 
-def _quoted(text: Any) -> Any:
-    """Return a text as it is written to CSV, the same object where nothing changes."""
-    if isinstance(text, str) and _FORMULA.match(text) and not _NUMBER.fullmatch(text):
-        return f"'{text}"
-    return text
-
-
-def _unquoted(text: Any) -> Any:
-    is_quoted = isinstance(text, str) and text.startswith("'") and _FORMULA.match(text)
-    return text[1:] if is_quoted else text
-
-
-def _unquoted_cells(table: pd.DataFrame) -> pd.DataFrame:
-    table = table.copy(deep=False)
-    for name in table.columns:
-        if table[name].dtype.kind in "OU" or isinstance(table[name].dtype, pd.StringDtype):
-            texts = table[name]
-            quoted = texts.str.startswith("'", na=False).to_numpy(dtype=bool)
-            if quoted.any():
-                texts = texts.copy()
-                texts[quoted] = texts[quoted].map(_unquoted)
-                table[name] = texts
-    return table
-
-
 def _selected(path: Path, names: list[str], required: Collection[str],
               optional: Collection[str] | None) -> list[str]:
     """Check the names of all columns; return those that are to be read, in their order."""
@@ -265,126 +229,12 @@ def _read_csv(path: Path, required: Collection[str],
     detected".
     """
     with open_gzip(path, _WHAT) as file:
-        layout = _Layout(path)
+        layout = CsvLayout(path)
         layout.check(file)
     names = _selected(path, layout.header, required, optional)
     with open_gzip(path, _WHAT) as file, \
             pd.read_csv(file, dtype=str, keep_default_na=False, skipinitialspace=True, header=0,
                         names=layout.header, usecols=names, index_col=False, encoding="utf-8",
                         chunksize=max(_CHUNK_CELLS // len(layout.header), 1)) as reader:
-        chunks = [_unquoted_cells(chunk) if layout.has_apostrophes else chunk for chunk in reader]
+        chunks = [without_quotes(chunk) if layout.has_apostrophes else chunk for chunk in reader]
     return pd.concat(chunks, ignore_index=True)
-
-
-class _Layout:
-    """Checks that every row of a CSV file has as many fields as its header.
-
-    Attributes:
-        header: names of the columns.
-        rows: with the header, without blank lines.
-        has_apostrophes: whether there is any.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self.header: list[str] = []
-        self.rows = 0
-        self.has_apostrophes = False
-
-    def check(self, file: IO[bytes]) -> None:
-        """Check all rows; counts separators as long as there are no quotation marks.
-
-        Args:
-            file: decompressed.
-
-        Raises:
-            BadInput: names the row.
-        """
-        blocks = self._blocks(file)
-        for block in blocks:
-            if b'"' in block or block.count(b"\r") != block.count(b"\r\n"):
-                self._check_fields(chain([block], blocks))
-                break
-            self._count_separators(block)
-        if not self.header:
-            raise BadInput(f"{self._path} is empty; it needs a first row with the names of the "
-                           "columns")
-
-    def _blocks(self, file: IO[bytes]) -> Iterator[bytes]:
-        """Yield whole lines, checked to be text."""
-        rest = file.read(3).removeprefix(b"\xef\xbb\xbf")
-        while data := file.read(_BLOCK_BYTES):
-            whole, newline, rest_of_data = data.rpartition(b"\n")
-            if not newline:
-                rest += data
-                if len(rest) > ROW_BYTES.limit:
-                    ROW_BYTES.refuse(f"{self._path}: after row {self.rows}",
-                                     f"a row of more than {ROW_BYTES.limit:,} bytes")
-                continue
-            yield self._checked(rest + whole + newline)
-            rest = rest_of_data
-        if rest:
-            yield self._checked(rest)
-
-    def _checked(self, block: bytes) -> bytes:
-        block.decode()
-        if b"\0" in block:
-            raise BadInput(f"{self._path} is not text in UTF-8 (it has null characters); allowed "
-                           "is comma-separated, UTF-8")
-        self.has_apostrophes = self.has_apostrophes or b"'" in block
-        return block
-
-    def _count_separators(self, block: bytes) -> None:
-        if not self.header:
-            line, _, block = block.lstrip(b"\r\n").partition(b"\n")
-            COLUMNS.check(line.count(b",") + 1, f"{self._path}: row 1")
-            if not line:
-                return
-            self._begin(next(csv.reader([line.decode()], skipinitialspace=True)))
-        if not block:
-            return
-        if not block.endswith(b"\n"):
-            block += b"\n"
-        codes = np.frombuffer(block, dtype=np.uint8)
-        ends = np.flatnonzero(codes == ord("\n"))
-        fields = np.diff(np.searchsorted(np.flatnonzero(codes == ord(",")), ends), prepend=0) + 1
-        length = np.diff(ends, prepend=-1) - 1
-        blank = (length == 0) | ((length == 1) & (codes[ends - 1] == ord("\r")))
-        fields = fields[~blank]
-        wrong = fields != len(self.header)
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            self._refuse(self.rows + row + 1, int(fields[row]))
-        self._add(len(fields))
-
-    def _check_fields(self, blocks: Iterable[bytes]) -> None:
-        """Check rows that may have fields in quotation marks, or lines that end in any way."""
-        lines = (line for block in blocks
-                 for line in re.findall(r"[^\r\n]*(?:\r\n|\r|\n)|[^\r\n]+$", block.decode()))
-        try:
-            for fields in filter(None, csv.reader(lines, skipinitialspace=True)):
-                if not self.header:
-                    COLUMNS.check(len(fields), f"{self._path}: row 1")
-                    self._begin(fields)
-                    continue
-                if len(fields) != len(self.header):
-                    self._refuse(self.rows + 1, len(fields))
-                self._add(1)
-        except csv.Error as error:
-            raise BadInput(f"{self._path}: row {self.rows + 1}: {error}; is a quotation mark not "
-                           "closed?") from None
-
-    def _begin(self, header: list[str]) -> None:
-        self.header, self.rows = [_unquoted(name.strip()) for name in header], 1
-        if len(header) == 1 and not self.header[0].isidentifier():
-            raise BadInput(f"{self._path}: its header {self.header[0][:60]!r} is one single "
-                           "column; allowed is comma-separated, UTF-8")
-
-    def _add(self, rows: int) -> None:
-        self.rows += rows
-        ROWS.check(self.rows - 1, self._path)
-        CELLS.check((self.rows - 1) * len(self.header), self._path)
-
-    def _refuse(self, row: int, fields: int) -> None:
-        raise BadInput(f"{self._path}: row {row} has {fields} fields, the header has "
-                       f"{len(self.header)}; every row needs as many commas as the header")

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from radiotwin.cells import write_csv
 from radiotwin.errors import RunFailed
 from radiotwin.files import scratch_folder
 from studies.runner import Study
@@ -134,11 +135,11 @@ def make_inputs(folder: Path, command: str) -> None:
 def write_raw_table(path: Path, rows: int = 300_000) -> None:
     """Write levels of ten devices as a receiver would."""
     rng = np.random.default_rng(0)
-    pd.DataFrame({
+    write_csv(pd.DataFrame({
         "time": np.arange(rows) * 0.1, "x": rng.uniform(0, 1000, rows).round(2),
         "y": rng.uniform(0, 1000, rows).round(2), "z": 60.0,
         "device": rng.integers(0, 10, rows), "level": rng.normal(-80, 8, rows).round(1),
-    }).to_csv(path, index=False)
+    }), path)
 
 
 def write_city(path: Path, side: int = 25) -> None:
@@ -214,7 +215,7 @@ def timeless(path: Path) -> bytes:
         return json.dumps(_without_clocks(json.loads(data))).encode()
     if path.suffix == ".csv":
         table = pd.read_csv(path, dtype=str, keep_default_na=False)
-        return table.drop(columns=[name for name in table if name in CLOCKS]).to_csv().encode()
+        return table.drop(columns=[name for name in table if name in CLOCKS]).to_json().encode()
     return data
 
 

@@ -5,7 +5,6 @@ import math
 import os
 import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,6 +22,17 @@ from radiotwin.twin import fit_twin
 from studies.runner import Study
 from studies.tables import markdown
 
+# A process begins with the peak memory of the one that started it, so a small one has to: this
+# starts Python with its own arguments, and prints exit status, wall and CPU seconds, and MiB.
+_LAUNCHER = """
+import json, os, sys, time
+started = time.perf_counter()
+child = os.posix_spawn(sys.executable, [sys.executable, *sys.argv[1:]], os.environ,
+                       file_actions=[(os.POSIX_SPAWN_DUP2, 2, 1)])
+_, status, used = os.wait4(child, 0)
+print(json.dumps([os.waitstatus_to_exitcode(status), time.perf_counter() - started,
+                  used.ru_utime + used.ru_stime, used.ru_maxrss / 2**10]))
+"""
 PLOT_M = 26.0  # [m], side of a plot of the town
 Make = Callable[[int, Path], dict[str, list[str]]]
 """Writes the inputs of a size to a folder; returns commands by name, in their order."""
@@ -49,15 +59,13 @@ def run_measured(command: list[str], folder: Path) -> dict[str, float]:
     Raises:
         RunFailed: its exit status is not 0.
     """
-    started = time.perf_counter()
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    child = subprocess.Popen([sys.executable, "-m", *command], cwd=folder, env=environment)
-    _, status, usage = os.wait4(child.pid, 0)
-    child.returncode = os.waitstatus_to_exitcode(status)
-    if child.returncode:
-        raise RunFailed(f"{' '.join(command)}: exit status {child.returncode}")
-    return {"wall_s": time.perf_counter() - started, "cpu_s": usage.ru_utime + usage.ru_stime,
-            "peak_mib": usage.ru_maxrss / 2**10}
+    launched = subprocess.run([sys.executable, "-I", "-S", "-c", _LAUNCHER, "-m", *command],
+                              cwd=folder, env=environment, stdout=subprocess.PIPE, check=True)
+    status, wall_s, cpu_s, peak_mib = json.loads(launched.stdout)
+    if status:
+        raise RunFailed(f"{' '.join(command)}: exit status {status}")
+    return {"wall_s": wall_s, "cpu_s": cpu_s, "peak_mib": peak_mib}
 
 
 def make_import(links: int, folder: Path) -> dict[str, list[str]]:
@@ -221,10 +229,12 @@ def load_table(rows: pd.DataFrame) -> str:
     """Return time and memory of each command, and their ratios to those of the smallest size."""
     lines: list[list[str]] = []
     first: dict[tuple, dict[str, float]] = {}
-    for row in rows.sort_values(["part", "size"]).to_dict("records"):
-        for name, cost in row["commands"].items():
-            least = first.setdefault((row["part"], name), cost)
-            lines.append([row["part"], f"{row['size']:,}", name, f"{cost['wall_s']:.1f}",
+    for part, size, commands in sorted(
+            (settings["part"], settings["size"], commands)
+            for settings, commands in zip(rows["settings"], rows["commands"])):
+        for name, cost in commands.items():
+            least = first.setdefault((part, name), cost)
+            lines.append([part, f"{size:,}", name, f"{cost['wall_s']:.1f}",
                           f"{cost['wall_s'] / least['wall_s']:.1f}", f"{cost['peak_mib']:,.0f}",
                           f"{cost['peak_mib'] / least['peak_mib']:.2f}"])
     return markdown(["part", "size", "command", "wall [s]", "ratio", "peak memory [MiB]", "ratio"],

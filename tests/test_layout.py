@@ -30,8 +30,8 @@ LAYERS = (
     {"antennas", "measurements", "command", "doctor", "exits"},
     {"array_file", "geodesy", "llvm", "safe_xml", "cells", "progress", "published", "records", "hdf5"},
     {"pieces"},
-    {"console"},
-    {"content_hash", "files", "inputs", "plugins", "tables"},
+    {"console", "csv_layout"},
+    {"content_hash", "files", "inputs", "plugins", "spreadsheet", "tables"},
     {"budgets", "interruption"},
     {"errors", "signals"},
 )

@@ -20,6 +20,7 @@ from radiotwin.tables import Origin
 GRID_M = 0.01  # [m], corners are rounded to it, so that walls meant to coincide do
 MIN_OVERLAP_M2 = 1.0  # [m²], that is reported
 _CHUNK = 64  # prisms: bounds the pairs that are found at once
+_CHUNK_PAIRS = 2048  # whose common part is made before they are counted
 SLIVER_AREA_M2 = 1.0  # [m²]
 SLIVER_WIDTH_M = 0.3  # [m], mean width; the thickness of one wall
 MIN_COVERED_SHARE = 0.9  # of an outline that its parts cover for it to be left out
@@ -234,11 +235,13 @@ def find_contacts(prisms: Sequence[Prism]) -> Contacts:
         a, b = a[kept], b[kept]
         found += len(a)
         TOUCHING_PAIRS.check(found, "the map")
-        common = shapely.intersection(areas[a], areas[b])
-        shared_m2 = shapely.area(common)
-        overlapping += int(np.count_nonzero(shared_m2 > MIN_OVERLAP_M2))
-        OVERLAPS.check(overlapping, "the map")
-        parts.append((np.stack([a, b], axis=1), shared_m2, shapely.length(common)))
+        for first in range(0, len(a), _CHUNK_PAIRS):
+            pair = np.stack([a, b], axis=1)[first:first + _CHUNK_PAIRS]
+            common = shapely.intersection(*areas[pair].T)
+            shared_m2 = shapely.area(common)
+            overlapping += int(np.count_nonzero(shared_m2 > MIN_OVERLAP_M2))
+            OVERLAPS.check(overlapping, "the map")
+            parts.append((pair, shared_m2, shapely.length(common)))
     if not parts:
         return Contacts(np.zeros((0, 2), dtype=int), np.zeros(0), np.zeros(0))
     pairs, shared_m2, shared_m = (np.concatenate(each) for each in zip(*parts))
