@@ -110,4 +110,6 @@ FEATURES = Budget("FEATURES", 5_000_000, "buildings")  # of a map file, before i
 OUTLINE_CORNERS = Budget("OUTLINE_CORNERS", 20_000, "corners")  # of one building of a map
 CROSSINGS = Budget("CROSSINGS", 20_000, "crossings of outlines with themselves")  # of a map
 OVERLAPS = Budget("OVERLAPS", 200_000, "pairs of buildings that overlap")  # of a map
-TOUCHING_PAIRS = Budget("TOUCHING_PAIRS", 2_000_000, "pairs of buildings that touch")  # of a map
+PART_PAIRS = Budget("PART_PAIRS", 2_000_000, "pairs of a part and a building around it")
+# As each pair is cut with each other's outline, which takes time by the corners of both
+TOUCHING_CORNERS = Budget("TOUCHING_CORNERS", 5_000_000, "corners in pairs of buildings that touch")

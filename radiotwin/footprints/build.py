@@ -245,7 +245,8 @@ def _check_sizes(features: list[Feature], origin: Origin, path: Path) -> None:
     if not widths_m[widest] <= MAX_WIDTH_M:
         raise BadInput(f"{path}: {features[widest].name} is {widths_m[widest] / 1000:.0f} km wide, "
                        "as no building is; correct or remove it")
-    _check_width(float(np.ptp(corners, axis=(1, 2)).max()), 10 * MAX_WIDTH_M)
+    # From the middle: across the antimeridian all may lie close together, on the earth's other side
+    _check_width(2 * float(np.abs(corners).max()), 10 * MAX_WIDTH_M)
 
 
 def _check_width(width_m: float, most_m: float) -> None:
