@@ -108,8 +108,8 @@ MAP_ATTRIBUTES = Budget("MAP_ATTRIBUTES", 1_000, "attributes")  # of one variabl
 MAP_PICTURES = Budget("MAP_PICTURES", 2_000, "pictures")  # in one file
 FEATURES = Budget("FEATURES", 5_000_000, "buildings")  # of a map file, before it is cut to a box
 OUTLINE_CORNERS = Budget("OUTLINE_CORNERS", 20_000, "corners")  # of one building of a map
-CROSSINGS = Budget("CROSSINGS", 20_000, "crossings of outlines with themselves")  # of a map
-OVERLAPS = Budget("OVERLAPS", 200_000, "pairs of buildings that overlap")  # of a map
+CROSSINGS = Budget("CROSSINGS", 2_000, "crossings of outlines with themselves")  # of a map
+OVERLAPS = Budget("OVERLAPS", 20_000, "pairs of buildings that overlap")  # of a map
 PART_PAIRS = Budget("PART_PAIRS", 2_000_000, "pairs of a part and a building around it")
 # As each pair is cut with each other's outline, which takes time by the corners of both
 TOUCHING_CORNERS = Budget("TOUCHING_CORNERS", 5_000_000, "corners in pairs of buildings that touch")
