@@ -103,9 +103,11 @@ FILES = Budget("FILES", 1_000, "files that include each other", "a Mitsuba file"
 SEARCH_FOLDERS = Budget("SEARCH_FOLDERS", 100, "folders to search", "a Mitsuba file")
 FEATURES = Budget("FEATURES", 5_000_000, "buildings", "a map file, before it is cut to a box")
 OUTLINE_CORNERS = Budget("OUTLINE_CORNERS", 20_000, "corners", "one building of a map")
-CROSSINGS = Budget("CROSSINGS", 20_000, "crossings of outlines with themselves", "a map")
-OVERLAPS = Budget("OVERLAPS", 200_000, "pairs of buildings that overlap", "a map")
-TOUCHING_PAIRS = Budget("TOUCHING_PAIRS", 2_000_000, "pairs of buildings that touch", "a map")
+CROSSINGS = Budget("CROSSINGS", 2_000, "crossings of outlines with themselves", "a map")
+OVERLAPS = Budget("OVERLAPS", 20_000, "pairs of buildings that overlap", "a map")
+PART_PAIRS = Budget("PART_PAIRS", 2_000_000, "pairs of a part and a building around it", "a map")
+TOUCHING_CORNERS = Budget("TOUCHING_CORNERS", 5_000_000,
+                          "corners in pairs of buildings that touch", "a map")
 # Radio maps
 MAP_VALUES = Budget("MAP_VALUES", 500_000_000, "values", "one variable of a radio map")
 MAP_AXIS = Budget("MAP_AXIS", 20_000_000, "coordinates", "one axis of a radio map")

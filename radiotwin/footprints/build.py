@@ -37,7 +37,7 @@ from radiotwin.scene.names import RESERVED_NAMES, Names, safe_name, unique_name
 from radiotwin.scene.placement import choose_extent
 from radiotwin.scene.problems import Problem
 from radiotwin.scene.report import BuildReport
-from radiotwin.scene.sources import scene_name
+from radiotwin.scene.sources import scene_name, source_text
 from radiotwin.scene.surfaces import Surfaces
 from radiotwin.tables import Origin
 
@@ -166,7 +166,7 @@ def _provenance(
     source: str, counts: dict[str, int], map_options: MapOptions, options: BuildOptions
 ) -> dict[str, str]:
     """Return `[provenance]` of `scene.toml`."""
-    known = {"source": source, "seed": str(options.seed),
+    known = {"source": source_text(source), "seed": str(options.seed),
              "height_default_m": f"{map_options.default_height_m:g}",
              "heights_from": ", ".join(f"{key} {number}" for key, number in counts.items())}
     if map_options.bbox_deg is not None:
@@ -245,7 +245,8 @@ def _check_sizes(features: list[Feature], origin: Origin, path: Path) -> None:
     if not widths_m[widest] <= MAX_WIDTH_M:
         raise BadInput(f"{path}: {features[widest].name} is {widths_m[widest] / 1000:.0f} km wide, "
                        "as no building is; correct or remove it")
-    _check_width(float(np.ptp(corners, axis=(1, 2)).max()), 10 * MAX_WIDTH_M)
+    # From the middle: across the antimeridian all may lie close together, on the earth's other side
+    _check_width(2 * float(np.abs(corners).max()), 10 * MAX_WIDTH_M)
 
 
 def _check_width(width_m: float, most_m: float) -> None:

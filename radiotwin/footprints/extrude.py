@@ -7,7 +7,9 @@ neighbours of different materials a slot of 2 cm is left open.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import mapbox_earcut
 import numpy as np
+import shapely
 import trimesh
 from manifold3d import Manifold, Mesh64, OpType
 from scipy.sparse import coo_matrix
@@ -16,7 +18,7 @@ from scipy.sparse.csgraph import connected_components
 from radiotwin.footprints.solids import GRID_M, Contacts, Prism
 from radiotwin.progress import progress
 from radiotwin.scene.materials import Material
-from radiotwin.scene.meshes import clean
+from radiotwin.scene.meshes import clean, is_volume
 
 SLOT_M = 0.02  # [m], more than the 1 cm below which the 3D map takes two surfaces for one
 # [m], how far a surface may move to remove a splinter; files hold single precision, 0.1 mm at 1 km
@@ -83,11 +85,24 @@ def _union(solids: list[Manifold]) -> Manifold:
 def _solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
     """Return a prism, with all its faces moved outwards by `wider_m`."""
     area = prism.area.buffer(wider_m, join_style="mitre") if wider_m else prism.area
-    bottom_m, top_m = prism.height.bottom_m - wider_m, prism.height.top_m + wider_m
-    mesh = trimesh.creation.extrude_polygon(area, height=top_m - bottom_m, engine="earcut")
-    mesh.apply_translation([0, 0, bottom_m])
-    vertices = np.ascontiguousarray(mesh.vertices, dtype=np.float64)
-    return Manifold(Mesh64(vertices, mesh.faces.astype(np.uint64)))
+    rings = [shapely.get_coordinates(ring) for ring in (area.exterior, *area.interiors)]
+    points, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings])
+    roof = mapbox_earcut.triangulate_float64(points, ends).reshape(-1, 3)
+    corner = np.arange(len(points))
+    corner[ends - 1] = [0, *ends[:-1]]  # a ring's last point is its first
+    used, roof = np.unique(corner[roof], return_inverse=True)  # none in the middle of a wall
+    points, roof, n = points[used], roof.reshape(-1, 3), len(used)
+    (ax, ay), (bx, by) = ((points[roof[:, side]] - points[roof[:, 0]]).T for side in (1, 2))
+    if (ax * by - ay * bx).sum() < 0:
+        roof = roof[:, ::-1]
+    start, end = roof[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
+    outer = ~np.isin(start * n + end, end * n + start)
+    start, end = start[outer], end[outer]
+    walls = np.stack([end + n, start + n, end, end, start + n, start], axis=1).reshape(-1, 3)
+    height_m = np.repeat([prism.height.bottom_m - wider_m, prism.height.top_m + wider_m], n)
+    vertices = np.column_stack([np.tile(points, (2, 1)), height_m])
+    faces = np.concatenate([roof[:, ::-1], roof + n, walls])
+    return Manifold(Mesh64(vertices, faces.astype(np.uint64)))
 
 
 def _mesh(solid: Manifold) -> trimesh.Trimesh:
@@ -98,5 +113,5 @@ def _mesh(solid: Manifold) -> trimesh.Trimesh:
     """
     found = solid.to_mesh64()
     vertices, faces = found.vert_properties[:, :3], found.tri_verts.astype(np.int64)
-    cleaned = trimesh.Trimesh(*clean(vertices, faces)[:2], process=False)
-    return cleaned if cleaned.is_volume else trimesh.Trimesh(vertices, faces, process=False)
+    cleaned = clean(vertices, faces)[:2]
+    return trimesh.Trimesh(*(cleaned if is_volume(*cleaned) else (vertices, faces)), process=False)

@@ -2,13 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import shapely
 from shapely.geometry.base import BaseGeometry
 
-from radiotwin.budgets import OVERLAPS, TOUCHING_PAIRS
+from radiotwin.budgets import OVERLAPS, PART_PAIRS, TOUCHING_CORNERS
 from radiotwin.footprints.features import Feature, problems_of
 from radiotwin.footprints.heights import Height, height_of
 from radiotwin.footprints.material_table import MaterialTable
@@ -20,7 +20,7 @@ from radiotwin.tables import Origin
 GRID_M = 0.01  # [m], corners are rounded to it, so that walls meant to coincide do
 MIN_OVERLAP_M2 = 1.0  # [m²], that is reported
 _CHUNK = 64  # prisms: bounds the pairs that are found at once
-_CHUNK_PAIRS = 2048  # whose common part is made before they are counted
+_PAIRS_AT_ONCE = 10_000
 SLIVER_AREA_M2 = 1.0  # [m²]
 SLIVER_WIDTH_M = 0.3  # [m], mean width; the thickness of one wall
 MIN_COVERED_SHARE = 0.9  # of an outline that its parts cover for it to be left out
@@ -171,7 +171,7 @@ def _resolve_parts(wholes: list[Area], parts: list[Area], defects: _Defects) -> 
         inside = area.representative_point()
         owners = [int(index) for index in tree.query(inside, predicate="within")]
         found += len(owners)
-        TOUCHING_PAIRS.check(found, "the map")
+        PART_PAIRS.check(found, "the map")
         if owners:
             owner = min(owners, key=whole_m2.__getitem__)
             parts_of.setdefault(owner, []).append(area)
@@ -222,30 +222,34 @@ def find_contacts(prisms: Sequence[Prism]) -> Contacts:
     Raises:
         BadInput: there are too many such pairs.
     """
-    areas = np.array([prism.area for prism in prisms], dtype=object)
+    areas: Any = np.array([prism.area for prism in prisms], dtype=object)
+    pairs = _touching(prisms, areas)
+    shared_m2, shared_m = np.zeros(len(pairs)), np.zeros(len(pairs))
+    overlapping = 0
+    for start in range(0, len(pairs), _PAIRS_AT_ONCE):
+        part = slice(start, start + _PAIRS_AT_ONCE)
+        common = shapely.intersection(*areas[pairs[part].T])
+        shared_m2[part], shared_m[part] = shapely.area(common), shapely.length(common)
+        overlapping += int(np.count_nonzero(shared_m2[part] > MIN_OVERLAP_M2))
+        OVERLAPS.check(overlapping, "the map")
+    return Contacts(pairs, shared_m2, shared_m)
+
+
+def _touching(prisms: Sequence[Prism], areas: Any) -> np.ndarray:
+    """Return the (n, 2) pairs of prisms that touch, the lower index first."""
     bottom_m = np.array([prism.height.bottom_m for prism in prisms])
     top_m = np.array([prism.height.top_m for prism in prisms])
-    tree = shapely.STRtree(areas)
-    parts, found, overlapping = [], 0, 0
+    corners, found = shapely.get_num_coordinates(areas), 0
+    tree, parts = shapely.STRtree(areas), [np.zeros((0, 2), dtype=int)]
     for start in range(0, len(areas), _CHUNK):
         a, b = tree.query(areas[start:start + _CHUNK], predicate="intersects")
         a = a + start
         slack_m = np.minimum(top_m[a], top_m[b]) - np.maximum(bottom_m[a], bottom_m[b])
         kept = (a < b) & (slack_m > -GRID_M)
-        a, b = a[kept], b[kept]
-        found += len(a)
-        TOUCHING_PAIRS.check(found, "the map")
-        for first in range(0, len(a), _CHUNK_PAIRS):
-            pair = np.stack([a, b], axis=1)[first:first + _CHUNK_PAIRS]
-            common = shapely.intersection(*areas[pair].T)
-            shared_m2 = shapely.area(common)
-            overlapping += int(np.count_nonzero(shared_m2 > MIN_OVERLAP_M2))
-            OVERLAPS.check(overlapping, "the map")
-            parts.append((pair, shared_m2, shapely.length(common)))
-    if not parts:
-        return Contacts(np.zeros((0, 2), dtype=int), np.zeros(0), np.zeros(0))
-    pairs, shared_m2, shared_m = (np.concatenate(each) for each in zip(*parts))
-    return Contacts(pairs, shared_m2, shared_m)
+        parts.append(np.stack([a[kept], b[kept]], axis=1))
+        found += int(corners[parts[-1]].sum())
+        TOUCHING_CORNERS.check(found, "the map")
+    return np.concatenate(parts)
 
 
 def find_overlaps(prisms: Sequence[Prism],

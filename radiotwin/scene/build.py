@@ -34,13 +34,14 @@ from radiotwin.scene.placement import (
     choose_altitudes,
     choose_extent,
     choose_step,
+    make_extent,
     place_devices,
     place_uavs,
 )
 from radiotwin.scene.preview import draw_preview
 from radiotwin.scene.problems import Problem
 from radiotwin.scene.report import BuildReport, MaterialUse
-from radiotwin.scene.sources import find_source, scene_name
+from radiotwin.scene.sources import find_source, scene_name, source_text
 from radiotwin.scene.writer import CityShape, write_city
 from radiotwin.tables import Origin
 
@@ -127,7 +128,7 @@ def build_scene(source: Path | str, out_folder: Path | str, options: BuildOption
     if options.bbox is not None:
         corners = np.array(options.bbox) + np.tile(city.moved_m[:2], 2)
         x_min, y_min, x_max, y_max = corners.tolist()
-        extent = Extent(x_min_m=x_min, x_max_m=x_max, y_min_m=y_min, y_max_m=y_max)
+        extent = make_extent((x_min, x_max, y_min, y_max))
     declared = Declared(str(source), scene_name(source), extent, None,
                         _provenance(city, str(source), options))
     return finish_scene(city, declared, out_folder, options, check_only)
@@ -257,7 +258,7 @@ def _plan(city: ImportedCity, declared: Declared, options: BuildOptions) -> _Pla
 
 
 def _provenance(city: ImportedCity, source: str, options: BuildOptions) -> dict[str, str]:
-    known = {"source": source, "seed": str(options.seed)}
+    known = {"source": source_text(source), "seed": str(options.seed)}
     if any(city.moved_m):
         known["moved_m"] = ", ".join(f"{value:.3f}" for value in city.moved_m)
     for name in ("scale", "up", "bbox", "materials"):

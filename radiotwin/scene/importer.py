@@ -15,7 +15,7 @@ from radiotwin.progress import progress
 from radiotwin.scene import checks
 from radiotwin.scene.material_mapping import map_materials
 from radiotwin.scene.materials import Material
-from radiotwin.scene.meshes import clean, load_shape
+from radiotwin.scene.meshes import MeshBudget, clean, load_shape
 from radiotwin.scene.mitsuba_xml import DeclaredShape, read_mitsuba_xml
 from radiotwin.scene.names import RESERVED_NAMES, Names, safe_name, unique_name
 from radiotwin.scene.problems import Problem, error, fixed, listed, warning
@@ -73,7 +73,8 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
         raise BadInput(f"{path} declares no shapes; give a scene file with <shape> elements")
     materials, problems = map_materials(declared.shapes, declared.materials, overrides)
     names, name_problems = _safe_names(declared.shapes)
-    meshes, mesh_problems = _load_meshes(declared.shapes, names, scale or 1.0, up or "z")
+    meshes, mesh_problems = _load_meshes(
+        path, declared.shapes, names, scale or 1.0, up or "z")
     problems += name_problems + mesh_problems
     kept = [index for index, mesh in enumerate(meshes) if mesh is not None]
     names, materials = [names[index] for index in kept], [materials[index] for index in kept]
@@ -120,32 +121,32 @@ def _safe_names(shapes: Sequence[DeclaredShape]) -> tuple[list[str], list[Proble
     return names, problems
 
 
-def _load_meshes(shapes: Sequence[DeclaredShape], names: Sequence[str], scale: float, up: str
-                 ) -> tuple[list[Mesh | None], list[Problem]]:
+def _load_meshes(path: Path, shapes: Sequence[DeclaredShape], names: Sequence[str], scale: float,
+                 up: str) -> tuple[list[Mesh | None], list[Problem]]:
     """Read (vertices, faces) of each shape, None where it has none."""
     meshes: list[Mesh | None] = []
+    budget = MeshBudget(path)
     unreadable, empty = [], []
     slivers: dict[str, int] = {}
     polygons: dict[str, int] = {}
     with progress("reading meshes", total=len(shapes)) as advance:
         for shape, name in zip(shapes, names):
-            mesh = None
+            advance(1)
             try:
                 raw = load_shape(shape)
-                vertices, faces, dropped = clean(checks.upright(raw.vertices * scale, up),
-                                                 raw.faces)
-                if dropped:
-                    slivers[name] = dropped
-                if raw.polygons:
-                    polygons[name] = raw.polygons
-                if len(faces):
-                    mesh = vertices, faces
-                else:
-                    empty.append(name)
             except BadInput as bad:
                 unreadable.append(error(str(bad), name))
-            meshes.append(mesh)
-            advance(1)
+                meshes.append(None)
+                continue
+            budget.add(raw)
+            vertices, faces, dropped = clean(checks.upright(raw.vertices * scale, up), raw.faces)
+            if dropped:
+                slivers[name] = dropped
+            if raw.polygons:
+                polygons[name] = raw.polygons
+            if not len(faces):
+                empty.append(name)
+            meshes.append((vertices, faces) if len(faces) else None)
     problems = unreadable[:_MAX_UNREADABLE]
     if len(unreadable) > _MAX_UNREADABLE:
         more = [problem.shape for problem in unreadable[_MAX_UNREADABLE:]]

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import inf
 
 from radiotwin.errors import BadInput
 from radiotwin.scene import problems
@@ -19,6 +18,10 @@ from radiotwin.scene.mitsuba_xml import DeclaredShape
 from radiotwin.scene.names import safe_name, unique_name
 from radiotwin.scene.problems import Problem, listed
 from radiotwin.scene.xml_tree import Node
+
+_LIMITS = {  # far beyond any material, and well inside single precision
+    "relative_permittivity": (1, 1e6), "conductivity_s_per_m": (0, 1e10), "thickness_m": (0, 1e4),
+    "scattering_coefficient": (0, 1), "xpd_coefficient": (0, 1)}
 
 
 def map_materials(shapes: Sequence[DeclaredShape], declared: Mapping[str, Node],
@@ -131,14 +134,11 @@ def _with_surface(identifier: str, node: Node, material: Material) -> Material:
         thickness_m=node.number("thickness", Material.thickness_m),
         scattering_coefficient=node.number("scattering_coefficient", 0.0),
         xpd_coefficient=node.number("xpd_coefficient", 0.0))
-    limits = (("relative_permittivity", 1, inf), ("conductivity_s_per_m", 0, inf),
-              ("thickness_m", 0, inf), ("scattering_coefficient", 0, 1), ("xpd_coefficient", 0, 1))
-    for name, low, high in limits:
+    for name, (low, high) in _LIMITS.items():
         value = getattr(material, name)
         if value is not None and not low <= value <= high:
-            allowed = f"at least {low}" if high == inf else f"{low} to {high}"
             raise _Unmapped(f"{node.position}: material {identifier!r}: {name} = {value:g} is not "
-                            f"possible; allowed: {allowed}")
+                            f"possible; allowed: {low:g} to {high:g}")
     return material
 
 

@@ -52,13 +52,37 @@ def load_shapes(shapes: Iterable[DeclaredShape], source: Path) -> Iterator[RawMe
     Raises:
         BadInput: As `load_shape`, or a budget is exceeded.
     """
-    vertices = faces = 0
+    budget = MeshBudget(source)
     for shape in shapes:
         mesh = load_shape(shape)
-        vertices, faces = vertices + len(mesh.vertices), faces + len(mesh.faces)
-        VERTICES.check(vertices, f"{source} with its meshes")
-        FACES.check(faces, f"{source} with its meshes")
+        budget.add(mesh)
         yield mesh
+
+
+class MeshBudget:
+    """Vertices and faces of a city so far.
+
+    Args:
+        source: Its XML file; messages begin with it.
+    """
+
+    def __init__(self, source: Path) -> None:
+        self._subject = f"{source} with its meshes"
+        self._vertices = self._faces = 0
+
+    def add(self, mesh: RawMesh) -> None:
+        """Add a mesh.
+
+        Args:
+            mesh: Of one shape.
+
+        Raises:
+            BadInput: All together have too many vertices or faces.
+        """
+        self._vertices += len(mesh.vertices)
+        self._faces += len(mesh.faces)
+        VERTICES.check(self._vertices, self._subject)
+        FACES.check(self._faces, self._subject)
 
 
 def load_shape(shape: DeclaredShape) -> RawMesh:
@@ -218,9 +242,8 @@ def clean(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     Returns:
         (v', 3) vertices [m], (f', 3) faces, and the number of triangles dropped.
     """
-    _, first, index = np.unique(np.round(vertices_m / WELD_M).astype(np.int64), axis=0,
-                                return_index=True, return_inverse=True)
-    faces = index.reshape(-1)[faces]
+    first, index = _distinct(np.round(vertices_m / WELD_M).astype(np.int64))
+    faces = index[faces]
     corners = vertices_m[first][faces]
     sides = corners - np.roll(corners, 1, axis=1)
     longest = (sides**2).sum(axis=2).max(axis=1)
@@ -228,3 +251,34 @@ def clean(vertices_m: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
     good = double_area > _MIN_ASPECT * longest
     used, faces = np.unique(faces[good], return_inverse=True)
     return vertices_m[first][used], faces.reshape(-1, 3), int(np.count_nonzero(~good))
+
+
+def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first row of each kind, in ascending order, and the (n,) kind of each of (n, 3).
+
+    As `np.unique` with an axis, but in a tenth of its time where there are few rows.
+    """
+    order = np.lexsort(rows.T[::-1])
+    ordered = rows[order]
+    new = np.ones(len(rows), dtype=bool)
+    new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    index = np.empty(len(rows), dtype=np.int64)
+    index[order] = np.cumsum(new) - 1
+    return order[new], index
+
+
+def is_volume(vertices_m: np.ndarray, faces: np.ndarray) -> bool:
+    """Return whether triangles enclose a volume: every edge joins two of them, normals outwards.
+
+    Args:
+        vertices_m: (v, 3) [m]
+        faces: (f, 3) indices of vertices.
+    """
+    if len(faces) == 0:
+        return False
+    start, end = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).T
+    there, back = (np.sort(a * len(vertices_m) + b) for a, b in ((start, end), (end, start)))
+    if (there != back).any() or (there[1:] == there[:-1]).any():
+        return False
+    a, b, c = (vertices_m - vertices_m[0])[faces].swapaxes(0, 1)
+    return bool(np.einsum("ij,ij->", a, np.cross(b, c)) > 0)

@@ -19,6 +19,7 @@ from radiotwin.scene.config import (
 )
 from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.surfaces import Surfaces
+from radiotwin.tables import MAX_COORDINATE_M
 
 _DEVICE_CLEARANCE_M = 10.0  # free ground around a device [m]
 _UAV_CLEARANCE_M = 2.0  # free air beside the start of a UAV [m]
@@ -141,10 +142,25 @@ def choose_extent(bounds: tuple[float, float, float, float]) -> Extent:
     """
     step_m = choose_step(bounds)
     x_min, x_max, y_min, y_max = bounds
-    return Extent(x_min_m=np.floor(x_min / step_m) * step_m,
-                  x_max_m=np.ceil(x_max / step_m) * step_m,
-                  y_min_m=np.floor(y_min / step_m) * step_m,
-                  y_max_m=np.ceil(y_max / step_m) * step_m)
+    return make_extent((np.floor(x_min / step_m) * step_m, np.ceil(x_max / step_m) * step_m,
+                        np.floor(y_min / step_m) * step_m, np.ceil(y_max / step_m) * step_m))
+
+
+def make_extent(bounds: tuple[float, float, float, float]) -> Extent:
+    """Return the extent with the given bounds.
+
+    Args:
+        bounds: (x_min, x_max, y_min, y_max) [m].
+
+    Raises:
+        BadInput: They are too far from the origin.
+    """
+    x_min, x_max, y_min, y_max = bounds
+    if not max(map(abs, bounds)) <= MAX_COORDINATE_M:
+        raise BadInput(f"an extent of x {x_min:g} to {x_max:g} m, y {y_min:g} to {y_max:g} m is "
+                       f"not possible; at most {MAX_COORDINATE_M:g} m from the origin are allowed: "
+                       "choose a part with --bbox, or correct --scale")
+    return Extent(x_min_m=x_min, x_max_m=x_max, y_min_m=y_min, y_max_m=y_max)
 
 
 def choose_step(bounds: tuple[float, float, float, float]) -> float:

@@ -1,5 +1,6 @@
 """Sources of a city: a file, or a scene inside the installed sionna-rt package."""
 
+import os
 import re
 from importlib.util import find_spec
 from pathlib import Path
@@ -36,7 +37,7 @@ def find_source(source: Path | str) -> Path:
             raise BadInput(f"{text}: sionna-rt has no scene {name!r}; it has: {', '.join(scenes)}")
         return scenes[name]
     path = Path(source)
-    if not path.is_file():
+    if not os.path.isfile(path):  # unlike Path, False for an impossible name, too
         raise BadInput(f"{path} is not a file; give a map, a Mitsuba or Sionna RT scene (.xml), or "
                        "sionna:NAME with one of: "
                        f"{', '.join(sionna_scenes()) or '(sionna-rt is not installed)'}")
@@ -54,4 +55,9 @@ def scene_name(source: Path | str) -> str:
     """
     text = str(source)
     name = text.removeprefix("sionna:") if text.startswith("sionna:") else Path(source).stem
-    return re.sub(r"[^A-Za-z0-9_.+-]", "_", name)[:64] or "city"
+    return re.sub(r"[^A-Za-z0-9_.+-]", "_", name).lstrip(".")[:64] or "city"
+
+
+def source_text(source: Path | str) -> str:
+    """Return a source for `scene.toml`, with an escape for each byte that is not UTF-8."""
+    return str(source).encode("utf-8", "backslashreplace").decode("utf-8")

@@ -9,7 +9,7 @@ import pyogrio
 import pytest
 import shapely
 
-from radiotwin.budgets import CROSSINGS, OUTLINE_CORNERS, OVERLAPS
+from radiotwin.budgets import CROSSINGS, OUTLINE_CORNERS, OVERLAPS, TOUCHING_CORNERS
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.footprints import build_scene_from_map, overpass
 from radiotwin.footprints.geopackage import read_geopackage
@@ -59,7 +59,16 @@ def test_many_equal_buildings(tmp_path, monkeypatch):
         check(tmp_path, *[box(0, 0)] * 20)
 
 
+def test_pairs_are_counted_before_they_are_cut(tmp_path, monkeypatch):
+    monkeypatch.setenv(TOUCHING_CORNERS.variable, "1000")
+    monkeypatch.setattr("shapely.intersection", None)
+    with pytest.raises(BadInput, match="corners in pairs of buildings that touch; at most 1,000"):
+        check(tmp_path, *[box(0, 0)] * 20)
+
+
 @pytest.mark.parametrize("rings", [
+    [[[179.999, 10], [-179.999, 10], [-179.999, 10.001], [179.999, 10]]],
+    [[[x * 179.999, 10], [x * 179.9999, 10], [x * 179.9999, 10.0001], [x * 179.999, 10]] for x in (1, -1)],
     [[[-170, -80], [170, -80], [170, 80], [-170, 80], [-170, -80]]],
     [box(0, 0), [[-10, 47.4], [8.6, 47.4], [8.6, 47.40001], [-10, 47.4]]],
     [box(0, 0), [[-171.5, -47.4], [-171.4, -47.4], [-171.4, -47.3], [-171.5, -47.4]]]])

@@ -377,3 +377,15 @@ def test_munich_of_sionna(tmp_path):
     assert scene.city.inside(points[built] - [0, 0, 1]).mean() > 0.999
     assert not scene.city.inside(points[built] + [0, 0, 1]).any()
     assert not scene.city.inside(points[top_m < 0.1] + [0, 0, 1.5]).any()
+
+
+def test_all_meshes_share_one_budget(town, tmp_path, monkeypatch):
+    monkeypatch.setenv("RADIOTWIN_MAX_VERTICES", "50")
+    with pytest.raises(BadInput, match="town.xml with its meshes: [0-9]+ vertices; at most 50"):
+        build_scene(town.write(), tmp_path / "out", check_only=True)
+
+
+@pytest.mark.parametrize("bbox", [(0, 0, 1e-300, 1e300), (-1e308, -1e308, 1e308, 1e308), (0, 0, 1e-9, 50)])
+def test_a_part_without_measure(town, bbox):
+    with pytest.raises(BadInput, match="an extent of .*(not possible|but a line)"):
+        check(town.write(), bbox=bbox)

@@ -90,13 +90,15 @@ def test_own_constants_under_an_itu_name_get_another(empty_city):
         (
             '<bsdf type="radio-material" id="m"><float name="relative_permittivity" value="0.5"/></bsdf>',
             "m",
-            "at least 1",
+            r"allowed: 1 to 1e\+06",
         ),
         (
             '<bsdf type="radio-material" id="m"><float name="conductivity" value="-1"/></bsdf>',
             "m",
-            "at least 0",
+            r"allowed: 0 to 1e\+10",
         ),
+        *((f'<bsdf type="radio-material" id="m"><float name="{name}" value="1e308"/></bsdf>', "m", "is not possible")
+          for name in ("relative_permittivity", "conductivity", "thickness")),
         (
             '<bsdf type="radio-material" id="m"><float name="scattering_coefficient" value="2"/></bsdf>',
             "m",

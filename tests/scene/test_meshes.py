@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.meshes import clean, load_shape, load_shapes, read_obj
+from radiotwin.scene.meshes import clean, is_volume, load_shape, load_shapes, read_obj
 from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
 
 
@@ -172,3 +172,22 @@ def test_obj_indices_of_many_digits(tmp_path, text):
     (tmp_path / "a.obj").write_text(text)
     with pytest.raises(BadInput, match="row [23]"):
         read_obj(tmp_path / "a.obj")
+
+
+def test_cleaning_keeps_the_first_of_equal_corners_in_order():
+    rng = np.random.default_rng(0)
+    vertices = rng.integers(0, 4, (300, 3)) + rng.uniform(-2e-5, 2e-5, (300, 3))
+    faces = rng.permutation(300).reshape(-1, 3)
+    found, _, _ = clean(vertices, faces)
+    _, first = np.unique(np.round(vertices, 4), axis=0, return_index=True)
+    assert set(map(tuple, found)) <= set(map(tuple, vertices[first]))
+    assert (np.lexsort(np.round(found, 4).T[::-1]) == np.arange(len(found))).all()
+
+
+def test_what_encloses_a_volume(town):
+    vertices, faces = town.box((0, 9), (0, 5))
+    faces = np.array(faces)
+    assert is_volume(vertices + [1e5, 1e5, 0], faces)
+    turned = np.concatenate([faces[:1, ::-1], faces[1:]])
+    for other in (faces[:, ::-1], faces[1:], turned, np.concatenate([faces, faces]), faces[:0]):
+        assert not is_volume(vertices, other)

@@ -4,7 +4,7 @@ import sys
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.scene.sources import find_source, scene_name
+from radiotwin.scene.sources import find_source, scene_name, source_text
 
 
 def test_sionna_scene_is_found():
@@ -40,3 +40,10 @@ def test_building_needs_no_ray_tracer():
         "sys.exit(bool({'mitsuba', 'drjit', 'sionna.rt'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_names_that_no_file_can_have():
+    with pytest.raises(BadInput, match="is not a file"):
+        find_source("a" * 300 + ".xml")
+    assert scene_name("..xml") == "city" and scene_name(".town.xml") == "town"
+    assert source_text("\udcffä.osm") == r"\udcffä.osm"
