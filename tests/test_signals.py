@@ -55,3 +55,26 @@ def test_a_child_never_gets_a_ctrl_c(tmp_path):
     """The first one got it: Python's resource tracker, started with it, let the signal through again."""
     done = run(CHILD, tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+WHILE_LOADED = """
+import enum, os, signal, sys
+set_item, sent = enum._EnumDict.__setitem__, []
+def signalled(self, *item):
+    if "drjit" in sys.modules and not sent:
+        sent.append(True)
+        os.kill(os.getpid(), signal.SIGINT)
+    return set_item(self, *item)
+enum._EnumDict.__setitem__ = signalled
+from radiotwin import signals
+from radiotwin.exits import exit_status
+from radiotwin.trace.sionna_scene import import_sionna
+signals.leave(exit_status(import_sionna, "all is kept"))
+"""
+
+
+@pytest.mark.llvm
+def test_a_signal_while_the_tracer_is_loaded(tmp_path):
+    """Compiled code that makes an enumeration aborted the process."""
+    done = run(WHILE_LOADED, tmp_path)
+    assert (done.returncode, done.stderr) == (130, "radiotwin: interrupted; all is kept\n")
