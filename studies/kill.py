@@ -208,9 +208,10 @@ def digests(folder: Path) -> dict[str, str]:
 def timeless(path: Path) -> bytes:
     """Return the content of a file without durations and the times of events."""
     if path.name.startswith("events.out.tfevents"):
-        return repr([(event.step, value.tag, str(value)) for event in
-                     EventFileLoader(str(path)).Load() for value in event.summary.value
-                     if value.tag.rpartition("/")[2] not in CLOCKS]).encode()
+        # A resumed run logs the rounds before it, then their blocks of training.
+        return repr(sorted((event.step, value.tag, str(value)) for event in
+                           EventFileLoader(str(path)).Load() for value in event.summary.value
+                           if value.tag.rpartition("/")[2] not in CLOCKS)).encode()
     if path.name == CHECKPOINT:
         return _bytes_of(load_checkpoint(path))
     if path.name == "metrics.csv":
