@@ -2,10 +2,9 @@
 
 import hashlib
 import json
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -22,13 +21,16 @@ from marl.sizes import check_sizes
 from marl.threads import keep_memory, limit_threads, torch_device
 from radiotwin.cells import write_csv
 from radiotwin.console import print_rows
-from radiotwin.errors import BadInput, RunFailed
+from radiotwin.errors import BadInput
 from radiotwin.files import atomic_file, atomic_path, is_temporary
 from radiotwin.inputs import read_bytes, read_json, require_plain
 from radiotwin.progress import progress
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.survey import read_truth
+
+if TYPE_CHECKING:
+    from marl.event_log import EventLog
 
 TRAINED_IN = {"nn": "NN twin", "log-distance": "log-distance twin", "kriging": "kriging twin",
               "raytrace": "ray-traced twin", "truth": "the truth"}
@@ -184,34 +186,22 @@ class _Log:
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._rows, self._blocks = folder, 0, 0
-        self._writer: Any = None
+        self._events: EventLog | None = None
 
     def __call__(self, rows: list[dict], blocks: list[dict]) -> None:
         with atomic_path(self._folder / "metrics.csv") as temporary:
             write_csv(pd.DataFrame(rows), temporary)
-        try:
-            self._log(rows, blocks)
-        except OSError as error:
-            raise RunFailed(f"cannot write {self._folder / 'tensorboard'}: "
-                            f"{error.strerror or error}; the finished rounds are kept: make room, "
-                            "and go on with --resume") from error
+        if self._events is None:
+            from marl.event_log import EventLog  # slow to load
 
-    def _log(self, rows: list[dict], blocks: list[dict]) -> None:
-        """Add to the TensorBoard events."""
-        if self._writer is None:
-            from torch.utils.tensorboard import SummaryWriter
-
-            # A resumed run logs its first rounds again, so nothing is there twice.
-            shutil.rmtree(self._folder / "tensorboard", ignore_errors=True)
-            self._writer = SummaryWriter(self._folder / "tensorboard")
+            self._events = EventLog(self._folder / "tensorboard")
         for row in rows[self._rows:]:
-            self._scalars("round", row, row["round"])
+            self._events.add("round", row["round"], _numbers(row))
         for block in blocks[self._blocks:]:
-            self._scalars("train", block, block["episodes"])
+            self._events.add("train", block["episodes"], _numbers(block))
         self._rows, self._blocks = len(rows), len(blocks)
-        self._writer.flush()
+        self._events.flush()
 
-    def _scalars(self, group: str, record: dict, step: int) -> None:
-        for name, value in record.items():
-            if name not in ("round", "episodes") and np.isfinite(value):
-                self._writer.add_scalar(f"{group}/{name}", value, step)
+
+def _numbers(record: dict) -> dict[str, float]:
+    return {name: value for name, value in record.items() if name not in ("round", "episodes")}

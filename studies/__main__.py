@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from radiotwin.console import complain, say, show_warnings_plainly
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, RunFailed
 from radiotwin.files import atomic_path
 from studies import runner
 
@@ -43,6 +43,9 @@ def main(
     except BadInput as error:
         complain(str(error))
         raise typer.Exit(2) from None
+    except RunFailed as error:
+        complain(f"{error}; finished rows are kept: the same command with --resume goes on")
+        raise typer.Exit(1) from None
     except KeyboardInterrupt:
         complain("interrupted; finished rows are kept: the same command with --resume goes on")
         raise typer.Exit(130) from None

@@ -5,7 +5,6 @@ anew, the command is killed (SIGKILL) and run again to its end: its outputs have
 bytes, and neither temporaries nor processes may be left over.
 """
 
-import gzip
 import hashlib
 import json
 import os
@@ -15,20 +14,22 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from tensorboard.backend.event_processing.event_file_loader import EventFileLoader
 
+from marl.checkpoint import NAME as CHECKPOINT
+from marl.checkpoint import load_checkpoint
 from radiotwin.cells import write_csv
 from radiotwin.errors import RunFailed
 from radiotwin.files import scratch_folder
 from studies.runner import Study
 from studies.tables import markdown
 
-MOMENTS = 4  # a row, with its own undisturbed run; five seeds make twenty
+MOMENTS = 10  # a row, with its own undisturbed run; two seeds make twenty
 EARLIEST_S = 0.05
 ORPHANS_MAY_LIVE_S = 20.0  # those that notice a closed pipe when their step is done
 RADIOTWIN = ("-c", "from radiotwin.cli import main; main()")
@@ -44,15 +45,15 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "build-scene": (*RADIOTWIN, "build-scene", "data/city.geojson", "-o", "out"),
     "map": (*RADIOTWIN, "map", "twin", *SCENE, "-o", "out/twin.nc"),
     "marl": ("-m", "marl.fedqmix", *SCENE, "--truth", "segmented", "--twin", "log-distance",
-             "--algorithm", "fedqmix", "--real-episodes", "2", "--episodes", "8", "--flights", "2",
-             "--planner-iterations", "50", "--out", "out"),
+             "--algorithm", "fedqmix", "--real-episodes", "3", "--episodes", "16", "--batch", "8",
+             "--replay", "40", "--flights", "2", "--planner-iterations", "50", "--compare", "false",
+             "--out", "out"),
     "demo": (*RADIOTWIN, "demo", "-o", "out"),
 }
 """Arguments of Python, in a folder with `scene`, `data` and `twin`; results go to `out`."""
 
-NOT_COMPARED = ("events.out.tfevents.*", "checkpoint.pt")  # files with clock times in them
-CLOCKS = {"seconds", "date", "created", "elapsed_s", "wall_s", "cpu_s", "train_s", "plan_s"}
-"""Keys of JSON files, and columns of tables, that hold clock times."""
+CLOCKS = {"learn_twin_s", "round_s"}
+"""Names of durations in the tables, checkpoints and events of planning: all that may differ."""
 
 
 def measure_kills(seed: int, settings: dict) -> dict:
@@ -99,7 +100,7 @@ class Workplace:
             (root / name).mkdir()
         self.environment = os.environ | {
             "PYTHONPATH": str(Path(__file__).parents[1]), "XDG_CACHE_HOME": str(root / "cache"),
-            "TMPDIR": str(root / "temporary")}
+            "RADIOTWIN_CACHE": "", "TMPDIR": str(root / "temporary")}
 
     def start(self, *arguments: str) -> subprocess.Popen:
         """Start Python in a session of its own, by which its processes are found again."""
@@ -170,7 +171,7 @@ def finish(place: Workplace, command: str) -> None:
     Raises:
         RunFailed: its exit status is not 0.
     """
-    again = ("--resume",) if command == "marl" and (place.work / "out/checkpoint.pt").is_file() \
+    again = ("--resume",) if command == "marl" and (place.work / "out/config.json").is_file() \
         else ()
     status = place.start(*COMMANDS[command], *again).wait()
     if status:
@@ -200,29 +201,38 @@ def _processes(session: int) -> Iterator[int]:
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """Return path -> hash of every file of a result, clock times aside."""
+    """Return path -> hash of every file of a result, durations aside."""
     return {path.relative_to(folder).as_posix(): hashlib.sha256(timeless(path)).hexdigest()
-            for path in sorted(folder.rglob("*"))
-            if path.is_file() and not any(fnmatch(path.name, each) for each in NOT_COMPARED)}
+            for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def timeless(path: Path) -> bytes:
-    """Return the content of a file without what holds clock times."""
-    data = path.read_bytes()
-    if path.suffix == ".gz":  # its head has the time
-        data = gzip.decompress(data)
-    if path.suffix == ".json":
-        return json.dumps(_without_clocks(json.loads(data))).encode()
-    if path.suffix == ".csv":
+    """Return the content of a file without durations and the times of events."""
+    if path.name.startswith("events.out.tfevents"):
+        # A resumed run logs the rounds before it, then their blocks of training.
+        return repr(sorted((event.step, value.tag, str(value)) for event in
+                           EventFileLoader(str(path)).Load() for value in event.summary.value
+                           if value.tag.rpartition("/")[2] not in CLOCKS)).encode()
+    if path.name == CHECKPOINT:
+        return _bytes_of(load_checkpoint(path))
+    if path.name == "metrics.csv":
         table = pd.read_csv(path, dtype=str, keep_default_na=False)
         return table.drop(columns=[name for name in table if name in CLOCKS]).to_json().encode()
-    return data
+    return path.read_bytes()
 
 
-def _without_clocks(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_clocks(each) for key, each in value.items() if key not in CLOCKS}
-    return [_without_clocks(each) for each in value] if isinstance(value, list) else value
+def _bytes_of(value: Any) -> bytes:
+    """Return the bytes of nested dicts, lists, tables, arrays and numbers, durations aside."""
+    if isinstance(value, dict | pd.DataFrame):
+        return b"".join(str(name).encode() + b"=" + _bytes_of(each)
+                        for name, each in value.items() if name not in CLOCKS)
+    if isinstance(value, list):
+        return b"[" + b",".join(map(_bytes_of, value)) + b"]"
+    if hasattr(value, "numpy"):  # a tensor
+        value = value.numpy()
+    numeric = isinstance(value, np.ndarray) and value.dtype != object
+    return value.tobytes() if numeric else repr(
+        value.tolist() if hasattr(value, "tolist") else value).encode()
 
 
 def kill_cases(seed: int) -> dict[str, dict]:
@@ -244,4 +254,4 @@ def kill_table(rows: pd.DataFrame) -> str:
 
 
 STUDIES = {"kill": Study("Does a killed command end the same when it runs again?", measure_kills,
-                         kill_cases, kill_table, seeds=5)}
+                         kill_cases, kill_table, seeds=2)}

@@ -14,6 +14,7 @@ from radiotwin.files import scratch_folder
 from radiotwin.scene.materials import permittivity, ranges_text
 from radiotwin.scene.reader import read_city
 from radiotwin.scene.writer import write_city
+from radiotwin.signals import deferred
 
 log = logging.getLogger(__name__)
 
@@ -34,8 +35,9 @@ def import_sionna() -> Any:
         RunFailed: No usable libLLVM.
     """
     llvm.prepare()
-    import mitsuba
-    import sionna.rt
+    with deferred():  # their compiled parts abort where Python raises while they are loaded
+        import mitsuba
+        import sionna.rt
 
     own = mitsuba.FileResolver()
     own.clear()

@@ -4,18 +4,28 @@ Where the machine allows no mount (only root may), the tests of `tests/test_file
 """
 
 import contextlib
+import io
 import os
+import shlex
 import shutil
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from marl.fedqmix.__main__ import app as plan
+from radiotwin.errors import RunFailed
+from radiotwin.exits import exit_status
 from radiotwin.export import EXPORTERS
 from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.trace.batches import BatchStore
+from tests.cli.conftest import as_in_a_process_of_its_own
 
-DISK_BYTES = 64 * 1024
-IMPORT = """[columns]
+DISK_BYTES = 1024 * 1024
+IMPORT = """length_unit = "m"
+level_unit = "dB"
+[columns]
 level = "gain_db"
 receiver = "receiver"
 x = "receiver_x_m"
@@ -28,7 +38,7 @@ OLD = b"an older result\n"
 
 @pytest.fixture(scope="module")
 def disk(tmp_path_factory):
-    """A file system of 64 KiB."""
+    """A file system of 1 MiB."""
     folder = tmp_path_factory.mktemp("disk")
     options = ["-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", str(folder)]
     mount = shutil.which("mount")
@@ -50,16 +60,23 @@ def inputs(small_scene, tmp_path_factory, run):
     fly_survey(small_scene, truth, flights=2, pattern="random-waypoint", seed=0).write(folder / "m.csv")
     assert run("fit m.csv --scene scene --model log_distance -o twin", folder).returncode == 0
     (folder / "import.toml").write_text(IMPORT)
+    version_1 = Path(__file__).parents[1] / "twin" / "version_1"
+    shutil.copytree(version_1 / "corrected", folder / "corrected")
+    (folder / "links").mkdir()
+    shutil.copy(version_1 / "links" / "measurements.csv", folder / "links")
+    first, *others = (version_1 / "links" / "devices.csv").read_text().splitlines()
+    lost = f"{others[-1].split(',')[0]},,,1.5,unknown,2400000000.0"
+    (folder / "links" / "devices.csv").write_text("\n".join([first, *others[:-1], lost, ""]))
     (folder / "points.csv").write_text("x_m,y_m,z_m\n" + "80,60,30\n" * 50)
     return folder
 
 
-def fill(disk, free):
-    """Empty the disk, write an old file and an old folder, and leave some bytes free."""
+def fill(disk, free, *names):
+    """Empty the disk, write old files, and leave some bytes free."""
     for path in disk.iterdir():
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     (disk / "filler").touch()  # what is written into a folder that exists takes room as well
-    for name in ("old.csv", "old.nc"):
+    for name in {"old.csv", "old.nc", *names}:
         (disk / name).write_bytes(OLD)
     with contextlib.suppress(OSError), open(disk / "filler", "wb", buffering=0) as file:
         while file.write(bytes(4096)):
@@ -72,6 +89,21 @@ def content(disk):
     return {str(path.relative_to(disk)): path.read_bytes() if path.is_file() else None for path in disk.rglob("*")}
 
 
+def assert_says_so(result):
+    """One message and no other word of success or of Python, and status 1."""
+    message = " ".join(result.stderr.split())
+    assert result.returncode == 1 and "No space left on device" in message, (result.returncode, result.stderr)
+    assert "unchanged" in message or "are kept" in message
+    assert result.stderr.startswith("radiotwin: ") and len(result.stderr.splitlines()) == 1
+    assert "wrote" not in result.stdout and "look at" not in result.stdout
+
+
+def assert_all_is_whole(disk):
+    """Of the files of a folder that is filled bit by bit those are whole that had room."""
+    assert not [path for path in disk.rglob("*") if ".radiotwin-" in path.name]
+    assert all(path.stat().st_size for path in disk.rglob("*") if path.is_file() and "tfevents" not in path.name)
+
+
 COMMANDS = [
     "build-scene preset:small -o {disk}/new",
     "survey scene --truth segmented -o {disk}/new/m.csv", "survey scene --truth segmented -o {disk}/new/m.parquet",
@@ -79,38 +111,64 @@ COMMANDS = [
     "import m.csv --devices devices.csv --columns import.toml -o {disk}/new", "fit m.csv --scene scene --model log_distance -o {disk}/new",
     *(f"map twin --scene scene -o {{disk}}/old{suffix}" for suffix in (*EXPORTERS, ".png")),
     *(f"export-scene scene -o {{disk}}/{name}" for name in ("new", "old.glb", "old.gltf", "old.obj")),
-    "report twin --scene scene -o {disk}/old.html",
+    "report twin --scene scene -o {disk}/old.html", "locate links/measurements.csv --twin corrected -o {disk}/old.csv",
+    "demo -o {disk}/new",
 ]
 
 
 @pytest.mark.parametrize("free", [0, 4096])
 @pytest.mark.parametrize("command", COMMANDS)
 def test_the_old_output_stays(run, disk, inputs, command, free):
-    fill(disk, free)
     out = command.rpartition("/")[2]
-    if out.startswith("old"):
-        (disk / out).write_bytes(OLD if free else b"")
+    fill(disk, free, *[out] * out.startswith("old"))
     before = content(disk)
     result = run(command.format(disk=disk), inputs)
     if free and result.returncode == 0:
         pytest.skip("the output is so small that it had room")
-    message = " ".join(result.stderr.split())
-    assert result.returncode == 1 and "No space left on device" in message and "unchanged" in message, message
-    assert result.stderr.count("radiotwin:") == 1 and "Traceback" not in result.stderr
-    assert "wrote" not in result.stdout
+    assert_says_so(result)
     assert content(disk) == before
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("free", [0, 24 * 1024, 160 * 1024])
 @pytest.mark.parametrize("command", ["compare m.csv --scene scene -o {disk}/new",
                                      "close-loop m.csv --scene scene --base log-distance -o {disk}/new"])
-def test_what_takes_long_says_so_in_the_end(run, disk, inputs, command):
-    """Of the files in its folder those are whole that had room."""
-    fill(disk, 0)
-    result = run(command.format(disk=disk), inputs)
-    assert result.returncode == 1 and "No space left on device" in result.stderr, result.stderr
-    assert not [path for path in disk.rglob("*") if ".radiotwin-" in path.name]
-    assert all(path.stat().st_size for path in disk.rglob("*") if path.is_file())
+def test_what_takes_long_says_so_in_the_end(run, disk, inputs, command, free):
+    fill(disk, free)
+    assert_says_so(run(command.format(disk=disk), inputs))
+    assert_all_is_whole(disk)
+
+
+PLANNED = ("config.json", "twin", "checkpoint.safetensors", "metrics.csv", "tensorboard", "comparison.csv", "curve.png",
+           "flights.csv", "trajectories.png")  # in the order in which they are written
+
+
+def planning(out, inputs):
+    arguments = "--scene scene --truth segmented --twin log-distance --algorithm random --real-episodes 1 " \
+                f"--planner-iterations 50 --flights 2 --out {out}"
+    said, error = io.StringIO(), io.StringIO()
+    with as_in_a_process_of_its_own(shlex.split(arguments), inputs), contextlib.redirect_stdout(said), \
+            contextlib.redirect_stderr(error):
+        status = exit_status(plan, "")
+    return subprocess.CompletedProcess(arguments, status, said.getvalue(), error.getvalue())
+
+
+@pytest.fixture(scope="module")
+def room(inputs):
+    """Name -> bytes of the pages of all that is written before it."""
+    assert planning("whole", inputs).returncode == 0
+    pages = [sum(-(-path.stat().st_size // 4096) for path in [inputs / "whole" / name, *(inputs / "whole" / name).glob("*")]
+                 if path.is_file()) for name in PLANNED]
+    return {name: 4096 * sum(pages[:number]) for number, name in enumerate(PLANNED)}
+
+
+@pytest.mark.parametrize("name", PLANNED)
+def test_planning(disk, inputs, room, name):
+    fill(disk, room[name])
+    result = planning(disk / "new", inputs)
+    assert_says_so(result)
+    assert f"cannot write {disk}/new/{name}" in result.stderr
+    assert_all_is_whole(disk)
 
 
 def test_a_map_in_a_process_of_its_own_ends_as_it_should(run_installed, disk, inputs):
@@ -128,22 +186,45 @@ def traced_gains(scene, device_m, points_m, *_):
 def test_gains(run, disk, inputs, monkeypatch):
     monkeypatch.setattr("radiotwin.trace.points.trace_gains", traced_gains)
     for name in ("old.csv", "old.csv.gz"):
-        fill(disk, 0)
+        fill(disk, 0, name)
         before = content(disk)
         result = run(f"gains scene --points points.csv -o {disk}/{name}", inputs)
         assert result.returncode == 1 and "No space left on device" in result.stderr, result.stderr
         assert content(disk) == before
 
 
-def test_trace(run, disk, inputs, monkeypatch):
+@pytest.fixture
+def traced(monkeypatch):
+    """A tracer that takes no time."""
     monkeypatch.setattr("radiotwin.trace.run.solve_lattice",
                         lambda scene, settings, store, index: np.full((len(index), scene.blocked.size), -80.0))
     monkeypatch.setattr("radiotwin.trace.run.solve_finer", lambda *_: (
         np.zeros((1, 1), int), np.arange(1), np.full((1, 1), -80.0)))
     monkeypatch.setattr("radiotwin.trace.run.check_gains", lambda *_: {})
     monkeypatch.setattr("radiotwin.trace.run.noise_figures", lambda *_: {})
+
+
+def test_trace(run, disk, inputs, traced):
     fill(disk, 4096)
     before = content(disk)
-    result = run(f"trace scene -o {disk}/old.nc", inputs)
-    assert result.returncode == 1 and "No space left on device" in result.stderr, result.stderr
+    assert_says_so(run(f"trace scene -o {disk}/old.nc", inputs))
     assert content(disk) == before
+
+
+def test_batches_of_a_trace(disk):
+    fill(disk, 4096)
+    store = BatchStore(disk, {"a": 1})
+    before = content(disk)
+    with pytest.raises(RunFailed, match="No space left on device"):
+        store.put("0", np.zeros(2000))
+    assert content(disk) == before and store.get("0", 2000) is None
+
+
+@pytest.mark.parametrize("free", [120 * 1024, *(pytest.param(size * 1024, marks=pytest.mark.slow)
+                                                for size in (320, 500, 700))])
+def test_the_demo_stops_at_the_step_that_has_no_room(run, disk, inputs, traced, free):
+    fill(disk, free)
+    result = run(f"demo -o {disk}/new", inputs)
+    print(result.stdout, result.stderr, [(p.name, p.stat().st_size) for p in disk.rglob("*")])
+    assert_says_so(result)
+    assert_all_is_whole(disk)

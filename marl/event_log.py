@@ -1,0 +1,69 @@
+"""Events for TensorBoard, on the disk when the call returns.
+
+TensorBoard's own writer has a thread that writes; where the disk is full it ends in a traceback.
+"""
+
+import os
+import shutil
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from tensorboard.compat.proto.event_pb2 import Event
+from tensorboard.compat.proto.summary_pb2 import Summary
+from tensorboard.summary.writer.record_writer import RecordWriter
+
+from radiotwin.errors import RunFailed
+
+NAME = "events.out.tfevents.radiotwin"  # TensorBoard looks for the second part
+VERSION = "brain.Event:2"
+
+
+class EventLog:
+    """The events of one run, in a folder of their own.
+
+    Args:
+        folder: is emptied: a resumed run logs its first rounds again, so nothing is there twice.
+
+    Raises:
+        RunFailed: the disk is full or failed, here and in `flush`.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / NAME
+        self._events = [Event(wall_time=time.time(), file_version=VERSION)]
+        shutil.rmtree(folder, ignore_errors=True)
+        try:
+            folder.mkdir(parents=True)
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def add(self, group: str, step: int, values: Mapping[str, float]) -> None:
+        """Add the numbers of one step; those that are not finite are left out.
+
+        Args:
+            group: name before the slash, under which TensorBoard shows them.
+            step: number of the round, or of episodes so far.
+            values: name -> number.
+        """
+        summary = Summary(value=[Summary.Value(tag=f"{group}/{name}", simple_value=value)
+                                 for name, value in values.items() if np.isfinite(value)])
+        self._events.append(Event(wall_time=time.time(), step=step, summary=summary))
+
+    def flush(self) -> None:
+        """Write what was added since the last call."""
+        try:
+            with self._path.open("ab") as file:
+                records = RecordWriter(file)
+                for event in self._events:
+                    records.write(event.SerializeToString())
+                file.flush()
+                os.fsync(file.fileno())
+        except OSError as error:
+            raise self._failed(error) from error
+        self._events.clear()
+
+    def _failed(self, error: OSError) -> RunFailed:
+        return RunFailed(f"cannot write {self._path}: {error.strerror or error}; the finished "
+                         "rounds are kept: make room, and go on with --resume")
