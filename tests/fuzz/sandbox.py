@@ -14,7 +14,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.fuzz.honest import run_command
+from tests.fuzz.honest import one_core, run_command
 
 ALLOWED_STATUS = (0, 2, 130)
 MAX_PEAK_BYTES, MAX_WALL_S = 2 * 2**30, 60
@@ -62,6 +62,13 @@ def run_watched(command: str, case: Path, listener: socket.socket) -> Outcome:
         breaches += sorted(set((case / _BREACHES_FILE).read_text(errors="replace").splitlines()))
     breaches += _leaks(case, listener)
     return Outcome(status, wall_s, usage.ru_maxrss * 1024, output, tuple(breaches))
+
+
+def arguments_of(command: str) -> list[str]:
+    """Return the arguments of a command line, or those in a file, `@FILE`, with NUL between them."""
+    if command.startswith("@"):
+        return Path(command[1:]).read_text(encoding="utf-8", errors="surrogateescape").split("\0")
+    return command.split(" ")
 
 
 def _leaks(case: Path, listener: socket.socket) -> list[str]:
@@ -115,12 +122,12 @@ def _child(command: str, case: Path) -> None:
         tempfile.tempdir = str(case / "tmp")
         resource.setrlimit(resource.RLIMIT_FSIZE, (2**30, 2**30))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        module, *arguments = command.split(" ")
-        sys.argv = [module, *arguments]
+        sys.argv = arguments_of(command)
         breaches = os.open(case / _BREACHES_FILE, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         sys.addaudithook(_Watch(case, breaches))
         try:
-            run_command(module)
+            with one_core():
+                run_command(sys.argv[0])
             status = 0
         except SystemExit as end:
             status = end.code if isinstance(end.code, int) else 0 if end.code is None else 1
