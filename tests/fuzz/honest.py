@@ -43,8 +43,8 @@ LINES = {
     "fit": "radiotwin fit survey/measurements.csv --scene scene -o out --model log_distance --seed 1 --start twin "
            "--devices survey/devices.csv",
     "map": "radiotwin map twin --scene scene -o out.nc --devices d1,d2 --altitudes 55",
-    "loop": "radiotwin close-loop open/measurements.csv -o out --base log-distance --hold-out block --seed 1 --scene scene",
-    "locate": "radiotwin locate open/measurements.csv -o out.csv --twin loop/twin --truth located.csv --scene scene",
+    "loop": "radiotwin close-loop survey/measurements.csv -o out --base log-distance --hold-out block --seed 1 --scene scene",
+    "locate": "radiotwin locate open/measurements.csv -o out.csv --twin loop/twin --truth located.csv --devices open/devices.csv",
     "compare": "radiotwin compare survey/measurements.csv -o out --scene scene --truth map.nc --held-out 1 --seed 1 --also twin",
     "report": "radiotwin report twin -o out.html --scene scene --truth segmented --measurements survey/measurements.csv",
     "import": "radiotwin import log.csv -o out --columns import.toml --level-unit dBm --length-unit m --time-zone UTC "
@@ -207,7 +207,7 @@ def _write_other_logs(folder: Path) -> None:
     (folder / "fixed.csv").write_text("when,mast,cell,rsrp,level_b\n" + "".join(
         f"{i},m{i % 2},c{i // 2 % 2},{-70 - i % 9},{-80 - i % 7}\n" for i in range(40)))
     (folder / "fixed.toml").write_text(
-        'devices = "sites.csv"\nreceivers = "masts.csv"\ntime_format = "epoch s"\nlevel_unit = "dBm"\n'
+        'devices = "sites.csv"\nlength_unit = "m"\nreceivers = "masts.csv"\ntime_format = "epoch s"\nlevel_unit = "dBm"\n'
         'not_detected = [-150, "no"]\naverage_m = 20.0\n[origin]\nlatitude_deg = 50.0\nlongitude_deg = 8.0\n'
         'altitude_m = 0.0\n[columns]\ntime = "when"\nreceiver = "mast"\ndevice = "cell"\nlevel = "rsrp"\n')
 

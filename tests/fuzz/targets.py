@@ -75,7 +75,7 @@ TARGETS = (
     Target("run folder", "run/config.json", "radiotwin report run -o out.html"),
     Target("run folder", "run/flights.csv", "radiotwin report run -o out.html"),
     Target("run folder", "run/comparison.csv", "radiotwin report run -o out.html"),
-    Target("scene.toml", "scene/scene.toml", f"radiotwin close-loop {_SURVEY} --scene scene --base log-distance -o out",
+    Target("scene.toml", "scene/scene.toml", f"radiotwin close-loop survey/measurements.csv --scene scene --base log-distance -o out",
            slow=True),
     Target("scene.toml", "scene/scene.toml",
            "marl.fedqmix --scene scene --truth segmented --twin truth --algorithm random --real-episodes 1 --flights 2 "

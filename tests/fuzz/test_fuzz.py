@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from tests.fuzz.cases import CORPUS, KINDS, Case, listen, loads, run_case
+from tests.fuzz.cases import CORPUS, Case, instead_of, listen, loads, run_case
 from tests.fuzz.honest import make_honest
 from tests.fuzz.mutations import Mutation, names
 from tests.fuzz.sandbox import CANARY, prepare_case, run_watched
@@ -36,7 +36,7 @@ def cases():
     def of(target):
         mutation = st.builds(Mutation, st.sampled_from(names(target.suffix)), st.floats(0, 0.999999), st.integers(0, 10**6))
         changed = st.builds(partial(Case, target.file, target.command), st.lists(mutation, min_size=1, max_size=3).map(tuple))
-        return st.one_of(*[changed] * 15, st.sampled_from(KINDS).map(partial(Case, target.file, target.command, ())))
+        return st.one_of(*[changed] * 15, st.sampled_from(instead_of(target)).map(partial(Case, target.file, target.command, ())))
     return st.sampled_from([target for target in TARGETS if not target.slow]).flatmap(of)
 
 
