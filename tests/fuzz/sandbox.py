@@ -122,6 +122,7 @@ def _child(command: str, case: Path) -> None:
         tempfile.tempdir = str(case / "tmp")
         resource.setrlimit(resource.RLIMIT_FSIZE, (2**30, 2**30))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        sys.dont_write_bytecode = True
         sys.argv = arguments_of(command)
         breaches = os.open(case / _BREACHES_FILE, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         sys.addaudithook(_Watch(case, breaches))
