@@ -12,6 +12,7 @@ from radiotwin.scene.config import UavConfig
 from radiotwin.survey.grid import MOVE_COST, FlightGrid
 from radiotwin.survey.patterns import PATTERNS
 
+_MAX_NOISE_DB = 50.0  # beyond it levels come out that no reader takes for levels
 _MAX_FLIGHTS = 100_000  # far beyond any campaign: a typing error
 
 
@@ -166,8 +167,9 @@ def _check(scene: Scene, truth: RadioMap, flights: int, pattern: str, noise_db: 
         raise BadInput(f"pattern {pattern!r} is unknown; allowed are {', '.join(PATTERNS)}")
     if not 1 <= flights <= _MAX_FLIGHTS:
         raise BadInput(f"flights = {flights}: allowed is 1 to {_MAX_FLIGHTS}")
-    if not 0 <= noise_db < np.inf:
-        raise BadInput(f"noise_db = {noise_db}: a standard deviation is a finite number, 0 or more")
+    if not 0 <= noise_db <= _MAX_NOISE_DB:
+        raise BadInput(f"noise_db = {noise_db}: a standard deviation is 0 or more, and at most "
+                       f"{_MAX_NOISE_DB:g} dB")
     if not scene.config.uavs:
         raise BadInput(f"{path}: declares no UAV; add at least one [[uavs]] table, or build the "
                        "scene with --uavs N")

@@ -46,14 +46,14 @@ def loads(line: str) -> Case:
 
 def instead_of(target: Target) -> list[str]:
     """Return what may be put instead of a file; a file that the user names may be a link to any place."""
-    named = target.file in target.command.split() or target.suffix == ".args"
+    named = target.file in target.command.split()
     return [kind for kind in KINDS if not (named and kind == "link out")]
 
 
 def draw(rng: random.Random, targets: list[Target]) -> Case:
     """Draw a case."""
     target = rng.choice(targets)
-    if rng.random() < 0.03:
+    if rng.random() < 0.03 and target.suffix != ".args":
         return Case(target.file, target.command, (), rng.choice(instead_of(target)))
     kinds = names(target.suffix)
     return Case(target.file, target.command, tuple(

@@ -19,7 +19,7 @@ import numpy as np
 import pandas as pd
 
 SQUARE = [[8.001, 50.001], [8.002, 50.001], [8.002, 50.002], [8.001, 50.002], [8.001, 50.001]]
-RUN = "scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare false --hidden 8"
+RUN = "scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare false --planner-iterations 50 --hidden 8"
 COMMANDS = (
     "radiotwin build-scene preset:small -o scene",
     "radiotwin survey scene --truth segmented --flights 2 -o survey/measurements.csv",
@@ -52,8 +52,8 @@ LINES = {
               "--min-distance-m 1 --max-distance-m 1e6 --average-m 10 --average median --origin 50,8,100 --devices sites.csv",
     "gains": "radiotwin gains scene -o out.csv --points points.csv --devices d1 --sum power --quality fast --seed 1",
     "marl": "python -m marl.fedqmix --out out --scene scene --truth segmented --twin log-distance --algorithm random "
-            "--real-episodes 1 --noise-db 1 --seed 1 --flights 2",
-    "learn": "python -m marl.fedqmix --out out --resume --scene scene --algorithm iql --truth segmented --episodes 4 "
+            "--real-episodes 1 --noise-db 1 --seed 1 --flights 2 --planner-iterations 50",
+    "learn": "python -m marl.fedqmix --out out --scene scene --algorithm iql --truth segmented --episodes 4 --planner-iterations 50 "
              "--real-episodes 1 --flights 2 --compare false --hidden 8 --parallel 2 --replay 8 --batch 2 --discount 0.9",
 }
 
@@ -183,7 +183,6 @@ def _write_effects(folder: Path) -> None:
     devices.loc[devices.index[-1], "role"] = "unknown"
     devices.to_csv(folder / "links" / "devices.csv", index=False)
     run_here("radiotwin locate links/measurements.csv --twin twin_corrected -o links/located.csv", folder)
-    run_here("radiotwin map twin_raytrace --scene scene --altitudes 55 -o paths.nc", folder)
 
 
 def _write_log(folder: Path) -> None:

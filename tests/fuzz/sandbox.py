@@ -165,6 +165,8 @@ class _Watch:
         if not isinstance(path, str | bytes | os.PathLike):
             return None
         path = os.path.realpath(os.fsdecode(path))
+        if os.path.basename(os.path.dirname(path)) == "__pycache__":  # numba compiles once, for all later runs
+            return None
         if flags & _WRITING or (isinstance(mode, str) and set(mode) & set("wax+")):
             return None if path.startswith(self.inside) else f"writes outside: {path}"
         if path in _SECRETS or path == str(self.case / "canary"):
@@ -173,7 +175,7 @@ class _Watch:
 
     def _change(self, event: str, arguments: tuple) -> str | None:
         paths = [os.path.realpath(os.fsdecode(each)) for each in arguments if isinstance(each, str | bytes | os.PathLike)]
-        outside = [path for path in paths if not path.startswith(self.inside)]
+        outside = [path for path in paths if not path.startswith(self.inside) and "__pycache__" not in path]
         return f"{event} outside: {outside[0]}" if outside else None
 
     def _always(self, event: str, arguments: tuple) -> str | None:

@@ -26,7 +26,7 @@ class Target:
 _SURVEY = "open/measurements.csv"
 _FIT = "radiotwin fit survey/{} --scene scene --model log_distance -o out"
 _RUN = ("marl.fedqmix --scene scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare false "
-        "--hidden 8 --out run --resume")
+        "--planner-iterations 50 --hidden 8 --out run --resume")
 _IMPORT = "radiotwin import {} --columns {} -o out"
 _MESH = "scene/meshes/building_000.ply"
 TARGETS = (
@@ -75,11 +75,11 @@ TARGETS = (
     Target("run folder", "run/config.json", "radiotwin report run -o out.html"),
     Target("run folder", "run/flights.csv", "radiotwin report run -o out.html"),
     Target("run folder", "run/comparison.csv", "radiotwin report run -o out.html"),
-    Target("scene.toml", "scene/scene.toml", f"radiotwin close-loop survey/measurements.csv --scene scene --base log-distance -o out",
+    Target("scene.toml", "scene/scene.toml", "radiotwin close-loop survey/measurements.csv --scene scene --base log-distance -o out",
            slow=True),
     Target("scene.toml", "scene/scene.toml",
            "marl.fedqmix --scene scene --truth segmented --twin truth --algorithm random --real-episodes 1 --flights 2 "
-           "--out out"),
+           "--planner-iterations 50 --out out"),
     Target("scene.toml", "scene/scene.toml", "radiotwin build-scene scene/city.xml -o out"),
     Target("foreign city", "roof.obj", "radiotwin build-scene city.xml -o out"),
     Target("foreign city", "exported/city.xml", "radiotwin build-scene exported/city.xml -o out"),
@@ -91,7 +91,8 @@ TARGETS = (
         ("fixed.csv", "fixed.toml"))),
     *(Target("log to import", file, _IMPORT.format("fixed.csv", "fixed.toml")) for file in ("masts.csv", "fixed.toml")),
     Target("points", "points.csv", "radiotwin gains scene --points points.csv --quality fast -o out.csv"),
-    *(Target("twin", f"{folder}/{file}", command.format(folder)) for folder, command in (
+    *(Target("twin", f"{folder}/{file}", command.format(folder), slow="raytrace" in folder)
+      for folder, command in (
         ("twin_corrected", "radiotwin locate links/measurements.csv --twin {} -o out.csv"),
         ("old_corrected", "radiotwin locate links/measurements.csv --twin {} -o out.csv"),
         ("twin_raytrace", "radiotwin map {} --scene scene --altitudes 55 -o out.nc"),

@@ -36,6 +36,8 @@ def cases():
     def of(target):
         mutation = st.builds(Mutation, st.sampled_from(names(target.suffix)), st.floats(0, 0.999999), st.integers(0, 10**6))
         changed = st.builds(partial(Case, target.file, target.command), st.lists(mutation, min_size=1, max_size=3).map(tuple))
+        if target.suffix == ".args":
+            return changed
         return st.one_of(*[changed] * 15, st.sampled_from(instead_of(target)).map(partial(Case, target.file, target.command, ())))
     return st.sampled_from([target for target in TARGETS if not target.slow]).flatmap(of)
 

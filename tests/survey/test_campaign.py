@@ -85,6 +85,7 @@ def test_heading_is_clockwise_from_north_and_time_goes_on(small_scene, truth):
     ({"noise_db": -1.0}, "0 or more"),
     ({"noise_db": float("nan")}, "0 or more"),
     ({"noise_db": float("inf")}, "0 or more"),
+    ({"noise_db": 1e308}, "at most 50 dB"),
 ])
 def test_options_that_cannot_be(small_scene, truth, options, message):
     with pytest.raises(BadInput, match=message):
