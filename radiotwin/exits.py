@@ -8,6 +8,7 @@
 | 128 + signal | 129 terminal closed, 130 interrupted, 141 nobody reads the output, 143 ended |
 """
 
+import errno
 import io
 import json
 import os
@@ -122,6 +123,9 @@ def _explained(error: BaseException, kept: str) -> tuple[int, str]:
                    "fewer processes, or a machine with more memory")
     if isinstance(error, OSError) and _folder_is_gone():
         return 2, "the working folder does not exist any more; change to another one"
+    if isinstance(error, OSError) and error.errno in (errno.ENAMETOOLONG, errno.ELOOP):
+        return 2, (f"{str(error.filename)[:60]}… cannot be a path ({error.strerror}); give the "
+                   "path of a file or folder that exists")
     return 1, _mistake(error)
 
 

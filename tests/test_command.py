@@ -64,6 +64,11 @@ def test_an_app_is_interrupted_with_a_message(capsys):
     assert "interrupted; go on" in capsys.readouterr().err
 
 
+def test_a_path_that_no_file_can_have_is_bad_input(capsys):
+    assert exit_status(lambda: Path("x" * 300).is_dir(), "all is kept") == 2
+    assert "cannot be a path (File name too long)" in capsys.readouterr().err
+
+
 def overflow():
     return overflow()
 

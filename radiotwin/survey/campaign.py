@@ -51,7 +51,9 @@ def fly_survey(scene: Scene, truth: RadioMap, *, flights: int, pattern: str, see
                 rng = np.random.default_rng([seed, flight, number])
                 cells = fly(scene, uav, pattern, rng)
                 index = _lattice_index(scene, uav, cells)
-                level_db = gain_db[:, index] + rng.normal(0, noise_db, (len(gain_db), len(index)))
+                # NumPy refuses -0.0 for a standard deviation.
+                error_db = rng.normal(0, abs(noise_db), (len(gain_db), len(index)))
+                level_db = gain_db[:, index] + error_db
                 if shadowing_sd_db is not None:
                     level_db += rng.normal(0, 1, level_db.shape) * shadowing_sd_db[:, index]
                 level_db[level_db < limit_db] = np.nan

@@ -63,7 +63,7 @@ def fuzz(
 
 
 def _signature(case: Case, breach: str) -> tuple:
-    return case.file, case.command.split()[1], case.instead, breach
+    return case.file, case.command, case.instead, breach
 
 
 def _tail(output: str) -> str:

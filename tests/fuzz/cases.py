@@ -44,11 +44,17 @@ def loads(line: str) -> Case:
     return Case(**record, mutations=mutations)
 
 
+def instead_of(target: Target) -> list[str]:
+    """Return what may be put instead of a file; a file that the user names may be a link to any place."""
+    named = target.file in target.command.split()
+    return [kind for kind in KINDS if not (named and kind == "link out")]
+
+
 def draw(rng: random.Random, targets: list[Target]) -> Case:
     """Draw a case."""
     target = rng.choice(targets)
-    if rng.random() < 0.03:
-        return Case(target.file, target.command, (), rng.choice(KINDS))
+    if rng.random() < 0.03 and target.suffix != ".args":
+        return Case(target.file, target.command, (), rng.choice(instead_of(target)))
     kinds = names(target.suffix)
     return Case(target.file, target.command, tuple(
         Mutation(rng.choice(kinds), round(rng.random(), 6), rng.randrange(10**6)) for _ in range(rng.choice(MUTATION_COUNT))))

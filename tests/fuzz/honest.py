@@ -1,6 +1,7 @@
 """Honest files to begin from, made by the commands themselves in one folder."""
 
 import contextlib
+import gzip
 import io
 import json
 import os
@@ -10,25 +11,51 @@ import shutil
 import signal
 import sys
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pandas as pd
 
 SQUARE = [[8.001, 50.001], [8.002, 50.001], [8.002, 50.002], [8.001, 50.002], [8.001, 50.001]]
-RUN = "scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare false --hidden 8"
+RUN = "scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare false --planner-iterations 50 --hidden 8"
 COMMANDS = (
     "radiotwin build-scene preset:small -o scene",
     "radiotwin survey scene --truth segmented --flights 2 -o survey/measurements.csv",
     "radiotwin fit survey/measurements.csv --scene scene --model log_distance -o twin",
     "radiotwin fit survey/measurements.csv --scene scene -o twin_nn",
+    "radiotwin fit survey/measurements.csv --scene scene --model regression_kriging -o twin_kriging",
     "radiotwin map twin --scene scene -o map.nc",
     "radiotwin compare survey/measurements.csv --scene scene -o comparison",
     "radiotwin close-loop open/measurements.csv --base log-distance -o loop",
     f"marl.fedqmix --scene {RUN} --out run",
     "radiotwin build-scene town.geojson -o town",
     "radiotwin import log.csv --columns import.toml -o imported",
+    "radiotwin export-scene scene -o exported",
 )
+# A command line each, in a file of its own, which is damaged as any other; no value of it names an output.
+LINES = {
+    "build": "radiotwin build-scene town.geojson -o out --devices 2 --uavs 1 --seed 1 --frequency-hz 2.4e9 --bbox "
+             "50,8,50.1,8.1 --height-default 10 --material default=itu_brick",
+    "city": "radiotwin build-scene city.xml -o out --scale 1 --up z --bbox 0,0,90,90 --devices 1 --material wall=itu_brick",
+    "survey": "radiotwin survey scene -o out.csv --truth segmented --flights 1 --pattern lawnmower --noise-db 1 --seed 1",
+    "fit": "radiotwin fit survey/measurements.csv --scene scene -o out --model log_distance --seed 1 --start twin "
+           "--devices survey/devices.csv",
+    "map": "radiotwin map twin --scene scene -o out.nc --devices d1,d2 --altitudes 55",
+    "loop": "radiotwin close-loop survey/measurements.csv -o out --base log-distance --hold-out block --seed 1 --scene scene",
+    "locate": "radiotwin locate open/measurements.csv -o out.csv --twin loop/twin --truth located.csv --devices open/devices.csv",
+    "compare": "radiotwin compare survey/measurements.csv -o out --scene scene --truth map.nc --held-out 1 --seed 1 --also twin",
+    "report": "radiotwin report twin -o out.html --scene scene --truth segmented --measurements survey/measurements.csv",
+    "import": "radiotwin import log.csv -o out --columns import.toml --level-unit dBm --length-unit m --time-zone UTC "
+              "--not-detected -150,no --not-measured x --not-detected-at-or-below -140 --min-level -160 --max-level 0 "
+              "--min-distance-m 1 --max-distance-m 1e6 --average-m 10 --average median --origin 50,8,100 --devices sites.csv",
+    "gains": "radiotwin gains scene -o out.csv --points points.csv --devices d1 --sum power --quality fast --seed 1",
+    "marl": "python -m marl.fedqmix --out out --scene scene --truth segmented --twin log-distance --algorithm random "
+            "--real-episodes 1 --noise-db 1 --seed 1 --flights 2 --planner-iterations 50",
+    "learn": "python -m marl.fedqmix --out out --scene scene --algorithm iql --truth segmented --episodes 4 --planner-iterations 50 "
+             "--real-episodes 1 --flights 2 --compare false --hidden 8 --parallel 2 --replay 8 --batch 2 --discount 0.9",
+}
 
 
 def make_honest(folder: Path) -> None:
@@ -37,6 +64,7 @@ def make_honest(folder: Path) -> None:
     _write_survey(folder / "open")
     _write_maps(folder)
     _write_log(folder)
+    _write_other_logs(folder)
     (folder / "points.csv").write_text("x_m,y_m,z_m\n10,20,30\n150,160,40\n")
     (folder / "pattern.csv").write_text("azimuth_deg,elevation_deg,gain_dbi\n" + "".join(
         f"{azimuth},{elevation},{-abs(elevation) / 10}\n" for azimuth in range(0, 360, 30)
@@ -45,9 +73,14 @@ def make_honest(folder: Path) -> None:
         f"{cut} 360\n" + "".join(f"{angle} {angle % 90 / 10}\n" for angle in range(360))
         for cut in ("HORIZONTAL", "VERTICAL")))
     (folder / "materials.toml").write_text('default = "brick"\nground = "concrete"\n["building"]\nyes = "wood"\n')
-    for line in COMMANDS:
-        run_here(line, folder)
+    (folder / "args").mkdir()
+    for name, line in LINES.items():
+        (folder / "args" / f"{name}.args").write_text(line.removeprefix("python -m ").replace(" ", "\0"))
+    with one_core():
+        for line in COMMANDS:
+            run_here(line, folder)
     _declare_antennas(folder / "scene")
+    _write_effects(folder)
     table = pd.read_csv(folder / "survey" / "measurements.csv")
     table.to_csv(folder / "survey" / "packed.csv.gz", index=False)
     table.to_parquet(folder / "survey" / "table.parquet", index=False)
@@ -66,9 +99,14 @@ def _write_survey(folder: Path) -> None:
                 rows.append((flight * 100 + slot, f"f{flight}", f"r{flight % 2}", x, y, 51.5, f"d{device}", level_db))
     names = ["time_s", "flight", "receiver", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device", "gain_db"]
     pd.DataFrame(rows, columns=names).to_csv(folder / "measurements.csv", index=False)
+    _write_devices(folder.parent / "located.csv", device_m)
     device_m[3] = np.nan
+    _write_devices(folder / "devices.csv", device_m)
+
+
+def _write_devices(path: Path, device_m: np.ndarray) -> None:
     pd.DataFrame({"device": [f"d{i}" for i in range(4)], "x_m": device_m[:, 0], "y_m": device_m[:, 1], "z_m": 1.5,
-                  "role": ["anchor"] * 3 + ["unknown"]}).to_csv(folder / "devices.csv", index=False)
+                  "role": ["anchor"] * 3 + ["unknown"]}).to_csv(path, index=False)
 
 
 def _write_maps(folder: Path) -> None:
@@ -86,7 +124,65 @@ def _write_maps(folder: Path) -> None:
 <shape type="cube" id="block"><transform name="to_world"><scale x="$side" y="20" z="10"/>
 <translate value="0, 0, 10"/></transform><ref id="wall" name="bsdf"/></shape>
 <shape type="rectangle" id="floor"><transform name="to_world"><scale value="200"/></transform>
+<ref id="wall" name="bsdf"/></shape><shape type="obj" id="roof"><string name="filename" value="roof.obj"/>
 <ref id="wall" name="bsdf"/></shape></scene>""")
+    (folder / "roof.obj").write_text("""# a pyramid
+v 60 60 0
+v 90 60 0
+v 90 90 0
+v 60 90 0
+v 75 75 20
+vn 0 0 1
+vt 0 0
+f 4/1/1 3/1/1 2/1/1 1/1/1
+f 1 2 5
+f 2 3 5
+f 3 4 5
+f -2 -5 -1
+""")
+    _in_a_child(_write_pbf, folder)
+
+
+def _write_pbf(folder: Path) -> None:
+    import osmium
+
+    with osmium.SimpleWriter(str(folder / "town.osm.pbf")) as writer:
+        for element in osmium.FileProcessor(str(folder / "town.osm")):
+            writer.add(element)
+
+
+def _in_a_child(function: Callable[[Path], None], folder: Path) -> None:
+    """Call a function whose library leaves threads, for which children forked later would wait."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            function(folder)
+            os._exit(0)
+        finally:
+            os._exit(1)
+    if os.waitpid(pid, 0)[1]:
+        raise RuntimeError(f"{function.__name__} failed")
+
+
+def _write_effects(folder: Path) -> None:
+    """Write twins with every kind of effect, of this version and of version 0.1."""
+    from radiotwin.twin import Twin
+
+    source = Path(__file__).parents[1] / "twin" / "version_1"
+    parts = json.loads((source / "effects.json").read_text())
+    for name, over in (("corrected", "links"), ("raytrace", "map")):
+        old = folder / f"old_{name}"
+        shutil.copytree(source / name, old)
+        record = json.loads((old / "twin.json").read_text())
+        record["effects"]["parts"] = [part for part in parts if part["over"] == over
+                                      and (over == "links" or part["setting"].get("exact"))]
+        (old / "twin.json").write_text(json.dumps(record))
+        Twin.load(old).save(folder / f"twin_{name}")
+    shutil.copytree(source / "links", folder / "links")
+    devices = pd.read_csv(folder / "links" / "devices.csv")
+    devices.loc[devices.index[-1], "role"] = "unknown"
+    devices.to_csv(folder / "links" / "devices.csv", index=False)
+    run_here("radiotwin locate links/measurements.csv --twin twin_corrected -o links/located.csv", folder)
 
 
 def _write_log(folder: Path) -> None:
@@ -96,6 +192,28 @@ def _write_log(folder: Path) -> None:
     (folder / "import.toml").write_text(
         'devices = "sites.csv"\ntime_format = "epoch s"\nlevel_unit = "dBm"\nlength_unit = "m"\n[columns]\n'
         'time = "when"\nlatitude = "lat"\nlongitude = "lon"\naltitude = "alt"\ndevice = "cell"\nlevel = "rsrp"\n')
+
+
+def _write_other_logs(folder: Path) -> None:
+    """Write the same log in the other forms that `import` reads."""
+    text = (folder / "log.csv").read_text()
+    (folder / "log.csv.gz").write_bytes(gzip.compress(text.encode()))
+    table = pd.read_csv(io.StringIO(text))
+    table.to_parquet(folder / "log.parquet", index=False)
+    points = [{"type": "Feature", "properties": {name: row[name] for name in ("when", "cell", "rsrp")},
+               "geometry": {"type": "Point", "coordinates": [row["lon"], row["lat"], row["alt"]]}}
+              for row in table.to_dict("records")]
+    (folder / "log.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": points}))
+    settings = (folder / "import.toml").read_text()
+    (folder / "points.toml").write_text(
+        settings.replace('"lat"', '"latitude"').replace('"lon"', '"longitude"').replace('"alt"', '"altitude"'))
+    (folder / "masts.csv").write_text("receiver,latitude,longitude,height\nm0,50.0,8.0,30\nm1,50.001,8.002,32\n")
+    (folder / "fixed.csv").write_text("when,mast,cell,rsrp,level_b\n" + "".join(
+        f"{i},m{i % 2},c{i // 2 % 2},{-70 - i % 9},{-80 - i % 7}\n" for i in range(40)))
+    (folder / "fixed.toml").write_text(
+        'devices = "sites.csv"\nlength_unit = "m"\nreceivers = "masts.csv"\ntime_format = "epoch s"\nlevel_unit = "dBm"\n'
+        'not_detected = [-150, "no"]\naverage_m = 20.0\n[origin]\nlatitude_deg = 50.0\nlongitude_deg = 8.0\n'
+        'altitude_m = 0.0\n[columns]\ntime = "when"\nreceiver = "mast"\ndevice = "cell"\nlevel = "rsrp"\n')
 
 
 def _declare_antennas(scene: Path) -> None:
@@ -108,6 +226,11 @@ def _declare_antennas(scene: Path) -> None:
     text = re.sub(r"\[\[uavs\]\]\n", '[[uavs]]\nantenna = "pattern.csv"\n', text)
     text = re.sub(r"\[\[devices\]\]\n", '[[devices]]\nantenna = "pattern.msi"\n', text)
     (copy / "scene.toml").write_text(text)
+
+
+def one_core() -> contextlib.AbstractContextManager:
+    """Have this process believe that there is one core, so that it trains here and starts no others."""
+    return mock.patch.object(os, "sched_getaffinity", lambda pid: {0})
 
 
 def run_here(line: str, folder: Path) -> None:
@@ -132,11 +255,17 @@ def run_here(line: str, folder: Path) -> None:
         raise RuntimeError(f"{line}: exit status {status}\n{said.getvalue()}")
 
 
+def _gains_of_nothing(scene: object, device_m: np.ndarray, points_m: np.ndarray, *others: object) -> np.ndarray:
+    """Take the place of the ray tracer, which needs LLVM and a process of its own."""
+    return np.full((len(device_m), len(points_m)), -80.0)
+
+
 def run_command(module: str) -> None:
     """Run a command by `sys.argv`: `radiotwin`, or a module as `python -m` does."""
     if module == "radiotwin":
         from radiotwin.cli import main
 
-        main()
+        with mock.patch("radiotwin.trace.points.trace_gains", _gains_of_nothing):
+            main()
     else:
         runpy.run_module(module, run_name="__main__")

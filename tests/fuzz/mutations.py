@@ -6,7 +6,6 @@ import json
 import re
 import sqlite3
 import tempfile
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,8 @@ TEXTS = ("", " ", "'", '"', "null", "[]", "{}", "../../../etc/passwd", "/etc/pas
          "=cmd|' /C calc'!A0", "\x1b[31m\x1b]0;owned\x07", "‮evil", "a\x00b", "é" * 300, "a" * 5000, "$x", "%n%s%x",
          "{{7*7}}", "CON", "canary", "../canary", "\ud800".encode("utf-8", "surrogatepass").decode("latin-1"), "default",
          "\u2028", "\t", ",", ";", "a.b.c", ".", "..", "/", "-h", "--out=/tmp/x", "evil", "../evil")
+# What may stand where an output's name is expected by mistake
+SAFE_TEXTS = tuple(text for text in TEXTS if not set(text) & set("/\0") and text != "..")
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 _WORD = re.compile(rb"[A-Za-z_][A-Za-z0-9_]*")
 
@@ -43,14 +44,14 @@ def apply(mutation: Mutation, data: bytes, suffix: str, port: int) -> bytes:
     try:
         changed = change(data, mutation.where, mutation.what)
     except (ValueError, KeyError, IndexError, OSError, EOFError, sqlite3.Error, UnicodeError, RuntimeError, TypeError,
-            AttributeError, zipfile.BadZipFile):
+            AttributeError):
         return data  # an earlier change has left nothing to take apart
     return changed.replace(b"{port}", str(port).encode())
 
 
 def names(suffix: str) -> list[str]:
     """Return the names of the mutations of a kind of file."""
-    return [*_of(suffix), *BYTES]
+    return [*_of(suffix)] if suffix == ".args" else [*_of(suffix), *BYTES]
 
 
 def _at(where: float, count: int) -> int:
@@ -172,6 +173,31 @@ def _json_deep(data: bytes, where: float, what: int) -> bytes:
     return (text[:index] + "[" * depth + "]" * depth + text[index:].lstrip("0123456789.-e")).encode()
 
 
+# Of a command line, with NUL between its arguments -------------------------------------------------------------------
+
+def _value_of_option(data: bytes, where: float, what: int) -> bytes:
+    """Change the value of an option, or a part of it; never where outputs go, nor what the command is."""
+    arguments = data.split(b"\0")
+    first = 1 if arguments[0].startswith(b"marl") else 3
+    places = [index for index in range(first, len(arguments)) if arguments[index - 1] not in (b"-o", b"--out")
+              and not arguments[index].startswith(b"-")] or [len(arguments) - 1]
+    index = places[_at(where, len(places))]
+    new = (*NUMBERS, *SAFE_TEXTS)[what % (len(NUMBERS) + len(SAFE_TEXTS))].encode("utf-8", "replace")
+    parts = arguments[index].split(b",")
+    if what // 97 % 7 == 0:
+        del arguments[index]
+    elif what // 97 % 7 == 1:
+        arguments += arguments[index - 1:index + 1]
+    elif what // 97 % 7 == 2 and len(parts) > 1:
+        parts[what % len(parts)] = new
+        arguments[index] = b",".join(parts)
+    elif what // 97 % 7 == 3:
+        arguments[index] = b",".join(parts * (2 + what % 50))
+    else:
+        arguments[index] = new
+    return b"\0".join(arguments)
+
+
 # Of containers --------------------------------------------------------------------------------------------------------
 
 def _inside(data: bytes, where: float, what: int) -> bytes:
@@ -184,27 +210,6 @@ def _inside(data: bytes, where: float, what: int) -> bytes:
 def _bomb(data: bytes, where: float, what: int) -> bytes:
     packed = gzip.compress(bytes(2**20), 9)
     return data + packed * (16, 256, 4096)[what % 3]
-
-
-def _member(data: bytes, where: float, what: int) -> bytes:
-    """Change a member of a zip archive, its name, or how large it says it is."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        members = [(info.filename, archive.read(info)) for info in archive.infolist()]
-    index, out = _at(where, len(members)), io.BytesIO()
-    name, content = members[index]
-    if what % 5 == 0:
-        del members[index]
-    elif what % 5 == 1:
-        members[index] = (name.replace("data", _text(what)) or "x", content)
-    elif what % 5 == 2:
-        members[index] = (name, bytes(64 * 2**20))
-    else:
-        changes = list(BYTES.values())
-        members[index] = (name, changes[what % len(changes)](content, where, what // 3))
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED if what % 5 == 2 else zipfile.ZIP_STORED) as archive:
-        for name, content in members:
-            archive.writestr(name, content)
-    return out.getvalue()
 
 
 def _header(data: bytes, where: float, what: int) -> bytes:
@@ -316,6 +321,6 @@ def _parquet(data: bytes, where: float, what: int) -> bytes:
 def _of(suffix: str) -> dict[str, Callable[[bytes, float, int], bytes]]:
     return {
         ".json": TEXT | {"node": _json_node, "deep": _json_deep}, ".geojson": TEXT | {"node": _json_node, "deep": _json_deep},
-        ".gz": {"inside": _inside, "bomb": _bomb}, ".pt": {"member": _member}, ".safetensors": {"header": _header},
-        ".nc": {"object": _hdf5}, ".gpkg": {"statement": _sqlite}, ".parquet": {"column": _parquet},
+        ".gz": {"inside": _inside, "bomb": _bomb}, ".safetensors": {"header": _header},
+        ".nc": {"object": _hdf5}, ".args": {"value": _value_of_option}, ".gpkg": {"statement": _sqlite}, ".parquet": {"column": _parquet},
     }.get(suffix, TEXT)

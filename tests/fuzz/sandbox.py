@@ -14,7 +14,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.fuzz.honest import run_command
+from tests.fuzz.honest import one_core, run_command
 
 ALLOWED_STATUS = (0, 2, 130)
 MAX_PEAK_BYTES, MAX_WALL_S = 2 * 2**30, 60
@@ -62,6 +62,13 @@ def run_watched(command: str, case: Path, listener: socket.socket) -> Outcome:
         breaches += sorted(set((case / _BREACHES_FILE).read_text(errors="replace").splitlines()))
     breaches += _leaks(case, listener)
     return Outcome(status, wall_s, usage.ru_maxrss * 1024, output, tuple(breaches))
+
+
+def arguments_of(command: str) -> list[str]:
+    """Return the arguments of a command line, or those in a file, `@FILE`, with NUL between them."""
+    if command.startswith("@"):
+        return Path(command[1:]).read_text(encoding="utf-8", errors="surrogateescape").split("\0")
+    return command.split(" ")
 
 
 def _leaks(case: Path, listener: socket.socket) -> list[str]:
@@ -115,12 +122,13 @@ def _child(command: str, case: Path) -> None:
         tempfile.tempdir = str(case / "tmp")
         resource.setrlimit(resource.RLIMIT_FSIZE, (2**30, 2**30))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        module, *arguments = command.split(" ")
-        sys.argv = [module, *arguments]
+        sys.dont_write_bytecode = True
+        sys.argv = arguments_of(command)
         breaches = os.open(case / _BREACHES_FILE, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         sys.addaudithook(_Watch(case, breaches))
         try:
-            run_command(module)
+            with one_core():
+                run_command(sys.argv[0])
             status = 0
         except SystemExit as end:
             status = end.code if isinstance(end.code, int) else 0 if end.code is None else 1
@@ -157,6 +165,8 @@ class _Watch:
         if not isinstance(path, str | bytes | os.PathLike):
             return None
         path = os.path.realpath(os.fsdecode(path))
+        if os.path.basename(os.path.dirname(path)) == "__pycache__":  # numba compiles once, for all later runs
+            return None
         if flags & _WRITING or (isinstance(mode, str) and set(mode) & set("wax+")):
             return None if path.startswith(self.inside) else f"writes outside: {path}"
         if path in _SECRETS or path == str(self.case / "canary"):
@@ -165,7 +175,7 @@ class _Watch:
 
     def _change(self, event: str, arguments: tuple) -> str | None:
         paths = [os.path.realpath(os.fsdecode(each)) for each in arguments if isinstance(each, str | bytes | os.PathLike)]
-        outside = [path for path in paths if not path.startswith(self.inside)]
+        outside = [path for path in paths if not path.startswith(self.inside) and "__pycache__" not in path]
         return f"{event} outside: {outside[0]}" if outside else None
 
     def _always(self, event: str, arguments: tuple) -> str | None:

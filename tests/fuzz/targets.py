@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from tests.fuzz.honest import LINES
+
 
 @dataclass(frozen=True)
 class Target:
@@ -24,7 +26,8 @@ class Target:
 _SURVEY = "open/measurements.csv"
 _FIT = "radiotwin fit survey/{} --scene scene --model log_distance -o out"
 _RUN = ("marl.fedqmix --scene scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare false "
-        "--hidden 8 --out run --resume")
+        "--planner-iterations 50 --hidden 8 --out run --resume")
+_IMPORT = "radiotwin import {} --columns {} -o out"
 _MESH = "scene/meshes/building_000.ply"
 TARGETS = (
     *(Target("scene.toml", "scene/scene.toml", command) for command in (
@@ -72,6 +75,35 @@ TARGETS = (
     Target("run folder", "run/config.json", "radiotwin report run -o out.html"),
     Target("run folder", "run/flights.csv", "radiotwin report run -o out.html"),
     Target("run folder", "run/comparison.csv", "radiotwin report run -o out.html"),
-    Target("checkpoint", "run/checkpoint.pt", _RUN),
+    Target("scene.toml", "scene/scene.toml", "radiotwin close-loop survey/measurements.csv --scene scene --base log-distance -o out",
+           slow=True),
+    Target("scene.toml", "scene/scene.toml",
+           "marl.fedqmix --scene scene --truth segmented --twin truth --algorithm random --real-episodes 1 --flights 2 "
+           "--planner-iterations 50 --out out"),
+    Target("scene.toml", "scene/scene.toml", "radiotwin build-scene scene/city.xml -o out"),
+    Target("foreign city", "roof.obj", "radiotwin build-scene city.xml -o out"),
+    Target("foreign city", "exported/city.xml", "radiotwin build-scene exported/city.xml -o out"),
+    Target("foreign city", "exported/meshes/building_000.ply", "radiotwin build-scene exported/city.xml -o out"),
+    Target("OpenStreetMap", "town.osm.pbf", "radiotwin build-scene town.osm.pbf -o out"),
+    Target("measurements", "located.csv", f"radiotwin locate {_SURVEY} --twin loop/twin --truth located.csv -o out.csv"),
+    *(Target("log to import", file, _IMPORT.format(file, settings)) for file, settings in (
+        ("log.csv.gz", "import.toml"), ("log.parquet", "import.toml"), ("log.geojson", "points.toml"),
+        ("fixed.csv", "fixed.toml"))),
+    *(Target("log to import", file, _IMPORT.format("fixed.csv", "fixed.toml")) for file in ("masts.csv", "fixed.toml")),
+    Target("points", "points.csv", "radiotwin gains scene --points points.csv --quality fast -o out.csv"),
+    *(Target("twin", f"{folder}/{file}", command.format(folder), slow="raytrace" in folder)
+      for folder, command in (
+        ("twin_corrected", "radiotwin locate links/measurements.csv --twin {} -o out.csv"),
+        ("old_corrected", "radiotwin locate links/measurements.csv --twin {} -o out.csv"),
+        ("twin_raytrace", "radiotwin map {} --scene scene --altitudes 55 -o out.nc"),
+        ("old_raytrace", "radiotwin report {} --scene scene -o out.html"),
+        ("twin_kriging", "radiotwin map {} --scene scene --altitudes 55 -o out.png"))
+      for file in ("twin.json", "channel.safetensors")),
+    Target("twin", "twin/twin.json", _FIT.format("measurements.csv --start twin")),
+    Target("radio map", "map.nc", "radiotwin compare survey/measurements.csv --scene scene --truth map.nc -o out", slow=True),
+    Target("radio map", "map.nc", "radiotwin survey scene --truth map.nc --flights 1 -o out.csv"),
+    *(Target("command line", f"args/{name}.args", f"@args/{name}.args", slow=name in ("compare", "loop"))
+      for name in LINES),
+    Target("checkpoint", "run/checkpoint.safetensors", _RUN),
     Target("checkpoint", "run/config.json", _RUN),
 )

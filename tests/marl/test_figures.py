@@ -66,3 +66,8 @@ def test_the_curve_has_a_logarithmic_axis_and_every_curve_and_level(tmp_path):
     np.testing.assert_array_equal(axes.lines[0].get_xdata(), [1, 10])  # zero has no place on this axis
     draw_curve({"a": ROWS}, {}, tmp_path / "curve.png")
     assert is_png(tmp_path / "curve.png")
+
+
+def test_the_curve_of_a_run_without_real_episodes_is_drawn(tmp_path):
+    draw_curve({"a": ROWS[:1]}, {"planner": 0.9}, tmp_path / "curve.png")
+    assert is_png(tmp_path / "curve.png")

@@ -36,7 +36,7 @@ def test_the_statistical_truth_is_the_published_law(small_scene, truth):
 
 def test_receiver_noise_is_added_to_a_map_of_values(small_scene, truth):
     values = dataclasses.replace(truth, dataset=truth.dataset.drop_vars("sigma_db"))
-    exact, noisy = (survey(small_scene, values, noise_db=noise_db) for noise_db in (0.0, 3.0))
+    exact, noisy = (survey(small_scene, values, noise_db=noise_db) for noise_db in (-0.0, 3.0))
     index = truth.lattice.index_of(exact.receiver_m)
     expected = truth.gain_db.reshape(len(truth.devices), -1)[exact.device_index, index]
     np.testing.assert_allclose(exact.level_db, expected, atol=6e-4)
