@@ -87,7 +87,7 @@ def _solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
     area = prism.area.buffer(wider_m, join_style="mitre") if wider_m else prism.area
     rings = [shapely.get_coordinates(ring) for ring in (area.exterior, *area.interiors)]
     points, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings])
-    roof = mapbox_earcut.triangulate_float64(points, ends).reshape(-1, 3)
+    roof: np.ndarray = mapbox_earcut.triangulate_float64(points, ends).reshape(-1, 3)
     corner = np.arange(len(points))
     corner[ends - 1] = [0, *ends[:-1]]  # a ring's last point is its first
     used, roof = np.unique(corner[roof], return_inverse=True)  # none in the middle of a wall
@@ -114,4 +114,6 @@ def _mesh(solid: Manifold) -> trimesh.Trimesh:
     found = solid.to_mesh64()
     vertices, faces = found.vert_properties[:, :3], found.tri_verts.astype(np.int64)
     cleaned = clean(vertices, faces)[:2]
-    return trimesh.Trimesh(*(cleaned if is_volume(*cleaned) else (vertices, faces)), process=False)
+    if is_volume(*cleaned):
+        vertices, faces = cleaned
+    return trimesh.Trimesh(vertices, faces, process=False)
