@@ -25,6 +25,14 @@ _KEY_DOT = r"[ \t]*+\.[ \t]*+"
 _BLOCK_BYTES = 2**20
 
 
+def is_within(path: Path, *folders: Path) -> bool:
+    """Return whether a path lies in one of the folders once links are followed."""
+    try:
+        return any(path.resolve().is_relative_to(folder.resolve()) for folder in folders)
+    except (OSError, RuntimeError, ValueError):  # circular links, a name that no file can have
+        return False
+
+
 def require_within(folder: Path, path: Path, source: str) -> Path:
     """Return the path if it lies in the folder once links are followed.
 
@@ -36,11 +44,7 @@ def require_within(folder: Path, path: Path, source: str) -> Path:
     Raises:
         BadInput: the path leaves the folder by `..`, by its root, or by a symbolic link.
     """
-    try:
-        inside = path.resolve().is_relative_to(folder.resolve())
-    except (OSError, RuntimeError, ValueError):  # circular links, a name that no file can have
-        inside = False
-    if not inside:
+    if not is_within(path, folder):
         raise BadInput(f"{source}: {path} leads out of {folder}; only files in that folder may be "
                        "named: copy the file there")
     return path

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ValidationError
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.settings import Columns, Settings, Wide
-from radiotwin.inputs import read_toml
+from radiotwin.inputs import is_within, read_toml
 from radiotwin.tables import Origin
 
 
@@ -49,13 +49,22 @@ def read_settings(path: Path | str | None, given: Mapping[str, Any]) -> Settings
         data = read_toml(path, "TOML file, or pairs such as latitude=lat,longitude=lon")
         for table in ("devices", "receivers"):
             if isinstance(data.get(table), str):
-                data[table] = str(path.parent / data[table])
+                data[table] = str(_table_of(path, data[table]))
     try:
         return Settings.model_validate(data | dict(given))
     except ValidationError as error:
         # Pydantic reports each type of a union that it tried; the first report of a key is kept.
         lines = {_key(problem): _message(problem, path) for problem in reversed(error.errors())}
         raise BadInput("\n".join(reversed(lines.values()))) from None
+
+
+def _table_of(settings: Path, name: str) -> Path:
+    """Return the path of a table that a settings file names, which may be a stranger's."""
+    path = settings.parent / name
+    if not is_within(path, settings.parent, Path.cwd()):
+        raise BadInput(f"{settings}: {path} is neither in its folder nor in the current one; give "
+                       "the table on the command line, or copy it there")
+    return path
 
 
 def _key(problem: Mapping[str, Any]) -> str:

@@ -1,7 +1,6 @@
 """Read the folder of a run: of a demo, a twin, a close-loop, a planning run, or a scene."""
 
 import os
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from radiotwin.closeloop.result_file import read_report
 from radiotwin.compare import Comparison
 from radiotwin.comparison_output import read_comparison
 from radiotwin.errors import BadInput
-from radiotwin.inputs import require_within
+from radiotwin.inputs import is_within, require_within
 from radiotwin.measurements import read_measurements
 from radiotwin.radiomap import RadioMap
 from radiotwin.records import Record, read_record, validated
@@ -126,7 +125,7 @@ def _scene(run: Run, given: Path | None, named: str | None) -> Scene | None:
         return Scene.load(found.parent)
     reason = "the run names no scene; give one with --scene"
     if named and os.path.isfile(Path(named) / "scene.toml"):
-        if _is_within((run.folder, Path.cwd()), Path(named)):
+        if is_within(Path(named), run.folder, Path.cwd()):
             return Scene.load(named)
         # A stranger's run must not choose what is read here and goes into a page.
         reason = (f"the run names the scene {named}, which is neither in its folder nor in the "
@@ -136,9 +135,6 @@ def _scene(run: Run, given: Path | None, named: str | None) -> Scene | None:
     run.notes.append(f"No 3D map: {reason}.")
     return None
 
-
-def _is_within(folders: Iterable[Path], path: Path) -> bool:
-    return any(path.resolve().is_relative_to(folder.resolve()) for folder in folders)
 
 
 def _read_maps(run: Run, truth: str | None) -> None:

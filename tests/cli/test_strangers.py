@@ -352,7 +352,7 @@ def a_star_of_6_000_points(folder):
     write_town(folder / "town.geojson", [*points, points[0]])
 
 
-@stranger("build-scene town.geojson --check", "RADIOTWIN_MAX_OVERLAPS", OVERLAPS=10_000)
+@stranger("build-scene town.geojson --check", "RADIOTWIN_MAX_TOUCHING_CORNERS")
 def equal_buildings(folder):
     write_town(folder / "town.geojson", *[SQUARE] * 1500)
 

@@ -38,6 +38,7 @@ def fuzz(
     seen = {_signature(case, "") for case in known}
     with tempfile.TemporaryDirectory() as scratch:
         honest, folder, listener = Path(scratch) / "honest", Path(scratch) / "case", listen()
+        os.environ["RADIOTWIN_CACHE"] = str(Path(scratch) / "cache")
         make_honest(honest)
         print(f"honest files made in {time.monotonic() - started:.0f} s", flush=True)
         started = written = time.monotonic()

@@ -116,8 +116,8 @@ def _child(command: str, case: Path) -> None:
         sys.stdout = open(1, "w", encoding="utf-8", closefd=False)
         sys.stderr = open(2, "w", encoding="utf-8", closefd=False)
         os.chdir(case / "work")
-        os.environ |= {"HOME": str(case / "home"), "XDG_CACHE_HOME": str(case / "home"), "TMPDIR": str(case / "tmp"),
-                       "COLUMNS": "100"}
+        os.environ |= {"HOME": str(case / "home"), "XDG_CACHE_HOME": str(case / "home"),
+                       "RADIOTWIN_CACHE": str(case / "home"), "TMPDIR": str(case / "tmp"), "COLUMNS": "100"}
         import tempfile
         tempfile.tempdir = str(case / "tmp")
         resource.setrlimit(resource.RLIMIT_FSIZE, (2**30, 2**30))
@@ -165,7 +165,7 @@ class _Watch:
         if not isinstance(path, str | bytes | os.PathLike):
             return None
         path = os.path.realpath(os.fsdecode(path))
-        if os.path.basename(os.path.dirname(path)) == "__pycache__":  # numba compiles once, for all later runs
+        if "__pycache__" in path:  # numba compiles once, for all later runs
             return None
         if flags & _WRITING or (isinstance(mode, str) and set(mode) & set("wax+")):
             return None if path.startswith(self.inside) else f"writes outside: {path}"

@@ -56,7 +56,9 @@ def test_what_failed_once_keeps_the_rule(run, case):
     assert not outcome.breaches, f"{outcome.breaches}\n{outcome.output[-2000:]}"
 
 
-@pytest.mark.parametrize("target", TARGETS, ids=lambda target: f"{target.file} {target.command.partition(' ')[2]}")
+@pytest.mark.parametrize("target", [
+    pytest.param(target, marks=[pytest.mark.slow] * target.slow, id=f"{target.file} {target.command.partition(' ')[2]}")
+    for target in TARGETS])
 def test_undamaged_files_are_read(run, target):
     outcome = run(Case(target.file, target.command))
     assert outcome.status == 0 and not outcome.breaches, outcome

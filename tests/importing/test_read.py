@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
+from radiotwin.importing.settings_file import read_settings
 from radiotwin.importing.source import read_source
 
 TEXT = "device,x,y,level\na,0,0,-80\nb,3,4,-90\n"
@@ -103,3 +104,20 @@ def test_names_that_are_numbers_stay_whole(bring_in, local, tmp_path):
     result = bring_in((tmp_path / "made.parquet").read_bytes(), "data.parquet", columns=local, length_unit="m")
     assert list(result.table["device"]) == ["7"]
     assert result.report["left_out"][0] == {"reason": "no device", "column": "device", "readings": 1, "first": "row 2"}
+
+
+def test_settings_name_tables_in_their_folder_or_the_current_one_only(tmp_path, monkeypatch):
+    outside, work = tmp_path / "sites.csv", tmp_path / "work"
+    (work / "own").mkdir(parents=True)
+    outside.write_text("device,x,y,z\n")
+    (work / "sites.csv").write_text("device,x,y,z\n")
+    (work / "link.csv").symlink_to(outside)
+    monkeypatch.chdir(work)
+    settings = work / "own" / "import.toml"
+    columns = '[columns]\nlevel = "l"\ndevice = "d"\nx = "x"\ny = "y"\n'
+    for name in ("/etc/passwd", "../../sites.csv", "../link.csv"):
+        settings.write_text(f'devices = "{name}"\n{columns}')
+        with pytest.raises(BadInput, match="neither in its folder nor in the current one"):
+            read_settings(settings, {})
+    settings.write_text(f'devices = "../sites.csv"\n{columns}')
+    assert read_settings(settings, {}).devices == str(settings.parent / "../sites.csv")

@@ -34,8 +34,8 @@ def test_a_run_is_resumed_in_its_own_folder_only(begun, session):
 
 
 def test_a_folder_that_a_killed_run_only_began_is_empty(session, tmp_path):
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run" / ".radiotwin-abcdefgh.json").write_text("")
+    (tmp_path / "run" / ".radiotwin-abcdefgh").mkdir(parents=True)
+    (tmp_path / "run" / ".radiotwin-abcdefgh" / "config.json").write_text("")
     session(False)._claim_folder(WORLD)
     assert [each.name for each in (tmp_path / "run").iterdir()] == ["config.json"]
 

@@ -81,7 +81,8 @@ def test_a_planning_run_shows_its_flights_and_its_table(run_folder, tmp_path, mo
          "bias_db": 1.0}]}), "not one row for each of all, LoS, NLoS"),
     ("config.json", '{"run": {"scene": 3}}', "scene: "), ("config.json", "[]", "is no JSON object"),
     ("closeloop.json", "[" * 10**5, "levels of nesting"), ("closeloop.json", '{"a": ' + "9" * 5000 + "}", "readable"),
-    ("flights.csv", "flight,uav\nf,u\n", "column 'time_s' is missing"), ("twin.json", "{}", "is damaged")])
+    ("flights.csv", "flight,uav\nf,u\n", "column 'time_s' is missing"),
+    ("twin.json", "{}", "channel.safetensors does not exist")])
 def test_bad_folders_get_one_message(tmp_path, name, content, words):
     if name:
         (tmp_path / name).write_text(content)
