@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import subprocess
 import sys
 import tempfile
 import time
@@ -40,6 +41,9 @@ def fuzz(
         honest, folder, listener = Path(scratch) / "honest", Path(scratch) / "case", listen()
         os.environ["RADIOTWIN_CACHE"] = str(Path(scratch) / "cache")
         make_honest(honest)
+        # Numba compiles the path engine once, in a process that nothing kills.
+        subprocess.run([sys.executable, "-m", "radiotwin.cli", "map", "twin_raytrace", "--scene", "scene", "-o",
+                        "../warm.nc"], cwd=honest, check=True, capture_output=True)
         print(f"honest files made in {time.monotonic() - started:.0f} s", flush=True)
         started = written = time.monotonic()
         queue = known if again else None
