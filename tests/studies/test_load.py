@@ -22,5 +22,5 @@ def test_costs_are_shown_beside_those_of_the_smallest_size():
         "x": {"wall_s": 2.0 * settings["size"], "cpu_s": 1.0, "peak_mib": 100.0 + settings["size"] / 1e4}}}}
         for name, settings in load_cases(0).items()]
     lines = [line.split(" | ") for line in load_table(read_frame(rows)).splitlines()[2:]]
-    assert len(lines) == 9 and [line[1] for line in lines[:3]] == ["1,000", "10,000", "50,000"]
+    assert len(lines) == 12 and [line[1] for line in lines[:3]] == ["1,000", "10,000", "50,000"]
     assert [line[4] for line in lines[:3]] == ["1.0", "10.0", "50.0"] and lines[-1][5:] == ["1,100", "10.00 |"]
