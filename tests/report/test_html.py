@@ -27,6 +27,9 @@ ATTACK = ("""</script></title></style></textarea>--><script>window.pwned=1</scri
           """<svg onload=pwned=3><link rel=stylesheet href=URL/a.css><img src="URL/b.png">"><a href="javascript:pwned=4">"""
           """'"` onmouseover=pwned=5 autofocus onfocus=pwned=6 {{7*7}}${pwned=7}<!--<script>\\u003cimg """
           """<base href="URL/"><form action="URL/c"><meta http-equiv=refresh content="0;url=URL/d">\u2028\u202e\x1b[2J""")
+# A name of a device, a flight or a receiver has at most 200 characters, and none that is not seen.
+IN_NAMES = ("""</script></textarea>--><script>pwned=1</script><img src=x onerror="pwned=2"><svg onload=pwned=3>"""
+            """'"onmouseover=pwned=5 {{7*7}}<link rel=stylesheet href=URL/a>""")
 KEPT = {"schema", "verdict", "links", "positions", "role", "level", "model", "file", "los", "nlos", "effect", "name"}
 
 
@@ -62,7 +65,7 @@ def poisoned(value, attack, key=""):
 @pytest.fixture(scope="module")
 def hostile(run_folder, server, tmp_path_factory):
     """A run whose texts are all attacks, as its two pages: `{name: path}`."""
-    attack = ATTACK.replace("URL", server[0])
+    attack, in_names = (text.replace("URL", server[0]) for text in (ATTACK, IN_NAMES))
     folder = tmp_path_factory.mktemp("hostile") / attack.replace("/", "\\")[:180]
     shutil.copytree(run_folder, folder)
     path = folder / "scene" / "scene.toml"
@@ -72,14 +75,14 @@ def hostile(run_folder, server, tmp_path_factory):
     path = folder / "twin" / "twin.json"
     path.write_text(json.dumps(poisoned(json.loads(path.read_text()), attack)))
     truth = RadioMap.read(folder / "scene" / "truth.nc")
-    names = [name + attack for name in truth.devices]
+    names = [name + in_names for name in truth.devices]
     hostile = RadioMap(truth.dataset.assign_coords(device=np.array(names, dtype=object)).assign_attrs(source=attack))
     hostile.write(folder / "map.nc")
     (folder / "map.nc").rename(folder / f"{attack.replace('/', '')[:200]}.nc")
     for name in ("survey/measurements.csv.gz", "survey/devices.csv"):
         table = pd.read_csv(folder / name)
         for column in set(table) & {"flight", "receiver", "device"}:
-            table[column] = table[column].astype(str) + attack
+            table[column] = table[column].astype(str) + in_names
         table.to_csv(folder / name, index=False, quoting=csv.QUOTE_NONNUMERIC)
     (folder / "closeloop.json").write_text(json.dumps(poisoned(json.loads(VERSION_1.read_text()), attack)))
     figure = Figure()
