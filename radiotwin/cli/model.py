@@ -1,5 +1,6 @@
 """The commands that learn from measurements and judge the result: fit, map, compare."""
 
+import os
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -107,7 +108,8 @@ def map_(
     is_map = twin.suffix == ".nc"
     if out is None and is_map:
         raise BadInput(f"{twin} is a radio map already; give the file to write with --out")
-    out = out or twin.resolve().with_name(f"{twin.resolve().name}.nc")
+    place = Path(os.path.realpath(twin))  # unlike resolve, it takes links in a circle
+    out = out or place.with_name(f"{place.name}.nc")
     exporters = EXPORTERS | {".png": write_picture}
     world = Scene.load(scene)
     check_format(out, world, exporters)

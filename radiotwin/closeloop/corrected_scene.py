@@ -13,6 +13,7 @@ from radiotwin.effects.position_errors import DevicePositionError
 from radiotwin.effects.removed_obstacle import RemovedObstacle, buildings
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, require_writable
+from radiotwin.inputs import is_within
 from radiotwin.links import site_of
 from radiotwin.scene import Scene
 from radiotwin.scene.build import check_target
@@ -45,7 +46,7 @@ def check_corrected_target(folder: Path, scene: Scene | None, report_folder: Pat
                        "--scene, or leave --write-scene out")
     for other, what in ((scene.folder, "the declared scene"),
                         (report_folder, "the report (--out)")):
-        if other.resolve().is_relative_to(folder.resolve()):
+        if is_within(other, folder):
             raise BadInput(f"--write-scene {folder}: {what} is in {other}, which the corrected "
                            "scene would replace; choose another folder")
     check_target(folder)

@@ -158,11 +158,11 @@ def _read_maps(run: Run, truth: str | None) -> None:
                          f"the twin's map over the lattice of {run.scene.folder}")
         corrected = run.twin.is_corrected
         run.maps["twin, corrected" if corrected else "twin"] = run.twin.radio_map(run.scene)
-    truth_path = run.scene and (run.scene.folder / "truth.nc").resolve()
+    truth_path = run.scene and os.path.realpath(run.scene.folder / "truth.nc")
     paths = sorted(run.folder.glob("*.nc"))
     PAGE_MAPS.check(len(paths), run.folder)
     for path in paths:
-        if path.stem in run.maps or path.resolve() == truth_path:
+        if path.stem in run.maps or os.path.realpath(path) == truth_path:
             continue
         found = _read_map(path, run)
         if run.scene is not None and not run.scene.over_lattice(found):

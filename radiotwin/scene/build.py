@@ -15,6 +15,7 @@ from radiotwin.cells import write_csv
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder
 from radiotwin.geodesy import local_crs
+from radiotwin.inputs import is_within
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import (
@@ -202,7 +203,7 @@ def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | N
     if foreign:
         raise BadInput(f"{folder} holds {', '.join(foreign[:5])}, which the new content would "
                        "erase; move it away or choose another output folder")
-    if source is not None and source.resolve().is_relative_to(folder.resolve()):
+    if source is not None and is_within(source, folder):
         raise BadInput(f"{source} lies in {folder}, which the new scene would replace; choose "
                        "another output folder")
 
