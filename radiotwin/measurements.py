@@ -21,6 +21,7 @@ from radiotwin.cells import (
 )
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
+from radiotwin.inputs import is_within
 from radiotwin.tables import name_fault
 
 # Columns of the two files, as in docs/conventions.md.
@@ -154,11 +155,15 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
     if len(levels) != 1:
         raise BadInput(f"{path}: needs exactly one of the columns {LEVELS}, it has "
                        f"{levels or 'neither'}")
+    named = devices_path is not None
     devices_path = Path(devices_path) if devices_path else path.parent / "devices.csv"
     if not os.path.exists(devices_path):
         raise BadInput(f"{devices_path} does not exist; the table of devices needs the columns "
                        f"{', '.join(DEVICE_REQUIRED)} (role: {' or '.join(ROLES)}); --devices "
                        "names another file")
+    if not named and not is_within(devices_path, path.parent):
+        raise BadInput(f"{devices_path} is a link out of its folder; name the table that it leads "
+                       "to with --devices")
     devices = read_devices(devices_path)
     if table.empty:
         raise BadInput(f"{path}: has no rows; it needs at least one measured link")

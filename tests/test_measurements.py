@@ -224,3 +224,13 @@ def test_too_many_devices(write, monkeypatch):
     monkeypatch.setenv("RADIOTWIN_MAX_DEVICES", "1")
     with pytest.raises(BadInput, match="RADIOTWIN_MAX_DEVICES"):
         read_measurements(write(HEADER + ROWS))
+
+
+def test_a_table_of_devices_that_nobody_named_is_in_its_folder(write, tmp_path):
+    path = write(HEADER + ROWS)
+    (tmp_path / "work").mkdir()
+    path = path.rename(tmp_path / "work" / "measurements.csv")
+    (tmp_path / "work" / "devices.csv").symlink_to(tmp_path / "devices.csv")
+    with pytest.raises(BadInput, match="link out of its folder; name the table .* --devices"):
+        read_measurements(path)
+    assert len(read_measurements(path, tmp_path / "work" / "devices.csv").devices) == 2

@@ -19,7 +19,7 @@ from radiotwin.effects.fold_model import FittedEffect
 from radiotwin.effects.registry import effect_named
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, require_writable
-from radiotwin.inputs import parse_json, read_bytes, read_text
+from radiotwin.inputs import parse_json, read_bytes, read_text, require_within
 from radiotwin.links import LinkData
 from radiotwin.localize import TwinDevice
 from radiotwin.twin.record import (
@@ -91,8 +91,9 @@ def read_twin(folder: Path | str) -> dict[str, Any]:
     if not path.exists():
         raise BadInput(f"{folder} is not a twin's folder (no {TWIN_FILE}); `radiotwin fit` makes "
                        "one")
-    record = read_text(path, "twin")
-    return decode_twin(record, read_bytes(folder / CHANNEL_FILE, "channel model"), path)
+    record, channel = (require_within(folder, folder / name, str(folder))
+                       for name in (TWIN_FILE, CHANNEL_FILE))
+    return decode_twin(read_text(record, "twin"), read_bytes(channel, "channel model"), path)
 
 
 def decode_twin(record: str, channel: bytes, source: object) -> dict[str, Any]:

@@ -147,3 +147,13 @@ def test_a_twin_is_replaced_with_its_page_and_nothing_else_is_lost(twin, tmp_pat
     (tmp_path / "file").write_text("")
     with pytest.raises(BadInput, match="file"):
         check_twin_target(tmp_path / "file")
+
+
+@pytest.mark.parametrize("name", ["twin.json", "channel.safetensors"])
+def test_a_twin_reads_nothing_outside_its_folder(tmp_path, name):
+    (tmp_path / name).touch()
+    shutil.copytree(VERSION_1 / "raytrace", tmp_path / "twin")
+    (tmp_path / "twin" / name).unlink()
+    (tmp_path / "twin" / name).symlink_to(tmp_path / name)
+    with pytest.raises(BadInput, match="leads out of"):
+        Twin.load(tmp_path / "twin")
