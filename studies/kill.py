@@ -243,7 +243,7 @@ def kill_cases(seed: int) -> dict[str, dict]:
 def kill_table(rows: pd.DataFrame) -> str:
     """Return, for each command, how often it was killed and what came of it."""
     lines = []
-    for command, group in rows.groupby("command", sort=False):
+    for command, group in rows.groupby("name", sort=False):
         kills = [kill for row in group["kills"] for kill in row]
         lines.append([command, f"{group['duration_s'].median():.0f}", str(group["files"].max()),
                       f"{sum(kill['killed'] for kill in kills)} of {len(kills)}",
