@@ -84,7 +84,7 @@ def import_(
         given["columns"] = parse_columns(columns)
         mapping = None
     given = {name: value for name, value in given.items() if value is not None}
-    settings = read_settings(mapping, given)
+    settings = read_settings(mapping, given, file.parent)
     with progress("importing", total=None) as advance:
         report = import_file(file, settings, out, gzip, lambda step: advance(1, step))
     _print(report)

@@ -33,23 +33,26 @@ def parse_columns(text: str) -> dict[str, str]:
     return pairs
 
 
-def read_settings(path: Path | str | None, given: Mapping[str, Any]) -> Settings:
+def read_settings(path: Path | str | None, given: Mapping[str, Any],
+                  data_folder: Path | None = None) -> Settings:
     """Read settings.
 
     Args:
         path: TOML file, in which the paths of tables are relative to it; None for no file.
         given: fields of `Settings`, which replace those of the file.
+        data_folder: of the file to import; tables that the settings name may be in it, in the
+            settings' folder, and in the current one.
 
     Raises:
-        BadInput: not readable, not TOML, or values that are not allowed.
+        BadInput: not readable, not TOML, values that are not allowed, or a table elsewhere.
     """
     data: dict[str, Any] = {}
     if path is not None:
         path = Path(path)
         data = read_toml(path, "TOML file, or pairs such as latitude=lat,longitude=lon")
         for table in ("devices", "receivers"):
-            if isinstance(data.get(table), str):
-                data[table] = str(_table_of(path, data[table]))
+            if isinstance(data.get(table), str) and table not in given:
+                data[table] = str(_table_of(path, data[table], data_folder))
     try:
         return Settings.model_validate(data | dict(given))
     except ValidationError as error:
@@ -58,12 +61,12 @@ def read_settings(path: Path | str | None, given: Mapping[str, Any]) -> Settings
         raise BadInput("\n".join(reversed(lines.values()))) from None
 
 
-def _table_of(settings: Path, name: str) -> Path:
+def _table_of(settings: Path, name: str, data_folder: Path | None) -> Path:
     """Return the path of a table that a settings file names, which may be a stranger's."""
     path = settings.parent / name
-    if not is_within(path, settings.parent, Path.cwd()):
-        raise BadInput(f"{settings}: {path} is neither in its folder nor in the current one; give "
-                       "the table on the command line, or copy it there")
+    if not is_within(path, settings.parent, Path.cwd(), data_folder or Path.cwd()):
+        raise BadInput(f"{settings}: {path} is neither in its folder nor in the current one, nor "
+                       "beside the data; give the table on the command line, or copy it there")
     return path
 
 

@@ -117,7 +117,9 @@ def test_settings_name_tables_in_their_folder_or_the_current_one_only(tmp_path, 
     columns = '[columns]\nlevel = "l"\ndevice = "d"\nx = "x"\ny = "y"\n'
     for name in ("/etc/passwd", "../../sites.csv", "../link.csv"):
         settings.write_text(f'devices = "{name}"\n{columns}')
-        with pytest.raises(BadInput, match="neither in its folder nor in the current one"):
+        with pytest.raises(BadInput, match="neither in its folder nor in the current one, nor beside"):
             read_settings(settings, {})
     settings.write_text(f'devices = "../sites.csv"\n{columns}')
     assert read_settings(settings, {}).devices == str(settings.parent / "../sites.csv")
+    settings.write_text(f'devices = "../../sites.csv"\n{columns}')
+    assert read_settings(settings, {}, tmp_path).devices and read_settings(settings, {"devices": "a"}).devices == "a"
