@@ -44,7 +44,7 @@ def apply(mutation: Mutation, data: bytes, suffix: str, port: int) -> bytes:
     try:
         changed = change(data, mutation.where, mutation.what)
     except (ValueError, KeyError, IndexError, OSError, EOFError, sqlite3.Error, UnicodeError, RuntimeError, TypeError,
-            AttributeError):
+            AttributeError, zlib.error):
         return data  # an earlier change has left nothing to take apart
     return changed.replace(b"{port}", str(port).encode())
 
