@@ -1,4 +1,4 @@
-"""How a command ends: one message for whatever happens, and an exit status that tells it.
+"""The end of a command: one message for whatever happens, and an exit status.
 
 | status | |
 |---|---|
@@ -37,7 +37,7 @@ class _OutputLost(Exception):
 
 
 class _Output:
-    """A text stream whose OSErrors are told from those of the work."""
+    """A text stream whose OSErrors are distinguished from those of the work."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream

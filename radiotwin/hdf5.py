@@ -1,4 +1,4 @@
-"""What an HDF5 file of a stranger may hold: plain arrays in the file itself, of bounded size.
+"""Check that an HDF5 file holds plain arrays in the file itself, of bounded size.
 
 HDF5 files can name other files (external links, raw data, virtual datasets), call for filters that
 are loaded as plug-ins, and stand for far more values than they have bytes. All of that is refused
@@ -139,7 +139,7 @@ def _is_text(kind: h5py.h5t.TypeID) -> bool:
 def _largest_heap(file: IO[bytes]) -> int:
     """Return the bytes of the largest heap of a file: no text in it is longer.
 
-    HDF5 tells the length of a text only by reading it. A heap begins with `GCOL`, a version, three
+    HDF5 has the length of a text only after reading it. A heap begins with `GCOL`, a version, three
     zeros and its size (HDF5 File Format Specification 3.0, III.E); chance makes the same eight
     bytes once in 10^19.
     """

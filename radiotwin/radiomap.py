@@ -26,13 +26,12 @@ from radiotwin.map_file import (
     without_cf,
     write_blocks,
 )
+from radiotwin.measurements import MAX_COORDINATE_M
 from radiotwin.scene.lattice import Lattice
-from radiotwin.tables import Origin
+from radiotwin.tables import MAX_NAME, Origin
 
 _VARIABLES = ("gain_db", "los", "sigma_db")
-MAX_COORDINATE_M = 1e7  # a quarter of the way around the Earth
 MIN_STEP_M = 1e-3
-_MAX_NAME = 200  # characters
 _NUMBERS = ("frequency_hz", "gain_limit_db", "origin_latitude_deg", "origin_longitude_deg",
             "origin_altitude_m", "shadowing_share", "shadowing_length_m")  # among the attributes
 
@@ -229,10 +228,10 @@ def _value_problem(dataset: xr.Dataset) -> str | None:
     names = dataset["device"].values.astype(str)
     unique, count = np.unique(names, return_counts=True)
     if len(unique) < len(names):
-        return f"two devices have one name, {str(unique[count > 1][0])[:_MAX_NAME]!r}"
+        return f"two devices have one name, {str(unique[count > 1][0])[:MAX_NAME]!r}"
     for name in names.tolist():
-        if not name.isprintable() or not 0 < len(name) <= _MAX_NAME:
-            return (f"device name {name[:_MAX_NAME]!r} is empty, longer than {_MAX_NAME} "
+        if not name.isprintable() or not 0 < len(name) <= MAX_NAME:
+            return (f"device name {name[:MAX_NAME]!r} is empty, longer than {MAX_NAME} "
                     "characters, or has some that cannot be printed")
     gain_db = dataset["gain_db"].values
     low_db, high_db = np.fmin.reduce(gain_db, axis=None), np.fmax.reduce(gain_db, axis=None)

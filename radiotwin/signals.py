@@ -29,7 +29,7 @@ class Stopped(BaseException):
 
 
 class _State:
-    """What the handlers know.
+    """State that the handlers share.
 
     Attributes:
         raising: whether a signal is raised; before and after the work it ends the process.

@@ -50,7 +50,7 @@ class ParameterRecord(Record):
 
 
 class EvidenceRecord(Record):
-    """What speaks for an effect."""
+    """Evidence for an effect."""
 
     heldout_nll_gain: Number | None
     p_value: Number | None
@@ -90,7 +90,7 @@ class DependenceRecord(Record):
 
 
 class RemainingRecord(Record):
-    """What the residual depends on after all."""
+    """Variables that the residual depends on in the end."""
 
     structured: bool
     drivers: list[DependenceRecord]

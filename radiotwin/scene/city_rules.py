@@ -1,4 +1,4 @@
-"""What `city.xml` of a scene folder may say.
+"""Allowlist of the elements, types and attributes in `city.xml` of a scene folder.
 
 - Read: `scene`; `bsdf` and `shape` of the types below; `ref`; `transform` with `translate`,
   `rotate`, `scale`, `matrix`; `string`, `float`, `integer`, `boolean`, `rgb`, `point`, `vector`.

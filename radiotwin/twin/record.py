@@ -75,7 +75,7 @@ class ChannelRecord(_Strict):
 
 
 class _Provenance(BaseModel):
-    """What is read of the provenance; the rest is only kept."""
+    """Fields of the provenance that are read; the others are only kept."""
 
     model_config = ConfigDict(strict=True)
 
