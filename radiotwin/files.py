@@ -10,6 +10,7 @@ import io
 import os
 import re
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -48,7 +49,8 @@ def require_writable(path: Path | str) -> None:
     """
     path = Path(path)
     _refuse_folder(path)
-    with _parent_of(path), _reported(path), _temporary_folder(path) as folder:
+    with (_parent_of(path, only_tried=True), _reported(path),
+          _temporary_folder(path) as folder):
         (folder / path.name).touch()
 
 
@@ -304,16 +306,19 @@ def _swap(new: Path, path: Path) -> None:
 
 
 @contextmanager
-def _parent_of(path: Path) -> Iterator[None]:
-    """Make the folders above `path`, and remove the new ones that are empty in the end."""
+def _parent_of(path: Path, only_tried: bool = False) -> Iterator[None]:
+    """Make the folders above `path`; remove the new ones where nothing was written."""
+    written = False
     with _reported(path):
         new = [folder for folder in path.parents if not folder.exists()]
     try:
         with _reported(path):
             path.parent.mkdir(parents=True, exist_ok=True)
         yield
+        written = not only_tried
     finally:
-        for folder in new:
+        # Not where it was written: another process may need the folder, empty or not.
+        for folder in () if written else new:
             with suppress(OSError):  # not empty, or never made
                 folder.rmdir()
 
@@ -351,7 +356,11 @@ def _flush_all(paths: list[Path]) -> None:
 
 def _refuse_folder(path: Path) -> None:
     with _reported(path):
-        if path.is_dir():
+        try:
+            mode = path.stat().st_mode  # once: another process may write or remove it meanwhile
+        except (FileNotFoundError, NotADirectoryError):
+            return
+        if stat.S_ISDIR(mode):
             raise BadInput(f"{path} is a folder; give the name of a file")
-        if path.exists() and not path.is_file():
+        if not stat.S_ISREG(mode):
             raise BadInput(f"{path} is not an ordinary file; give the name of a file")

@@ -5,6 +5,8 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+from contextlib import suppress
 
 import pytest
 
@@ -208,3 +210,34 @@ def test_names_that_are_too_long_are_bad_input(tmp_path):
         with pytest.raises(BadInput, match="cannot write"), make(tmp_path / ("a" * 300)):
             pass
         assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_another_process_removes_meanwhile_is_written(tmp_path):
+    """Rationale: asked twice whether it is there, a file could be missing the second time."""
+    path, done = tmp_path / "new" / "part.bin", threading.Event()
+
+    def remove():
+        while not done.is_set():
+            with suppress(FileNotFoundError):
+                path.unlink()
+
+    other = threading.Thread(target=remove)
+    other.start()
+    try:
+        for _ in range(2000):
+            with atomic_path(path, flush=False) as temporary:
+                temporary.write_bytes(b"x")
+    finally:
+        done.set()
+        other.join()
+
+
+def test_a_folder_that_was_only_tried_is_removed_and_a_written_one_stays(tmp_path):
+    path = tmp_path / "a" / "b" / "part.bin"
+    require_writable(path)
+    assert not (tmp_path / "a").exists()
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(b"x")
+    path.unlink()
+    require_writable(path)
+    assert path.parent.is_dir()
