@@ -30,6 +30,7 @@ HEIGHT_SIZES_M = (0.0, 1.5, 3.0, 6.0)
 STEPS = 4  # tried sizes between two followed ones
 DOF = 4.0  # of the errors
 BLOCK_M = 100.0  # side of the ground within which the links of a device err alike
+SEEN_WALL_M, SEEN_HEIGHT_M = 0.5, 1.0  # smaller errors change less than the paths' own error
 INTERVAL_NATS = 1.353  # drop of the profile likelihood at the ends of a 90 % interval (Wilks 1938)
 
 
@@ -47,8 +48,8 @@ class MapError:
 
     @property
     def is_seen(self) -> bool:
-        """Whether the levels say that the map is wrong."""
-        return self.wall_m[0] > 0 or self.height_m[0] > 0
+        """Whether the map is so wrong that predictions should allow for it."""
+        return self.wall_m[0] >= SEEN_WALL_M or self.height_m[0] >= SEEN_HEIGHT_M
 
     def __str__(self) -> str:
         parts = [f"{what} by {size:.1f} m (90 %: {low:.1f}-{high:.1f})"
@@ -98,10 +99,10 @@ def estimate_map_error(links: LinkGeometry, level_db: np.ndarray, limit_db: floa
     level_db = level_db[rows]
     limits_db = np.full(len(rows), -np.inf if limit_db is None else limit_db)
     reached = [1, 1]
-    while True:  # larger errors only where smaller ones are too small
+    while True:  # larger errors are followed only where they may be
         found = _profile(spread, reached, level_db, limits_db)
-        at_end = [best == STEPS * last and last < len(WALL_SIZES_M) - 1
-                  for best, last in zip(found.best, reached, strict=True)]
+        at_end = [places[-1] == STEPS * last and last < len(WALL_SIZES_M) - 1
+                  for places, last in zip(found.likely(spread.links), reached, strict=True)]
         if not any(at_end):
             return found.error(spread.links)
         reached = [last + wider for last, wider in zip(reached, at_end, strict=True)]
@@ -157,16 +158,21 @@ class _Profile:
     best: tuple[int, int]
     z: np.ndarray
 
-    def error(self, links: LinkGeometry) -> MapError:
+    def likely(self, links: LinkGeometry) -> list[np.ndarray]:
+        """Return the places within the 90 % interval on both scales."""
         block = np.column_stack([links.device, np.floor(links.receiver_m[:, :2] / BLOCK_M)])
         label = np.unique(block, axis=0, return_inverse=True)[1].reshape(-1)
-        links_as_one = design_effect(label, self.z)
+        enough = INTERVAL_NATS * design_effect(label, self.z)
+        return [np.flatnonzero(self.nll.min(axis=1 - axis) - self.nll.min() <= enough)
+                for axis in range(2)]
+
+    def error(self, links: LinkGeometry) -> MapError:
+        """Return estimate and interval of both sizes [m]."""
         sizes = []
-        for axis, scale_m in enumerate((WALL_SIZES_M, HEIGHT_SIZES_M)):
-            profile = self.nll.min(axis=1 - axis) - self.nll.min()
-            likely = np.flatnonzero(profile <= INTERVAL_NATS * links_as_one)
-            places = np.array([self.best[axis], likely[0], likely[-1]]) / STEPS
-            sizes.append(tuple(np.interp(places, np.arange(len(scale_m)), scale_m).tolist()))
+        for best, places, scale_m in zip(self.best, self.likely(links),
+                                         (WALL_SIZES_M, HEIGHT_SIZES_M), strict=True):
+            three = np.array([best, places[0], places[-1]]) / STEPS
+            sizes.append(tuple(np.interp(three, np.arange(len(scale_m)), scale_m).tolist()))
         return MapError(*sizes)
 
 

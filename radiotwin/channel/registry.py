@@ -7,6 +7,7 @@ A package adds models under the entry-point group `radiotwin.channels`; a script
 from radiotwin.channel.base import ChannelModel
 from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.channel.log_distance import LogDistance
+from radiotwin.channel.path_kriging import PathKriging
 from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.channel.segmented_nn import SegmentedNN
@@ -15,7 +16,8 @@ from radiotwin.plugins import load_plugins
 
 ENTRY_POINTS = "radiotwin.channels"  # group of the packages' entry points
 BUILT_IN: tuple[type[ChannelModel], ...] = (
-    LogDistance, SegmentedLogDistance, SegmentedNN, RegressionKriging, ImagePaths)
+    LogDistance, SegmentedLogDistance, SegmentedNN, RegressionKriging, ImagePaths,
+    PathKriging)
 ALIASES = {"raytrace": ImagePaths.name}  # as the command line calls it
 
 _registered: dict[str, type[ChannelModel]] = {}

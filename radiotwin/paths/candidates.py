@@ -16,7 +16,7 @@ from radiotwin.scene.citymap import CityMap
 MAX_AFTER_EDGE = 1  # reflections; a second one would double the time for 0.01 dB
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=12)  # a map and those with errors that stand beside it
 def candidate_search(city: CityMap, depth: int) -> "CandidateSearch":
     """Return the search of a city, made once: it keeps the surroundings of edges it has seen."""
     return CandidateSearch(city, depth)

@@ -74,4 +74,4 @@ def perturbed_map(city: CityMap, wall_sd_m: float, height_sd_m: float, seed: int
         top_m = corners_m[:, 2].max()
         corners_m[:, 2] *= max(1 + heights_m[number] / top_m, MIN_HEIGHT_SHARE)
         vertices_m[rows] = corners_m
-    return CityMap(vertices_m, city.faces)
+    return CityMap(vertices_m, city.faces, city.materials, city.material)

@@ -11,6 +11,7 @@ import numpy as np
 import radiotwin
 from radiotwin.channel import ChannelModel, channel_named, check_fit_data, fit_once
 from radiotwin.channel.image_paths import ImagePaths
+from radiotwin.channel.path_kriging import PathKriging
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.fold_model import FoldModel
@@ -69,7 +70,7 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
     if start is not None:
         start.warn_of_another_scene(scene, scene.content_hash())
     channel = channel_named(model)
-    if channel is ImagePaths:
+    if channel in (ImagePaths, PathKriging):
         if allow_indoor:
             raise BadInput(f"model {model} follows paths outside buildings only; take another "
                            "model where unknown devices may be indoors")
@@ -77,6 +78,8 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
         for note in links.notes:
             warnings.warn(note, stacklevel=2)
         twin = _fit_along_paths(links, scene, seed, start)
+        if channel is PathKriging:
+            twin = _with_path_kriging(twin, links, seed)
         twin.provenance.update(flights=flights, seed=seed)
         return twin
     _check_heights(measurements)
@@ -228,6 +231,15 @@ def _fit_along_paths(links: LinkData, scene: Scene, seed: int, start: Twin | Non
                       f"{MAX_DEVICES} at most: they are where a law of distance and line of sight "
                       "has them", stacklevel=4)
     return replace(twin, fitted=EffectModel.of(by_paths, fit))
+
+
+def _with_path_kriging(twin: Twin, links: LinkData, seed: int) -> Twin:
+    """Return a twin with the same positions, and all that the links tell of map and errors."""
+    device_m = reliable_m(twin.devices, LOST_M)
+    rows = np.isfinite(device_m).all(axis=1)[links.device]
+    located = links.with_devices(np.where(np.isfinite(device_m), device_m, 0.0)).select(rows)
+    channel = fit_once(PathKriging, located.geometry, located.level_db, links.limit_db, seed)
+    return replace(twin, channel=channel, fitted=None)
 
 
 def _image_paths(links: LinkData, law: Twin, device_m: np.ndarray) -> ImagePaths:
