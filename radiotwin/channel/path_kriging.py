@@ -207,10 +207,10 @@ class PathKriging(ChannelModel):
         if not ((model.classes[:, 1] > 0) & (model.classes[:, 1] <= MAX_SD_DB)).all():
             raise ValueError("an error scale is impossible")
         model.weight = require_array(arrays, "weight", (2,), 0.0, 1.0)
-        model.field, model.kriging = (
-            kind.from_state({name.removeprefix(f"{part}/"): value for name, value in arrays.items()
-                             if name.startswith(f"{part}/")}, settings[part])
-            for kind, part in ((ResidualField, "paths"), (RegressionKriging, "law")))
+        own, law = ({name.removeprefix(f"{part}/"): value for name, value in arrays.items()
+                     if name.startswith(f"{part}/")} for part in ("paths", "law"))
+        model.field = ResidualField.from_state(own, settings["paths"])
+        model.kriging = RegressionKriging.from_state(law, settings["law"])
         return model
 
 

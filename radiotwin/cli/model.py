@@ -39,7 +39,8 @@ def fit(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the twin.")] = Path("twin"),
     model: Annotated[str, typer.Option(
         help="segmented_nn, segmented_log_distance, log_distance, regression_kriging, or raytrace: "
-             "paths over the 3D map, also to find devices in narrow streets; takes minutes.")
+             "paths over the 3D map, also to find devices in narrow streets; takes minutes. "
+             "path_kriging: the same over a map that may be wrong.")
         ] = "segmented_nn",
     devices: DeviceTable = None,
     start: Annotated[Path | None, typer.Option(

@@ -51,7 +51,8 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
         measurements: links to anchors and unknown devices.
         scene: its map and extent, and the receivers' sensitivity.
         model: name of a channel model (`radiotwin.channel.channel_models`); `raytrace` stands for
-            `image_paths`, which follows paths over the 3D map.
+            `image_paths`, which follows paths over the 3D map, and `path_kriging` allows for errors
+            of that.
         seed: of the channel's and the search's random numbers.
         start: an earlier twin; the search also starts from its positions.
         allow_indoor: whether unknown devices may be inside buildings.
@@ -64,7 +65,7 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
 
     Raises:
         BadInput: no anchor, nothing detected, links that no channel can be learnt from, an unknown
-            model, or devices that may be indoors with `image_paths`.
+            model, or devices that may be indoors with one that follows paths.
     """
     flights, measurements = measurements.flights, _thinned(measurements, seed)
     if start is not None:
