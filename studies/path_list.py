@@ -94,34 +94,42 @@ def _own_paths(listed: Any) -> pd.DataFrame:
 
 def _sionna_paths(scene: Scene, points_m: np.ndarray, samples: int, seed: int) -> pd.DataFrame:
     """Return the paths of all links, devices one after another as in `list_paths`."""
-    settings = SolverSettings(samples_per_src=samples)
+    settings = SolverSettings(samples_per_src=samples, batch_receivers=10)
     rt = import_sionna()
     city = load_city(scene.xml_path, scene.config.radio.frequency_hz)
     solver = rt.PathSolver(deterministic=True)
     city.add(rt.Transmitter("device", position=[0.0, 0.0, 0.0]))
-    city.add(rt.Receiver("receiver", position=[0.0, 0.0, 0.0]))
+    ends = [rt.Receiver(f"r{i}", position=[0.0, 0.0, 0.0]) for i in range(settings.batch_receivers)]
+    for end in ends:
+        city.add(end)
     rows = []
     for device, device_m in enumerate(scene.device_m):
         city.transmitters["device"].position = device_m.tolist()
-        for point, point_m in enumerate(points_m):
-            city.receivers["receiver"].position = point_m.tolist()
+        for first in range(0, len(points_m), len(ends)):
+            for end, point_m in zip(ends, points_m[first:first + len(ends)]):
+                end.position = point_m.tolist()
             with candidate_search(TABLE_SIZE, DIFFRACTION_PROBABILITY):
                 paths = solver(city, max_depth=settings.max_depth, samples_per_src=samples,
                                max_num_paths_per_src=settings.max_num_paths_per_src,
                                refraction=False, diffraction=True, seed=seed + 1)
-            rows += _of_link(paths, device * len(points_m) + point)
+            for i in range(min(len(ends), len(points_m) - first)):
+                rows += _of_link(paths, len(ends), i, device * len(points_m) + first + i)
     return pd.DataFrame(rows)
 
 
-def _of_link(paths: Any, link: int) -> list[dict]:
-    amplitude = (np.array(paths.a[0], float) + 1j * np.array(paths.a[1], float)).ravel()
-    delay_s = np.array(paths.tau, float).ravel()
-    count = len(delay_s)
-    kinds = np.array(paths.interactions).reshape(-1, count).T
-    points_m = np.array(paths.vertices).reshape(-1, count, 3).transpose(1, 0, 2)
+def _of_link(paths: Any, receivers: int, receiver: int, link: int) -> list[dict]:
+    """Return the paths of one of the receivers of a call."""
+    def column(values: Any, *shape: int) -> np.ndarray:
+        return np.array(values, dtype=float).reshape(*shape[:1], receivers, -1, *shape[1:])
+
+    amplitude = (column(paths.a[0]) + 1j * column(paths.a[1]))[receiver]
+    delay_s = column(paths.tau)[receiver]
+    depth = np.array(paths.interactions).shape[0]
+    kinds = column(paths.interactions, depth)[:, receiver].T.astype(int)
+    points_m = column(paths.vertices, depth, 3)[:, receiver].transpose(1, 0, 2)
     rays = {}
     for end, letter in (("departure", "t"), ("arrival", "r")):
-        zenith, azimuth = (np.array(getattr(paths, f"{angle}_{letter}"), float).ravel()
+        zenith, azimuth = (column(getattr(paths, f"{angle}_{letter}"))[receiver]
                            for angle in ("theta", "phi"))
         rays[end] = np.column_stack([np.sin(zenith) * np.cos(azimuth),
                                      np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
