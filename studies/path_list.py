@@ -166,13 +166,13 @@ def _matches(own: pd.DataFrame, theirs: pd.DataFrame) -> tuple[list[int], list[i
 
 def path_table(rows: pd.DataFrame) -> str:
     """Return matched paths and their differences."""
-    heads = ["scene", "links", "paths of Sionna", "matched", "of the power", "delay 99 % [ns]",
-             "departure, arrival 99 % [°]", "reflected: median, 90 %, RMS [dB]",
+    heads = ["scene", "links", "paths of Sionna RT", "in both", "of its power", "delay, 99 % [ns]",
+             "departure, arrival, 99 % [°]", "reflected: median, 90 %, RMS [dB]",
              "diffracted: median, 90 %, RMS [dB]", "delay spread: correlation",
-             "median of Sionna's, and of the difference [ns]"]
+             "its median, and that of the difference [ns]"]
     return markdown(heads, [[
-        row["name"], row["links"], row["sionna_paths"], row["matched"],
-        f"{100 * row['matched_power']:.1f} %", f"{row['delay_p99_ns']:.3f}",
+        row["name"], *(str(row[count]) for count in ("links", "sionna_paths", "matched")),
+        f"{100 * row['matched_power']:.1f} %", f"{row['delay_p99_ns']:.4f}",
         f"{row['departure_p99_deg']:.3f}, {row['arrival_p99_deg']:.3f}",
         *(", ".join(f"{row[f'{kind}_{what}_db']:.2f}" for what in ("median", "p90", "rms"))
           for kind in ("reflected", "diffracted")),
