@@ -27,7 +27,7 @@ from radiotwin.paths.vectors import dot
 from radiotwin.paths.wedges import around_edge
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
-SAMPLE_M, SAMPLE_RAD = 1.0, 0.002  # [m], [rad] seen from the device: step of points on an edge
+SAMPLE_M, SAMPLE_RAD = 0.3, 0.0007  # [m], [rad] seen from the device: step of points on an edge
 
 
 class Ways(NamedTuple):
