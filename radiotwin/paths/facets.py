@@ -1,4 +1,4 @@
-"""Planar facets of a city: triangles that share a segment and lie in one plane."""
+"""Planar facets of a city: triangles of one material that share a segment and lie in one plane."""
 
 from dataclasses import dataclass
 
@@ -32,6 +32,7 @@ class Facets:
         first: (f + 1,) first row in `triangle_uv_m` of each facet.
         triangle_uv_m: (t, 6) corners u, v, u, v, u, v of the triangles in the plane [m].
         of_face: (city faces,) facet of each face of the city; -1: a sliver, or on the ground.
+        material: (f,) row of the city's materials.
     """
 
     normal: np.ndarray
@@ -44,6 +45,7 @@ class Facets:
     first: np.ndarray
     triangle_uv_m: np.ndarray
     of_face: np.ndarray
+    material: np.ndarray
 
     def __len__(self) -> int:
         return len(self.normal)
@@ -63,7 +65,8 @@ def extract_facets(city: CityMap, topology: Topology | None = None) -> Facets:
         BadInput: a corner is not finite.
     """
     topology = topology or build_topology(city)
-    label = _coplanar_groups(topology)
+    material = city.material[topology.source]
+    label = _coplanar_groups(topology, material)
     count = int(label.max()) + 1 if len(label) else 0
     order = np.argsort(label, kind="stable")
     first = np.searchsorted(label[order], np.arange(count + 1))
@@ -78,11 +81,12 @@ def extract_facets(city: CityMap, topology: Topology | None = None) -> Facets:
     of_face = np.full(len(city.faces), -1)
     of_face[topology.source] = label
     return Facets(normal, np.einsum("ij,ij->i", normal, origin_m), origin_m, axis_u, axis_v,
-                  size_m, full[:, 0] > 0, first, uv_m.reshape(-1, 6), of_face)
+                  size_m, full[:, 0] > 0, first, uv_m.reshape(-1, 6), of_face,
+                  material[order][first[:-1]])
 
 
-def _coplanar_groups(topology: Topology) -> np.ndarray:
-    """Return the facet (t,) of each triangle."""
+def _coplanar_groups(topology: Topology, material: np.ndarray) -> np.ndarray:
+    """Return the facet (t,) of each triangle, which is of a material (t,)."""
     size = np.diff(topology.group)
     pairs = [np.empty((0, 2), dtype=int)]
     for i in range(MAX_TRIANGLES_AT_SEGMENT):
@@ -93,6 +97,7 @@ def _coplanar_groups(topology: Topology) -> np.ndarray:
     corners_m = topology.vertices_m[topology.triangles]
     normal = topology.normal
     same = np.einsum("ij,ij->i", normal[a], normal[b]) > np.cos(np.radians(0.5))
+    same &= material[a] == material[b]
     for one, other in ((a, b), (b, a)):
         off_m = np.einsum("ikj,ij->ik", corners_m[other] - corners_m[one][:, :1], normal[one])
         same &= (np.abs(off_m) < COPLANAR_M).all(axis=1)

@@ -7,9 +7,9 @@ the vertical polarisation more strongly than the horizontal one.
 import numpy as np
 from numba import njit
 
-from radiotwin.paths.coefficients import fresnel
+from radiotwin.paths.coefficients import Slabs, reflection
 from radiotwin.paths.images import Candidates, PathBuffer, sequence_length
-from radiotwin.paths.surfaces import Surfaces
+from radiotwin.paths.surfaces import MATERIAL, Surfaces
 from radiotwin.paths.vectors import cross, dot
 from radiotwin.paths.wedges import diffract
 
@@ -18,7 +18,7 @@ VERTICAL, AVERAGE = 0, 1
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def path_gains(
-    surfaces: Surfaces, candidates: Candidates, wave_number: float, permittivity: complex,
+    surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
     polarisation: int, buffer: PathBuffer, rows: np.ndarray, gain: np.ndarray,
 ) -> None:
     """Compute the power gains of paths between isotropic antennas.
@@ -27,7 +27,7 @@ def path_gains(
         surfaces: of the map.
         candidates: that the paths were found with.
         wave_number: 2 π / wavelength [1/m].
-        permittivity: complex relative permittivity of all surfaces.
+        slabs: materials of the map.
         polarisation: VERTICAL of both antennas; or AVERAGE over those of the transmitting one,
             where the receiving one takes in all.
         buffer: the paths.
@@ -52,7 +52,7 @@ def path_gains(
             for axis in range(3):
                 field[axis] = polarised[axis]
             spread = _follow(surfaces.planes, surfaces.edges, candidates, buffer.candidate[path],
-                             wave_number, permittivity, direction, length_m, legs, field)
+                             wave_number, slabs, direction, length_m, legs, field)
             if polarisation == VERTICAL:
                 polarised = _vertical(direction[legs - 1])
                 power += spread * abs(dot(field, polarised)) ** 2
@@ -65,7 +65,7 @@ def path_gains(
 @njit(cache=True, error_model="numpy")
 def _follow(
     planes: np.ndarray, edges: np.ndarray, candidates: Candidates, row: int, wave_number: float,
-    permittivity: complex, direction: np.ndarray, length_m: np.ndarray, legs: int,
+    slabs: Slabs, direction: np.ndarray, length_m: np.ndarray, legs: int,
     field: np.ndarray,
 ) -> float:
     """Change the field along one path; return the spreading factor of its power [1/m²]."""
@@ -73,14 +73,14 @@ def _follow(
     edge = candidates.edge[row]
     for k in range(legs - 1):
         if k < before:
-            _reflect(planes[candidates.before[row, k], :3], direction[k], direction[k + 1],
-                     permittivity, field)
+            facet = candidates.before[row, k]
+            _reflect(planes[facet], direction[k], direction[k + 1], slabs, field)
         elif k > before:
             facet = candidates.after[row, k - before - 1]
-            _reflect(planes[facet, :3], direction[k], direction[k + 1], permittivity, field)
+            _reflect(planes[facet], direction[k], direction[k + 1], slabs, field)
         else:
             diffract(edges, edge, direction[k], direction[k + 1], length_m[:before + 1].sum(),
-                     length_m[before + 1:legs].sum(), wave_number, permittivity, field)
+                     length_m[before + 1:legs].sum(), wave_number, slabs, field)
     if edge < 0:
         return 1.0 / length_m[:legs].sum() ** 2
     before_m, after_m = length_m[:before + 1].sum(), length_m[before + 1:legs].sum()
@@ -98,10 +98,11 @@ def _vertical(direction: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, error_model="numpy")
 def _reflect(
-    normal: np.ndarray, direction_in: np.ndarray, direction: np.ndarray, permittivity: complex,
+    plane: np.ndarray, direction_in: np.ndarray, direction: np.ndarray, slabs: Slabs,
     field: np.ndarray,
 ) -> None:
-    """Reflect the field of a ray at a facet, in place."""
+    """Reflect the field of a ray at a facet, a row of `planes`, in place."""
+    normal = plane[:3]
     sine = abs(dot(direction_in, normal))
     across = cross(direction_in, normal)
     size2 = dot(across, across)
@@ -111,7 +112,7 @@ def _reflect(
         size2 = dot(across, across)
     across /= np.sqrt(size2)
     within_in, within = cross(across, direction_in), cross(across, direction)
-    te, tm = fresnel(sine, permittivity)
+    te, tm = reflection(sine, slabs, int(plane[MATERIAL]))
     field_te = te * dot(field, across)
     field_tm = tm * dot(field, within_in)
     for i in range(3):

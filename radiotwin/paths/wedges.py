@@ -7,8 +7,17 @@ the half planes before and after the edge are folded into one.
 import numpy as np
 from numba import njit
 
-from radiotwin.paths.coefficients import wedge_coefficients
-from radiotwin.paths.surfaces import ALONG, EXTERIOR, NORMAL_0, NORMAL_N, START, TANGENT
+from radiotwin.paths.coefficients import Slabs, face_sines, reflection, wedge_coefficients
+from radiotwin.paths.surfaces import (
+    ALONG,
+    EXTERIOR,
+    MATERIAL_0,
+    MATERIAL_N,
+    NORMAL_0,
+    NORMAL_N,
+    START,
+    TANGENT,
+)
 from radiotwin.paths.vectors import cross, dot
 
 MIN_SINE = 1e-4  # of the angle between ray and face; rays closer to a face are not followed
@@ -45,7 +54,7 @@ def around_edge(
 @njit(cache=True, error_model="numpy")
 def diffract(
     edges: np.ndarray, edge: int, direction_in: np.ndarray, direction: np.ndarray, before_m: float,
-    after_m: float, wave_number: float, permittivity: complex, field: np.ndarray,
+    after_m: float, wave_number: float, slabs: Slabs, field: np.ndarray,
 ) -> None:
     """Diffract the field of a ray at an edge (Kouyoumjian and Pathak, eq. 9-13), without spreading.
 
@@ -57,7 +66,7 @@ def diffract(
         before_m: length of the path before the edge [m].
         after_m: length of the path after the edge [m].
         wave_number: 2 π / wavelength [1/m].
-        permittivity: complex relative permittivity of both faces.
+        slabs: materials of the city.
         field: (3,) complex, changed in place.
     """
     along, tangent = edges[edge, ALONG:ALONG + 3], edges[edge, TANGENT:TANGENT + 3]
@@ -67,8 +76,12 @@ def diffract(
     across_in, across = cross(along, direction_in), cross(along, direction)
     sine = np.sqrt(dot(across, across))
     distance_m = before_m * after_m / (before_m + after_m) * sine * sine
-    soft, hard = wedge_coefficients(phi, phi_in, sine, distance_m, wave_number,
-                                    edges[edge, EXTERIOR] / np.pi, permittivity)
+    n = edges[edge, EXTERIOR] / np.pi
+    sine_0, sine_n = face_sines(phi, phi_in, sine, n)
+    soft, hard = wedge_coefficients(
+        phi, phi_in, sine, distance_m, wave_number, n,
+        reflection(sine_0, slabs, int(edges[edge, MATERIAL_0])),
+        reflection(sine_n, slabs, int(edges[edge, MATERIAL_N])))
     across_in = -across_in / np.sqrt(dot(across_in, across_in))
     across = across / sine
     upright_in, upright = cross(across_in, direction_in), cross(across, direction)
