@@ -10,6 +10,7 @@ from radiotwin.paths.images import Candidates
 from radiotwin.paths.shooting import FacetSequences, device_sequences, edge_sequences
 from radiotwin.paths.surfaces import OFFSET, pack
 from radiotwin.paths.topology import build_topology, expand
+from radiotwin.paths.two_edges import FacetEdges
 from radiotwin.paths.ways import open_ways, with_facets_after
 from radiotwin.scene.citymap import CityMap
 
@@ -34,6 +35,7 @@ class CandidateSearch:
         edges: of the city.
         surfaces: both, for compiled code.
         ground: row of the ground in `surfaces.planes`.
+        facet_edges: edges at each facet.
     """
 
     def __init__(self, city: CityMap, depth: int) -> None:
@@ -48,8 +50,8 @@ class CandidateSearch:
         facet = self.edges.facet.ravel()
         edge = np.repeat(np.arange(len(self.edges)), 2)
         order = np.lexsort((edge, facet))
-        self._edge_of_facet = edge[order]
-        self._first_edge = np.searchsorted(facet[order], np.arange(len(self.facets) + 2))
+        self.facet_edges = FacetEdges(self.facets.of_face, edge[order], np.searchsorted(
+            facet[order], np.arange(len(self.facets) + 2)))
 
     def candidates(self, device_m: np.ndarray) -> Candidates:
         """Find the sequences from a device, those without an edge first.
@@ -84,10 +86,10 @@ class CandidateSearch:
         reflected = sequences.next_facets[sequences.next_facets[:, 0] > 0]
         pairs = np.concatenate([direct, reflected])
         pairs = pairs[sequences.order[pairs[:, 0]] < self._depth]
-        first = self._first_edge[pairs[:, 1]]
-        row, within = expand(self._first_edge[pairs[:, 1] + 1] - first)
-        both = np.unique(np.column_stack([pairs[row, 0], self._edge_of_facet[first[row] + within]]),
-                         axis=0)
+        first = self.facet_edges.first[pairs[:, 1]]
+        row, within = expand(self.facet_edges.first[pairs[:, 1] + 1] - first)
+        edge = self.facet_edges.edge[first[row] + within]
+        both = np.unique(np.column_stack([pairs[row, 0], edge]), axis=0)
         return sequences.facets[both[:, 0]], both[:, 1]
 
     def _look_around(self, edges: np.ndarray) -> None:

@@ -1,5 +1,9 @@
 """Edges of a city that diffract: roof edges and corners of buildings.
 
+Faces of two materials form no edge. In Sionna RT, whose gains are the truth here, they belong to
+two meshes, and no ray is diffracted where two meshes meet; `build-scene --material` gives a
+building one material where its roof is to diffract.
+
 Around a segment the triangles that meet there are sorted by angle; an open sector of more than
 180 degrees between two of them is a wedge. This also holds where several buildings touch: a shared
 wall that is built over leaves no wedge.
@@ -75,7 +79,8 @@ def extract_edges(
                     topology.owner, topology.group, np.pi + 0.1)
     segment = topology.segments[found[:, 0]]
     pair = np.sort(facets.of_face[topology.source[found[:, 1:]]], axis=1)
-    keep = pair[:, 0] != pair[:, 1]
+    keep = (pair[:, 0] != pair[:, 1]) \
+        & (facets.material[pair[:, 0]] == facets.material[pair[:, 1]])
     start_m, end_m, pair = _join(topology.vertices_m[segment[keep]], pair[keep])
     direction = end_m - start_m
     direction /= np.maximum(np.linalg.norm(direction, axis=1), 1e-12)[:, None]

@@ -17,10 +17,12 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from radiotwin.paths.coefficients import Slabs
+from radiotwin.paths.fields import VERTICAL, vertical
 from radiotwin.paths.surfaces import ALONG, LENGTH, NORMAL_0, NORMAL_N, START, Surfaces
 from radiotwin.paths.topology import expand
 from radiotwin.paths.vectors import cross, dot
-from radiotwin.paths.wedges import around_edge
+from radiotwin.paths.wedges import around_edge, diffract
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
 STEPS = 30  # of the search for the points on two edges; it mostly takes five
@@ -154,7 +156,8 @@ def shortest(
         to_m: (3,) its end [m].
 
     Returns:
-        Positions along the edges from their starts [m].
+        Positions along the edges from their starts [m]; -1 where the way goes through the point in
+        which the edges meet.
     """
     a, b = one[ALONG:ALONG + 3], other[ALONG:ALONG + 3]
     s, t = 0.5 * one[LENGTH], 0.5 * other[LENGTH]
@@ -184,8 +187,8 @@ def shortest(
         step_s, step_t = (st * slope_t - tt * slope_s) / scale, (st * slope_s - ss * slope_t) / scale
         s, t = s + step_s, t + step_t
         if abs(step_s) + abs(step_t) < PRECISION_M:
-            break
-    return s, t
+            return s, t
+    return -1.0, -1.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -214,8 +217,8 @@ def wave_at_edge(
 
 @njit(cache=True, error_model="numpy")
 def two_edge_gains(
-    surfaces: Surfaces, wave_number: float, slabs: Slabs, polarisation: int, edge: np.ndarray,
-    points_m: np.ndarray,
+    surfaces: Surfaces, wave_number: float, slabs: Slabs, polarisation: int, wedge: int,
+    edge: np.ndarray, points_m: np.ndarray,
 ) -> np.ndarray:
     """Compute the power gains of paths over two edges between isotropic antennas.
 
@@ -224,6 +227,7 @@ def two_edge_gains(
         wave_number: 2 π / wavelength [1/m].
         slabs: materials of the map.
         polarisation: as of `radiotwin.paths.fields.path_gains`.
+        wedge: as there.
         edge: (p, 2) as in `EdgePairs`.
         points_m: (p, 4, 3) as there.
 
@@ -247,9 +251,9 @@ def two_edge_gains(
             for axis in range(3):
                 field[axis] = polarised[axis]
             diffract(surfaces.edges, edge[i, 0], direction[0], direction[1], a,
-                     wave_at_edge(a, b, c, sine2)[1], wave_number, slabs, field)
+                     wave_at_edge(a, b, c, sine2)[1], wave_number, slabs, wedge, field)
             diffract(surfaces.edges, edge[i, 1], direction[1], direction[2],
-                     wave_at_edge(c, b, a, sine2)[1], c, wave_number, slabs, field)
+                     wave_at_edge(c, b, a, sine2)[1], c, wave_number, slabs, wedge, field)
             if polarisation == VERTICAL:
                 power += abs(dot(field, vertical(direction[2]))) ** 2
             else:
