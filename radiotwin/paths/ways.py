@@ -23,11 +23,11 @@ from radiotwin.paths.images import (
 )
 from radiotwin.paths.pruning import cone_misses, lit_part
 from radiotwin.paths.surfaces import ALONG, LENGTH, NORMAL_0, NORMAL_N, START, Surfaces
-from radiotwin.paths.vectors import dot
 from radiotwin.paths.wedges import around_edge
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
-SAMPLE_M, SAMPLE_RAD = 0.3, 0.0007  # [m], [rad] seen from the device: step of points on an edge
+SAMPLE_M, SAMPLE_RAD = 0.3, 0.002  # [m], [rad] seen from the device: step of points on an edge
+SAMPLE_CHUNK = 100_000  # points at once: about 50 MB
 
 
 class Ways(NamedTuple):
@@ -62,11 +62,13 @@ def open_ways(
         Those of the ways that the device sees the edge by.
     """
     lit_m, source_m, samples = _lit_parts(surfaces, before, edge, device_m)
-    points = PathBuffer.allocate(int(samples.sum()))
-    found = _sample(surfaces, before, edge, device_m, lit_m, samples, points)
+    points = PathBuffer.allocate(SAMPLE_CHUNK + int(samples.max(initial=0)))
     one_by_one = Candidates(before, np.full(len(edge), -1), before[:, :0])
-    clear = clear_paths(city, surfaces, one_by_one, points, found)
-    seen = np.unique(points.candidate[clear])
+    way, is_seen = 0, np.zeros(len(edge), dtype=bool)
+    while way < len(edge):
+        found, way = _sample(surfaces, before, edge, device_m, lit_m, samples, way, points)
+        is_seen[points.candidate[clear_paths(city, surfaces, one_by_one, points, found)]] = True
+    seen = np.flatnonzero(is_seen)
     return Ways(before[seen], edge[seen], lit_m[seen], source_m[seen])
 
 
@@ -91,7 +93,7 @@ def _lit_parts(
             lit_m[way, 0], lit_m[way, 1] = low_m, high_m
             source_m[way, 0], source_m[way, 1] = along_m, across_m
             nearest_m = min(max(along_m, low_m), high_m) - along_m
-            step_m = SAMPLE_M + SAMPLE_RAD * np.sqrt(across_m ** 2 + nearest_m ** 2)
+            step_m = max(SAMPLE_M, SAMPLE_RAD * np.sqrt(across_m ** 2 + nearest_m ** 2))
             samples[way] = 2 + int((high_m - low_m) / step_m)
     return lit_m, source_m, samples
 
@@ -99,31 +101,43 @@ def _lit_parts(
 @njit(cache=True, nogil=True, error_model="numpy")
 def _sample(
     surfaces: Surfaces, before: np.ndarray, edge: np.ndarray, device_m: np.ndarray,
-    lit_m: np.ndarray, samples: np.ndarray, points: PathBuffer,
-) -> int:
-    """Put the paths to points of lit parts, just off the edge, in a buffer; return their number."""
+    lit_m: np.ndarray, samples: np.ndarray, way: int, points: PathBuffer,
+) -> tuple[int, int]:
+    """Put paths to points of lit parts, just off the edge, in a buffer, from a way on.
+
+    Returns:
+        Their number, and the way to go on with.
+    """
+    edges = surfaces.edges
     image = np.empty((MAX_INTERACTIONS + 1, 3))
     found = 0
-    for way in range(len(edge)):
+    while way < len(edge) and found < SAMPLE_CHUNK:
         facets = before[way, :sequence_length(before, way)]
         if samples[way]:
             source_images(surfaces.planes, facets, device_m, image)
-        row = surfaces.edges[edge[way]]
-        outward = row[NORMAL_0:NORMAL_0 + 3] + row[NORMAL_N:NORMAL_N + 3]
-        outward = SKIN_M * outward / np.sqrt(dot(outward, outward))
+        at = edge[way]
+        out_x = edges[at, NORMAL_0] + edges[at, NORMAL_N]
+        out_y = edges[at, NORMAL_0 + 1] + edges[at, NORMAL_N + 1]
+        out_z = edges[at, NORMAL_0 + 2] + edges[at, NORMAL_N + 2]
+        skin = SKIN_M / np.sqrt(out_x ** 2 + out_y ** 2 + out_z ** 2)
         for k in range(samples[way]):
             share = (k + 0.5) / samples[way]
-            at_m = min(max(lit_m[way, 0] + share * (lit_m[way, 1] - lit_m[way, 0]), 0.0),
-                       row[LENGTH])
-            end_m = row[START:START + 3] + at_m * row[ALONG:ALONG + 3]
+            along_m = lit_m[way, 0] + share * (lit_m[way, 1] - lit_m[way, 0])
+            along_m = min(max(along_m, 0.0), edges[at, LENGTH])
+            x = edges[at, START] + along_m * edges[at, ALONG]
+            y = edges[at, START + 1] + along_m * edges[at, ALONG + 1]
+            z = edges[at, START + 2] + along_m * edges[at, ALONG + 2]
             points_m = points.points_m[found]
-            if reflections_back(surfaces.planes, surfaces.triangle_uv_m, facets, end_m[0],
-                                end_m[1], end_m[2], image, points_m):
-                points_m[0] = device_m
-                points_m[len(facets) + 1] = end_m + outward
+            if reflections_back(surfaces.planes, surfaces.triangle_uv_m, facets, x, y, z, image,
+                                points_m):
+                points_m[0, 0], points_m[0, 1], points_m[0, 2] = device_m
+                points_m[len(facets) + 1, 0] = x + skin * out_x
+                points_m[len(facets) + 1, 1] = y + skin * out_y
+                points_m[len(facets) + 1, 2] = z + skin * out_z
                 points.candidate[found], points.count[found] = way, len(facets) + 2
                 found += 1
-    return found
+        way += 1
+    return found, way
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
