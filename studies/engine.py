@@ -175,7 +175,7 @@ def measure_growth(seed: int, settings: dict) -> dict:
         box.apply_translation([60 * (column - side / 2 + 0.5), 60 * (row - side / 2 + 0.5),
                                size_m[2] / 2])
         boxes.append(box)
-    mesh = trimesh.util.concatenate(boxes[:settings["faces"] // 12])
+    mesh: Any = trimesh.util.concatenate(boxes[:settings["faces"] // 12])
     reach_m = min(500.0, 30.0 * side)
     points_m = rng.uniform([-reach_m, -reach_m, 45], [reach_m, reach_m, 60],
                            (settings["receivers"], 3))

@@ -1,6 +1,7 @@
 """The same links by Sionna RT and by the engine, path by path."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.constants import speed_of_light
@@ -12,9 +13,8 @@ from radiotwin.paths.fields import VERTICAL, path_gains
 from radiotwin.paths.images import PathBuffer, find_paths
 from radiotwin.paths.powers import PATH_CHUNK, WEDGES
 from radiotwin.scene import Scene
-from radiotwin.trace.settings import DIFFRACTION_PROBABILITY, TABLE_SIZE, SolverSettings
-from radiotwin.trace.sionna_scene import candidate_search as sionna_search
-from radiotwin.trace.solver import PathGains
+from radiotwin.trace.settings import SolverSettings
+from radiotwin.trace.solver import Antennas, PathGains
 
 DEPTH = 4
 SAME_M = 0.02  # [m], greatest difference of the lengths of one path; Sionna RT's are single
@@ -58,9 +58,9 @@ def engine_paths(
             before, after = ((facets[row] >= 0).sum() for facets in (candidates.before,
                                                                      candidates.after))
             legs_m = np.diff(buffer.points_m[path, :count], axis=0)
+            kind = "R" * before + ("D" + "R" * after if candidates.edge[row] >= 0 else "")
             out[buffer.receiver[path]].append(FoundPath(
-                "R" * before + ("D" + "R" * after) * (candidates.edge[row] >= 0),
-                float(np.linalg.norm(legs_m, axis=1).sum()), float(power)))
+                kind, float(np.linalg.norm(legs_m, axis=1).sum()), float(power)))
     return out
 
 
@@ -88,7 +88,7 @@ class SionnaPaths:
             out += self._found[:len(receiver_m[part])]
         return out
 
-    def _keep(self, paths, antennas):  # type: ignore[no-untyped-def]  # of Sionna RT
+    def _keep(self, paths: Any, antennas: Antennas) -> np.ndarray:
         rows = self._settings.batch_receivers
         power = sum(np.array(part, dtype=float).reshape(rows, -1) ** 2 for part in paths.a)
         length_m = speed_of_light * np.array(paths.tau, dtype=float).reshape(rows, -1)

@@ -184,7 +184,8 @@ def shortest(
         scale = ss * tt - st * st
         if not scale > 0.0:
             return -1.0, -1.0
-        step_s, step_t = (st * slope_t - tt * slope_s) / scale, (st * slope_s - ss * slope_t) / scale
+        step_s = (st * slope_t - tt * slope_s) / scale
+        step_t = (st * slope_s - ss * slope_t) / scale
         s, t = s + step_s, t + step_t
         if abs(step_s) + abs(step_t) < PRECISION_M:
             return s, t
