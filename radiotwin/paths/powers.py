@@ -74,9 +74,9 @@ def path_powers(
     """Follow the paths from devices to receivers and add up their powers.
 
     Surfaces are slabs of the map's materials, and the ground z = 0 one of `city.ground_material`.
-    Ends inside buildings are accepted, but their results mean little.
-    In the shadow of a dense city (scenes/rbm) the standard deviation from a ray tracer's gains is
-    5.5, 2.5, 1.5 and 1.4 dB at depth 2, 3, 4 and 5; each step takes about a third more time.
+    Ends inside buildings are accepted, but their results mean little. At the depth of 4 the RMS
+    difference from Sionna RT with a million rays is 0.9 dB in scenes/rbm and 3.7 dB in Munich,
+    without line of sight (`python -m studies engine`).
 
     Args:
         city: 3D map.
