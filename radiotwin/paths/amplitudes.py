@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 from radiotwin.paths.coefficients import Slabs
-from radiotwin.paths.fields import _follow, _vertical
+from radiotwin.paths.fields import _follow, vertical
 from radiotwin.paths.images import Candidates, PathBuffer
 from radiotwin.paths.surfaces import Surfaces
 from radiotwin.paths.vectors import dot
@@ -13,7 +13,7 @@ from radiotwin.paths.vectors import dot
 @njit(cache=True, nogil=True, error_model="numpy")
 def path_amplitudes(
     surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
-    buffer: PathBuffer, rows: np.ndarray, amplitude: np.ndarray, total_m: np.ndarray,
+    wedge: int, buffer: PathBuffer, rows: np.ndarray, amplitude: np.ndarray, total_m: np.ndarray,
 ) -> None:
     """Compute the complex gains of paths between vertically polarised isotropic antennas.
 
@@ -22,6 +22,7 @@ def path_amplitudes(
         candidates: that the paths were found with.
         wave_number: 2 π / wavelength [1/m].
         slabs: materials of the map.
+        wedge: LUEBBERS or SIONNA, see `radiotwin.paths.coefficients`.
         buffer: the paths.
         rows: (m,) paths of the buffer to compute.
         amplitude: (m,) complex output: received over sent field, with the phase of the delay, for
@@ -38,11 +39,11 @@ def path_amplitudes(
             direction[k] = buffer.points_m[path, k + 1] - buffer.points_m[path, k]
             length_m[k] = max(np.sqrt((direction[k] ** 2).sum()), 1e-9)
             direction[k] /= length_m[k]
-        sent = _vertical(direction[0])
+        sent = vertical(direction[0])
         for axis in range(3):
             field[axis] = sent[axis]
         spread = _follow(surfaces.planes, surfaces.edges, candidates, buffer.candidate[path],
-                         wave_number, slabs, direction, length_m, legs, field)
+                         wave_number, slabs, wedge, direction, length_m, legs, field)
         total_m[i] = length_m[:legs].sum()
-        amplitude[i] = dot(field, _vertical(direction[legs - 1])) * np.sqrt(spread) \
+        amplitude[i] = dot(field, vertical(direction[legs - 1])) * np.sqrt(spread) \
             / (2.0 * wave_number) * np.exp(-1j * wave_number * total_m[i])

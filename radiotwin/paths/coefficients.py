@@ -2,16 +2,23 @@
 
 A surface is a slab of one dielectric, of the thickness that its material declares [1]: behind a
 thin wall is air again, which reflects, too. What a rough surface scatters is missing from its
-reflection: with the scattering coefficient S the field is sqrt(1 - S²) times as strong [5]. An edge
-is a wedge in the uniform theory of
-diffraction [2] with Luebbers' heuristic for faces that are not conductors [3]. The knife edge of
-ITU-R P.526 is not used: it has neither the angle of the wedge nor its material nor the
-polarisation, and it holds close to the shadow boundary only.
+reflection: with the scattering coefficient S the field is sqrt(1 - S²) times as strong [5].
 
-Luebbers takes the angles of reflection at the faces from the incident ray, so that his
-coefficient changes when the two ends are swapped. Here the smaller of the angles of the incident
-and the diffracted ray to each face is taken. It is the same at the reflection boundaries and in
-the shadow behind a lit face, for which he gave it, and it is reciprocal everywhere.
+An edge is a wedge in the uniform theory of diffraction [2]. For faces that are not conductors there
+are heuristics only, which differ by many decibels away from the boundaries of shadow and
+reflection. There are two here:
+
+- Luebbers' [3] multiplies the two terms of the reflection boundaries by the reflection at the
+  face. He takes the angles of reflection from the incident ray, so that his coefficient changes
+  when the two ends are swapped. Here the smaller of the angles of the incident and the diffracted
+  ray to each face is taken. It is the same at the reflection boundaries and in the shadow behind a
+  lit face, for which he gave it, and it is reciprocal everywhere. For conductors it is exact.
+- Sionna RT's [6] multiplies all four terms by the reflection of the incident ray at one of the
+  faces, or by -1 where that face lies in the shadow. It is not reciprocal, and for a conductor not
+  that of [2] for the field across the edge, except near the boundaries.
+
+The knife edge of ITU-R P.526 is not used: it has neither the angle of the wedge nor its material
+nor the polarisation, and it holds close to the shadow boundary only.
 
 [1] Recommendation ITU-R P.2040-4, "Effects of building materials and structures on radiowave
     propagation above about 100 MHz", 2025: section 2.2.2 and Table 3.
@@ -22,6 +29,8 @@ the shadow behind a lit face, for which he gave it, and it is reciprocal everywh
 [4] Balanis, "Advanced Engineering Electromagnetics", 2nd ed., 2012: section 5.3.
 [5] Degli-Esposti et al., "Measurement and modelling of scattering from buildings", IEEE Trans.
     Antennas Propag. 55(1), 2007: eq. 2.
+[6] Aït Aoudia et al., "Sionna RT: Technical Report", arXiv:2504.21719, 2025, in the form of Sionna
+    RT 2.2, which names Hashimoto et al. as its source.
 """
 
 from collections.abc import Sequence
@@ -135,6 +144,32 @@ def _fresnel_tail(a: float) -> complex:
     for n in range(60, 0, -1):
         fraction = z + 0.5 * n / fraction
     return 0.5 * np.exp(-0.25j * np.pi) * np.exp(-1j * a * a) / fraction
+
+
+@njit(cache=True)
+def wedge_terms(
+    phi: float, phi_in: float, sine_edge: float, distance_m: float, wave_number: float, n: float
+) -> tuple[complex, complex]:
+    """Return the diffraction coefficients of a wedge, parted by its faces [2, eq. 25-28, 3].
+
+    Args:
+        phi: angle of the diffracted ray from face 0, across the edge [rad], 0 to n π.
+        phi_in: the same angle of the incident ray.
+        sine_edge: sine of the angle between ray and edge.
+        distance_m: s s' sin² / (s + s') of the distances s' before and s after the edge [m].
+        wave_number: 2 π / wavelength [1/m].
+        n: exterior angle of the wedge divided by π.
+
+    Returns:
+        The parts [√m] that the reflections at face 0 and at face n multiply; -1 of the sum is the
+        soft coefficient of a perfect conductor.
+    """
+    x = wave_number * distance_m
+    scale = -np.exp(-0.25j * np.pi) / (2.0 * n * np.sqrt(2.0 * np.pi * wave_number) * sine_edge)
+    return (scale * (_cotangent_term(phi - phi_in, x, n, 1)
+                     - _cotangent_term(phi + phi_in, x, n, -1)),
+            scale * (_cotangent_term(phi - phi_in, x, n, -1)
+                     - _cotangent_term(phi + phi_in, x, n, 1)))
 
 
 @njit(cache=True)

@@ -11,6 +11,7 @@ from radiotwin.paths.candidates import candidate_search
 from radiotwin.paths.clearance import clear_paths
 from radiotwin.paths.coefficients import slabs_of
 from radiotwin.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, find_paths
+from radiotwin.paths.powers import WEDGES
 from radiotwin.scene.citymap import CityMap
 
 RECEIVER_CHUNK = 500  # receivers at once
@@ -48,7 +49,7 @@ class Rays:
 
 
 def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float,
-                depth: int = 4) -> Iterator[tuple[Rays, int]]:
+                depth: int = 4, wedge: str = "sionna") -> Iterator[tuple[Rays, int]]:
     """Follow the paths from a device to receivers, some receivers at a time.
 
     Args:
@@ -57,6 +58,7 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
         receiver_m: (n, 3) positions [m].
         frequency_hz: carrier frequency [Hz].
         depth: maximum number of interactions of a path, 1 to 6.
+        wedge: coefficient of diffraction, as of `radiotwin.paths.path_powers`.
 
     Yields:
         The paths to the next receivers, whose rows are among all, and the number of these.
@@ -76,8 +78,8 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
                                        buffer)
             rows = clear_paths(city, search.surfaces, candidates, buffer, found)
             amplitude, length_m = np.empty(len(rows), dtype=complex), np.empty(len(rows))
-            path_amplitudes(search.surfaces, candidates, wave_number, slabs, buffer, rows,
-                            amplitude, length_m)
+            path_amplitudes(search.surfaces, candidates, wave_number, slabs, WEDGES[wedge],
+                            buffer, rows, amplitude, length_m)
             parts.append(_rays(buffer, rows, kinds[buffer.candidate[rows]], amplitude, length_m))
         yield _joined(parts, first), len(ends_m)
 

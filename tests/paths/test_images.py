@@ -7,6 +7,7 @@ from radiotwin.paths.candidates import CandidateSearch
 from radiotwin.paths.coefficients import slabs_of
 from radiotwin.paths.fields import VERTICAL, path_gains
 from radiotwin.paths.images import Candidates, PathBuffer, find_paths
+from radiotwin.paths.wedges import LUEBBERS
 from radiotwin.scene.citymap import CONCRETE
 
 WAVE_NUMBER = 2 * np.pi * 2.4e9 / 299_792_458.0
@@ -27,7 +28,7 @@ def solve(search, before, edge, after, device_m, receiver_m):
     buffer = PathBuffer.allocate(5)
     found, _ = find_paths(search.surfaces, candidates, np.array(device_m), np.array([receiver_m]), 0, buffer)
     gain = np.empty(found)
-    path_gains(search.surfaces, candidates, WAVE_NUMBER, SLABS, VERTICAL, buffer,
+    path_gains(search.surfaces, candidates, WAVE_NUMBER, SLABS, VERTICAL, LUEBBERS, buffer,
                np.arange(found), gain)
     return [buffer.points_m[i, :buffer.count[i]] for i in range(found)], gain
 

@@ -124,7 +124,7 @@ def test_a_turned_city(town, turn, links):
     device_m, receiver_m, device = links
     there = stacked(path_powers(town(), device_m, receiver_m, device, FREQUENCY_HZ))
     turned = stacked(path_powers(town(0.5), turn(device_m, 0.5), turn(receiver_m, 0.5), device, FREQUENCY_HZ))
-    assert (there.sum(axis=1) > 0).all()
+    assert (there.sum(axis=1) > 0).sum() == len(COMPONENTS) - 1  # there is no link that only two edges reach
     assert np.allclose(10 * np.log10(there.sum(axis=0)), 10 * np.log10(turned.sum(axis=0)), atol=0.3)
     assert np.median(np.abs(there.sum(axis=0) / turned.sum(axis=0) - 1)) < 1e-6
 
@@ -133,9 +133,9 @@ def test_a_turned_city(town, turn, links):
 def test_powers_are_reciprocal(town, links, polarisation):
     """Two interactions at most: longer paths may have more reflections before an edge than after it."""
     device_m, receiver_m, device = links
-    there = path_powers(town(0.3), device_m, receiver_m, device, FREQUENCY_HZ, polarisation, depth=2)
+    there = path_powers(town(0.3), device_m, receiver_m, device, FREQUENCY_HZ, polarisation, 2, "luebbers")
     few = np.arange(8)
-    back = path_powers(town(0.3), receiver_m[few], device_m[device[few]], few, FREQUENCY_HZ, polarisation, depth=2)
+    back = path_powers(town(0.3), receiver_m[few], device_m[device[few]], few, FREQUENCY_HZ, polarisation, 2, "luebbers")
     assert np.allclose(stacked(there)[:, few], stacked(back), rtol=1e-6, atol=1e-16)
     assert np.allclose(there.departures[few], back.arrivals, rtol=1e-6, atol=1e-16)
 
@@ -177,7 +177,7 @@ def test_more_interactions_only_add(town, links):
 @pytest.mark.parametrize("change, message", [
     ({"device_m": np.zeros((1, 2))}, "device_m"), ({"receiver_m": np.full((2, 3), np.nan)}, "receiver_m"),
     ({"device": np.array([0])}, "device"), ({"device": np.array([0, 1])}, "rows"),
-    ({"frequency_hz": 0.0}, "frequency"), ({"polarisation": "odd"}, "average"), ({"depth": 7}, "depth"),
+    ({"frequency_hz": 0.0}, "frequency"), ({"polarisation": "odd"}, "average"), ({"depth": 7}, "depth"), ({"wedge": "odd"}, "luebbers"),
 ])
 def test_bad_input(city_of, change, message):
     good = {"device_m": np.ones((1, 3)), "receiver_m": np.full((2, 3), 40.0), "device": np.array([0, 0]),
