@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,11 +15,13 @@ from radiotwin.closeloop.run import close_loop
 from radiotwin.errors import BadInput
 from radiotwin.links import prepare_links
 from radiotwin.measurements import read_measurements
+from radiotwin.paths import path_powers
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import Material
 from radiotwin.twin import Twin, check_twin_target, fit_twin
 
 VERSION_1 = Path(__file__).parent / "version_1"  # made with radiotwin 0.1, see its README.md
+ATOL_DB = 1e-3  # paths are found in another order, and their field is computed in another
 NO_MAP = SimpleNamespace(config=SimpleNamespace(radio=SimpleNamespace(frequency_hz=2.4e9)), city=None)
 
 
@@ -69,7 +72,7 @@ def test_a_corrected_twin_of_version_0_1_predicts_the_same():
     model, result = twin.fitted.on_links(links)
     reading = model.regression().predict(result)
     np.testing.assert_allclose(reading.mean_db, before["read_db"], atol=1e-6, rtol=0)
-    np.testing.assert_allclose(reading.scale_db, before["read_scale_db"], atol=1e-6, rtol=0)
+    np.testing.assert_allclose(reading.scale_db, before["read_scale_db"], atol=ATOL_DB, rtol=0)
 
 
 @pytest.fixture
@@ -78,6 +81,7 @@ def old_scene(small_scene, monkeypatch):
     thick = Material("concrete", itu="concrete", thickness_m=100.0)
     monkeypatch.setattr("radiotwin.scene.citymap.CONCRETE", thick)
     monkeypatch.setattr("radiotwin.effects.missing_obstacle.CONCRETE", thick)
+    monkeypatch.setattr("radiotwin.paths.powers.path_powers", partial(path_powers, wedge="luebbers"))
     scene = replace(small_scene)
     scene.__dict__["city"] = CityMap(small_scene.city.vertices, small_scene.city.faces, [thick])
     return scene
@@ -109,7 +113,8 @@ def test_an_effect_of_a_twin_of_version_0_1_does_the_same(number, old_scene, tmp
         model, result = twin.fitted.on_links(links)
         reading = model.regression().predict(result)
         values = [reading.mean_db, reading.scale_db, model.regression().nll(result)]
-    np.testing.assert_allclose(values, before[f"{part['over']}_{number}"], atol=1e-6, rtol=0)
+    limit_db = 0.1 if part["name"] == "diffraction" else ATOL_DB  # 0.1 did not follow paths over two edges
+    np.testing.assert_allclose(values, before[f"{part['over']}_{number}"], atol=limit_db, rtol=0)
 
 
 def test_a_twin_of_version_0_1_that_follows_paths_predicts_the_same(old_scene):
@@ -118,8 +123,8 @@ def test_a_twin_of_version_0_1_that_follows_paths_predicts_the_same(old_scene):
     links = twin.links(before["receiver_m"], before["device"], old_scene)
     found = twin.predict(links)
     np.testing.assert_array_equal(links.los, before["los"])
-    np.testing.assert_allclose(found.mean_db, before["mean_db"], atol=1e-6, rtol=0)
-    np.testing.assert_allclose(found.sd_db, before["sd_db"], atol=1e-6, rtol=0)
+    np.testing.assert_allclose(found.mean_db, before["mean_db"], atol=ATOL_DB, rtol=0)
+    np.testing.assert_allclose(found.sd_db, before["sd_db"], atol=ATOL_DB, rtol=0)
 
 
 def test_a_twin_of_version_0_1_is_saved_as_one_of_this_version(tmp_path):
