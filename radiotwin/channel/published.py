@@ -135,10 +135,11 @@ class PublishedLaw(ChannelModel):
                 ("height of the lower end", low_m, self.validity.low_m, "m")):
             odd = (value < least) | (value > most)
             if odd.any():
+                ends = sorted({f"{value[odd].min():.3g}", f"{value[odd].max():.3g}"}, key=float)
                 share = "" if what == "frequency" else f" in {odd.mean():.0%} of the links"
                 found.append(f"{self.name} is used outside what {self.source} was published for: "
-                             f"the {what} is {value[odd].min():.3g} to {value[odd].max():.3g} "
-                             f"{unit}{share}, published is {least:g} to {most:g} {unit}")
+                             f"the {what} is {' to '.join(ends)} {unit}{share}, published is "
+                             f"{least:g} to {most:g} {unit}")
         return found
 
     @override

@@ -170,7 +170,8 @@ def compare(
 ) -> None:
     """Compare all channel models on held-out flights.
 
-    Published laws that hold at the scene's frequency are among them, fitted to nothing. With --truth they are compared with the truth map, too.
+    Published laws that hold at the scene's frequency are among them, fitted to nothing.
+    With --truth they are compared with the truth map, too.
     """
     from radiotwin.compare import DEFAULT_MODELS, compare_models, published_models, split_flights
     from radiotwin.comparison_output import judge_also, write_comparison

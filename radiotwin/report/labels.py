@@ -43,7 +43,10 @@ SUFFIXES = {"_db_km": "dB/km", "_db_m": "dB/m", "_deg": "°", "_db": "dB", "_dbm
             "_m": "m", "_s": "s"}
 NAMES = {"log_distance": "log-distance law", "raytrace": "ray tracer"}
 MODELS = {"log_distance": "log-distance", "segmented_log_distance": "segmented log-distance",
-          "segmented_nn": "segmented NN", "regression_kriging": "regression kriging"}
+          "segmented_nn": "segmented NN", "regression_kriging": "regression kriging",
+          "tr36777_uma": "TR 36.777 UMa", "tr36777_umi": "TR 36.777 UMi",
+          "al_hourani_urban": "Al-Hourani urban", "p1411": "ITU-R P.1411",
+          "cost231_wi": "COST 231 W-I"}
 INTERPOLATIONS = ("correlated_shadowing", "unexplained_trend")
 """Effects that fit what is left without a cause."""
 
