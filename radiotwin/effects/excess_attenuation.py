@@ -1,21 +1,31 @@
 """Loss in proportion to distance: gas, rain, haze, or vegetation everywhere.
 
-Specific attenuation γ [dB/km] times path length [km] (ITU-R P.676-13, P.838-3, P.833-10). Its
+Specific attenuation γ [dB/km] times path length [km] (ITU-R P.676-12, P.838-3, P.833-10). Its
 density may fall with height as exp(-z / h), as that of water vapour does (ITU-R P.835-6, Sec. 1.2).
+
+Where the frequency is known, it is bounded by what there is to absorb: humid air and rain of 150
+mm/h over all heights, and woodland everywhere up to the height of tall trees. Receivers often fly
+at one height, and then only the loss straight up through the layer is known, not how it is
+distributed: so that loss is compared.
 """
 
 import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
+from radiotwin.effects.atmosphere import max_gas_db_km, max_rain_db_km
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import EffectParams, Estimate, Metres, Parameter, Variation
 from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.effects.vegetation import specific_db_m
 from radiotwin.links import LinkData
 
 PRIOR_SD_DB_KM = 30.0  # wide: heavy rain at 60 GHz is 15 dB/km
 SCALE_HEIGHTS_M = (5000.0, 150.0, 50.0)  # to begin with: the atmosphere, haze, vegetation
 MIN_HEIGHT_M, MAX_HEIGHT_M = 15.0, 5000.0
+TREES_M = 30.0  # height of tall trees
+# ITU-R P.833-10 calls its specific attenuations typical: species, density and water differ widely.
+DENSEST = 2.0  # woodland, relative to the typical one
 
 
 class ExcessAttenuation(GainEffect):
@@ -29,10 +39,20 @@ class ExcessAttenuation(GainEffect):
 
         scale_height_m: float = Field(
             ge=1e-3, le=1e9, description="Height over which the density falls to 1/e [m].")
+        frequency_hz: float | None = Field(
+            None, gt=0, le=1e12, description="Of the radio [Hz]; None: unknown, nothing is bounded.")
+        between_m: tuple[Metres, Metres] = Field(
+            (0.0, 0.0), description="Least and greatest height of an end of a link [m].")
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        return [self.Params(scale_height_m=height_m) for height_m in SCALE_HEIGHTS_M]
+        links = view.links
+        known = np.isfinite(links.frequency_hz)
+        z_m = np.concatenate([links.device_m[links.device, 2], links.receiver_m[:, 2]])
+        return [self.Params(scale_height_m=height_m,
+                            frequency_hz=float(links.frequency_hz) if known else None,
+                            between_m=(float(z_m.min()), float(z_m.max())))
+                for height_m in SCALE_HEIGHTS_M]
 
     @override
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
@@ -46,12 +66,23 @@ class ExcessAttenuation(GainEffect):
     def variation(self, params: Params) -> Variation:
         return Variation(np.log([params.scale_height_m]), np.array([0.4]), np.log([MIN_HEIGHT_M]),
                          np.log([MAX_HEIGHT_M]),
-                         lambda numbers: self.Params(scale_height_m=float(np.exp(numbers[0]))))
+                         lambda numbers: params.model_copy(
+                             update={"scale_height_m": float(np.exp(numbers[0]))}))
 
     @override
     def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
         if coefficients[0] < 0:
             return f"it would have to amplify, by {-coefficients[0]:.1f} dB/km"
+        if params.frequency_hz is None:
+            return None
+        height_m, (low_m, high_m) = params.scale_height_m, np.maximum(params.between_m, 0.0)
+        up_db = coefficients[0] / 1000 * height_m * (np.exp(-low_m / height_m)
+                                                     - np.exp(-high_m / height_m))
+        most_db = max_vertical_db(params.frequency_hz, low_m, high_m)
+        if up_db > most_db:
+            return (f"{coefficients[0]:.1f} dB/km at the ground take {up_db:.1f} dB straight up from "
+                    f"{low_m:.0f} to {high_m:.0f} m; at {params.frequency_hz / 1e9:g} GHz air, rain "
+                    f"and woodland take {most_db:.1f} dB at most (ITU-R P.676, P.838, P.833)")
         return None
 
     @override
@@ -61,3 +92,15 @@ class ExcessAttenuation(GainEffect):
                     estimate.coefficients[0], estimate.coefficients_sd[0], "dB/km"),
                 "scale_height_m": Parameter.log_normal(params.scale_height_m,
                                                        estimate.params_sd[0], "m")}
+
+
+def max_vertical_db(frequency_hz: float, low_m: float, high_m: float) -> float:
+    """Return the most that humid air, heavy rain and woodland take straight up [dB].
+
+    Args:
+        frequency_hz: of the radio [Hz].
+        low_m, high_m: heights between which it is lost [m].
+    """
+    air_db = (max_gas_db_km(frequency_hz) + max_rain_db_km(frequency_hz)) * (high_m - low_m) / 1000
+    through_trees_m = max(min(high_m, TREES_M) - low_m, 0.0)
+    return float(air_db + DENSEST * specific_db_m(frequency_hz) * through_trees_m)
