@@ -66,6 +66,7 @@ class BuildingEntry(GainEffect):
     """Links with one end inside a building lose on the way in."""
 
     name = "building_entry"
+    figure = "histogram"
     nlos_only = True
     confused_with = ("missing_obstacle", "receiver_gain_offset")
 

@@ -4,9 +4,7 @@ Specific attenuation γ [dB/km] times path length [km] (ITU-R P.676-12, P.838-3,
 density may fall with height as exp(-z / h), as that of water vapour does (ITU-R P.835-6, Sec. 1.2).
 
 Where the frequency is known, it is bounded by what there is to absorb: humid air and rain of 150
-mm/h over all heights, and woodland everywhere up to the height of tall trees. Receivers often fly
-at one height, and then only the loss straight up through the layer is known, not how it is
-distributed: so that loss is compared.
+mm/h at all heights, and woodland everywhere, as far as the profile lies below the tops of trees.
 """
 
 import numpy as np
@@ -15,7 +13,7 @@ from typing_extensions import override
 
 from radiotwin.effects.atmosphere import max_gas_db_km, max_rain_db_km
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.params import EffectParams, Estimate, Metres, Parameter, Variation
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.effects.vegetation import specific_db_m
 from radiotwin.links import LinkData
@@ -24,6 +22,7 @@ PRIOR_SD_DB_KM = 30.0  # wide: heavy rain at 60 GHz is 15 dB/km
 SCALE_HEIGHTS_M = (5000.0, 150.0, 50.0)  # to begin with: the atmosphere, haze, vegetation
 MIN_HEIGHT_M, MAX_HEIGHT_M = 15.0, 5000.0
 TREES_M = 30.0  # height of tall trees
+HEIGHT_SD = 2.0  # of the logarithm of a scale height: a weak prior
 # ITU-R P.833-10 calls its specific attenuations typical: species, density and water differ widely.
 DENSEST = 2.0  # woodland, relative to the typical one
 
@@ -41,17 +40,12 @@ class ExcessAttenuation(GainEffect):
             ge=1e-3, le=1e9, description="Height over which the density falls to 1/e [m].")
         frequency_hz: float | None = Field(
             None, gt=0, le=1e12, description="Of the radio [Hz]; None: unknown, nothing is bounded.")
-        between_m: tuple[Metres, Metres] = Field(
-            (0.0, 0.0), description="Least and greatest height of an end of a link [m].")
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        links = view.links
-        known = np.isfinite(links.frequency_hz)
-        z_m = np.concatenate([links.device_m[links.device, 2], links.receiver_m[:, 2]])
-        return [self.Params(scale_height_m=height_m,
-                            frequency_hz=float(links.frequency_hz) if known else None,
-                            between_m=(float(z_m.min()), float(z_m.max())))
+        frequency_hz = view.links.frequency_hz
+        known_hz = float(frequency_hz) if np.isfinite(frequency_hz) else None
+        return [self.Params(scale_height_m=height_m, frequency_hz=known_hz)
                 for height_m in SCALE_HEIGHTS_M]
 
     @override
@@ -70,19 +64,22 @@ class ExcessAttenuation(GainEffect):
                              update={"scale_height_m": float(np.exp(numbers[0]))}))
 
     @override
+    def neg_log_prior(self, params: Params) -> float:
+        # Receivers that fly at one height do not tell: of profiles that fit alike, the lower one.
+        return 0.5 * (np.log(params.scale_height_m / TREES_M) / HEIGHT_SD) ** 2
+
+    @override
     def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
         if coefficients[0] < 0:
             return f"it would have to amplify, by {-coefficients[0]:.1f} dB/km"
         if params.frequency_hz is None:
             return None
-        height_m, (low_m, high_m) = params.scale_height_m, np.maximum(params.between_m, 0.0)
-        up_db = coefficients[0] / 1000 * height_m * (np.exp(-low_m / height_m)
-                                                     - np.exp(-high_m / height_m))
-        most_db = max_vertical_db(params.frequency_hz, low_m, high_m)
-        if up_db > most_db:
-            return (f"{coefficients[0]:.1f} dB/km at the ground take {up_db:.1f} dB straight up from "
-                    f"{low_m:.0f} to {high_m:.0f} m; at {params.frequency_hz / 1e9:g} GHz air, rain "
-                    f"and woodland take {most_db:.1f} dB at most (ITU-R P.676, P.838, P.833)")
+        most_db_km = max_at_ground_db_km(params.frequency_hz, params.scale_height_m)
+        if coefficients[0] > most_db_km:
+            return (f"{coefficients[0]:.3g} dB/km at the ground, over a scale height of "
+                    f"{params.scale_height_m:.0f} m, is more than air, rain and woodland take at "
+                    f"{params.frequency_hz / 1e9:g} GHz: {most_db_km:.3g} dB/km (ITU-R P.676, "
+                    "P.838, P.833)")
         return None
 
     @override
@@ -94,13 +91,16 @@ class ExcessAttenuation(GainEffect):
                                                        estimate.params_sd[0], "m")}
 
 
-def max_vertical_db(frequency_hz: float, low_m: float, high_m: float) -> float:
-    """Return the most that humid air, heavy rain and woodland take straight up [dB].
+def max_at_ground_db_km(frequency_hz: float, scale_height_m: float) -> float:
+    """Return the most that air, rain and woodland take at the ground [dB/km].
+
+    Woodland takes straight up what trees of `TREES_M` take. A profile stands for it with the share
+    of its density that lies below their tops: one that reaches high is air.
 
     Args:
         frequency_hz: of the radio [Hz].
-        low_m, high_m: heights between which it is lost [m].
+        scale_height_m: over which the density falls to 1/e [m].
     """
-    air_db = (max_gas_db_km(frequency_hz) + max_rain_db_km(frequency_hz)) * (high_m - low_m) / 1000
-    through_trees_m = max(min(high_m, TREES_M) - low_m, 0.0)
-    return float(air_db + DENSEST * specific_db_m(frequency_hz) * through_trees_m)
+    relative = TREES_M / scale_height_m
+    woodland_db_km = 1000 * DENSEST * specific_db_m(frequency_hz) * relative * -np.expm1(-relative)
+    return float(max_gas_db_km(frequency_hz) + max_rain_db_km(frequency_hz) + woodland_db_km)
