@@ -45,7 +45,7 @@ class Comparison:
 
     def tables(self) -> list[tuple[str, dict[str, str], list[list]]]:
         """Return tables to show: (title, headings with their alignment, rows), scores first."""
-        tables = []
+        tables: list[tuple[str, dict[str, str], list[list]]] = []
         estimated = self.scores[self.scores["positions"] == "estimated"]
         for against, part in estimated.groupby("against", sort=False):
             columns = {"model": "left"} | dict.fromkeys(("RMSE", "MAE", "bias"), "right")

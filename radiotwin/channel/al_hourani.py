@@ -3,10 +3,11 @@
 [1] Al-Hourani, Kandeepan, Lardner, 'Optimal LAP altitude for maximum coverage', IEEE Wireless
 Communications Letters 3(6), 2014: the probability of line of sight (Eq. 5).
 [2] Al-Hourani, Kandeepan, Jamalipour, 'Modeling air-to-ground path loss for low altitude platforms
-in urban environments', IEEE GLOBECOM 2014: excess losses and their standard deviations by frequency.
+in urban environments', IEEE GLOBECOM 2014: excess losses, and their standard deviations, by
+frequency.
 
-The lower end is the terminal on the ground, the higher one the platform, as in the papers. They were
-simulated for platforms above all roofs.
+The lower end is the terminal on the ground, the higher one the platform, as in the papers, whose
+platforms fly above all roofs.
 """
 
 from __future__ import annotations

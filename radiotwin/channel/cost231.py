@@ -1,10 +1,10 @@
 """Walfisch-Ikegami model of COST 231: along a street, and over rows of roofs.
 
 COST Action 231, 'Digital mobile radio towards future generation systems', final report, EUR 18957,
-1999, Sec. 4.4.1 (Eqs. 4.4.6 to 4.4.19). The higher end is the base station, the lower one the mobile
-in the street. Roofs are as high as those of the map on average; street width and distance of
-buildings are the report's defaults. The distance is that through the air, which in its range is that
-along the ground to 0.1 dB, and which alone makes sense above a device.
+1999, Sec. 4.4.1. The higher end is the base station, the lower one the mobile in the street. Roofs
+are as high as those of the map on average; street width and distance of buildings are the report's
+defaults. The distance is that through the air: in the report's range the one along the ground makes
+little difference, and above a device it makes no sense.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class ExcessAttenuation(GainEffect):
         scale_height_m: float = Field(
             ge=1e-3, le=1e9, description="Height over which the density falls to 1/e [m].")
         frequency_hz: float | None = Field(
-            None, gt=0, le=1e12, description="Of the radio [Hz]; None: unknown, nothing is bounded.")
+            None, gt=0, le=1e12, description="Of the radio [Hz]; None: unknown, no bound.")
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:

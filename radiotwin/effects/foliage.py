@@ -1,8 +1,9 @@
 """Vegetation that the map does not show.
 
 Loss of d metres through it: A_m (1 − exp(−γ d / A_m)), which saturates (ITU-R P.833-10, Eq. 1), at
-most at that recommendation's own A_m of the frequency. It is located by back-projection. A grove that only links of one device pass cannot be located along
-these links: the box then gives the direction in which it lies.
+most at that recommendation's own A_m of the frequency. It is located by back-projection. A grove
+that only links of one device pass cannot be located along these links: the box then gives the
+direction in which it lies.
 """
 
 from typing import Annotated, NamedTuple
@@ -87,7 +88,8 @@ class Foliage(GainEffect):
     @override
     def variation(self, params: Params) -> Variation:
         x_m, y_m = params.box[:2]
-        low = [x_m - 80, y_m - 80, 5.0, 5.0, MIN_HEIGHT_M, -90.0, np.log(0.05), np.log(min(3.0, params.ceiling_db))]
+        low = [x_m - 80, y_m - 80, 5.0, 5.0, MIN_HEIGHT_M, -90.0, np.log(0.05),
+               np.log(min(3.0, params.ceiling_db))]
         high = [x_m + 80, y_m + 80, 200.0, 200.0, 30.0, 90.0, np.log(5.0),
                 np.log(params.ceiling_db)]
         return Variation(

@@ -2,8 +2,8 @@
 
 Powers of signal and interference add (ITU-R SM.1753), and that of the emitter falls by the
 free-space law, 20 log10 d (ITU-R P.525). It depends on the receiver's position only. The emitter is
-assumed to be near the ground. Where there is a 3D map, receivers that it does not see get less, by a
-loss that is fitted.
+assumed to be near the ground. Where there is a 3D map, receivers that it does not see get less, by
+a loss that is fitted.
 """
 
 from collections.abc import Sequence

@@ -32,7 +32,8 @@ BUILT_IN: tuple[type[Effect], ...] = (
     DeviceGainOffset, ReceiverGainOffset, DeviceDrift, ReceiverDrift, ReceiverSaturation,
     NoiseFloor, DetectionLimit, SectorAntenna, TiltedDipole, BodyShadowing, ExcessAttenuation,
     DevicePositionError, ReceiverPositionError, ReceiverClockOffset, MissingObstacle,
-    RemovedObstacle, BuildingEntry, Foliage, WallReflection, Diffraction, GroundReflection, Interference, LockLoss)
+    RemovedObstacle, BuildingEntry, Foliage, WallReflection, Diffraction, GroundReflection,
+    Interference, LockLoss)
 
 _registered: list[type[Effect]] = []
 

@@ -24,15 +24,15 @@ def test_gas_has_the_peaks_of_the_recommendation():
 
 
 def test_the_table_is_that_of_itur():
-    """No frequency has more than the table, straight lines between its rows included, and none much less."""
+    """Straight lines between the rows included; where a line of the spectrum is curved, the table has more."""
     pytest.importorskip("itur")
     from itur.models import itu676, itu838
-    for ghz in (*TABLE[:, 0], *np.geomspace(1, 450, 60)):
+    for ghz in (*TABLE[:, 0], *np.geomspace(1, 450, 150)):
         air_db = [(itu676.gamma0_exact(ghz, 1013.25, rho, t) + itu676.gammaw_exact(ghz, 1013.25, rho, t)).value
                   for rho, t in ((7.5, 288.15), (30.0, 308.15))]
-        assert 0.97 * max(air_db) <= max_gas_db_km(ghz * 1e9) <= 1.6 * max(air_db), ghz
+        assert 0.93 * max(air_db) <= max_gas_db_km(ghz * 1e9) <= 1.45 * max(air_db), ghz
         rain_db = itu838.rain_specific_attenuation(150, ghz, 0, 0).value
-        assert max_rain_db_km(ghz * 1e9) == pytest.approx(rain_db, rel=0.1), ghz
+        assert max_rain_db_km(ghz * 1e9) == pytest.approx(rain_db, rel=0.09), ghz
 
 
 @pytest.mark.parametrize("mhz, specific, greatest_db", [  # ITU-R P.833-10, Sec. 2.1, St. Petersburg
