@@ -73,7 +73,7 @@ class Comparison:
         """Return a model's name, and that it was fitted to nothing where that is so."""
         twin = self.twins.get(model)
         published = twin is not None and isinstance(twin.channel, PublishedLaw)
-        return f"{model} (as published)" if published else model
+        return f"{model} (no fit)" if published else model
 
     def location_summary(self) -> pd.DataFrame:
         """Return median, 90th percentile and worst position error [m] of each model."""
