@@ -6,6 +6,7 @@ A package adds effects under the entry-point group `radiotwin.effects`; a script
 
 from radiotwin.effects.base import Effect
 from radiotwin.effects.body_shadowing import BodyShadowing
+from radiotwin.effects.building_entry import BuildingEntry
 from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.detection_limit import DetectionLimit
 from radiotwin.effects.excess_attenuation import ExcessAttenuation
@@ -31,7 +32,8 @@ BUILT_IN: tuple[type[Effect], ...] = (
     DeviceGainOffset, ReceiverGainOffset, DeviceDrift, ReceiverDrift, ReceiverSaturation,
     NoiseFloor, DetectionLimit, SectorAntenna, TiltedDipole, BodyShadowing, ExcessAttenuation,
     DevicePositionError, ReceiverPositionError, ReceiverClockOffset, MissingObstacle,
-    RemovedObstacle, Foliage, WallReflection, Diffraction, GroundReflection, Interference, LockLoss)
+    RemovedObstacle, BuildingEntry, Foliage, WallReflection, Diffraction, GroundReflection,
+    Interference, LockLoss)
 
 _registered: list[type[Effect]] = []
 

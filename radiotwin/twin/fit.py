@@ -10,13 +10,15 @@ import numpy as np
 
 import radiotwin
 from radiotwin.channel import ChannelModel, channel_named, check_fit_data, fit_once
+from radiotwin.channel.base import MIN_DETECTED
 from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.channel.path_kriging import PathKriging
+from radiotwin.channel.published import PublishedLaw
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.errors import BadInput
-from radiotwin.links import LinkData, join_links, link_geometry, prepare_links
+from radiotwin.links import LinkData, LinkGeometry, join_links, link_geometry, prepare_links
 from radiotwin.localize import (
     DeviceEstimate,
     LocalizeSettings,
@@ -46,6 +48,8 @@ SURE_M = 15.0  # radius of a device of an earlier twin that is not searched for 
 def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmented_nn", seed: int,
              start: Twin | None = None, allow_indoor: bool = False) -> Twin:
     """Learn the channel from the anchors' links, then locate the unknown devices with it.
+
+    A published law (`radiotwin.channel.published`) is taken as it stands and needs no anchor.
 
     Args:
         measurements: links to anchors and unknown devices.
@@ -109,7 +113,10 @@ def fit_links(links: LinkData, scene: Scene, channel: type[ChannelModel], seed: 
     _check_limit(links)
     is_anchor = np.isin(np.arange(len(links.device_m)), sorted(links.anchors))
     anchors_m = np.where(is_anchor[:, None], links.device_m, np.nan)
-    fitted = _fit_channel(links, anchors_m, channel, seed)
+    if issubclass(channel, PublishedLaw):
+        fitted: ChannelModel = _published(links, anchors_m, scene, channel)
+    else:
+        fitted = _fit_channel(links, anchors_m, channel, seed)
     devices: list[Any] = [TwinDevice.anchor(name, *position_m) if anchor else None
                           for name, position_m, anchor in
                           zip(links.device_names, links.device_m, is_anchor, strict=True)]
@@ -120,6 +127,9 @@ def fit_links(links: LinkData, scene: Scene, channel: type[ChannelModel], seed: 
             devices[index] = each
     if fitted.trend is not fitted:
         fitted = _fit_channel(links, reliable_m(devices), channel, seed)
+    if isinstance(fitted, PublishedLaw):
+        for note in fitted.outside(_known_links(links, reliable_m(devices))[0]):
+            warnings.warn(note, stacklevel=3)
     return Twin(fitted, devices, _level(links), links.limit_db, _provenance(links, scene))
 
 
@@ -257,14 +267,41 @@ def _fit_channel(links: LinkData, device_m: np.ndarray, channel: type[ChannelMod
     if not links.anchors:
         raise BadInput("no anchor: every device has the role unknown, and a channel is learned "
                        "from devices whose positions are known; give at least one device x_m, y_m "
-                       "and the role anchor in devices.csv")
-    known = np.isfinite(device_m[:, :2]).all(axis=1)[links.device]
-    if not known.any():
+                       "and the role anchor in devices.csv, or take a published law, such as "
+                       "tr36777_uma, which is not learned")
+    geometry, level_db = _known_links(links, device_m)
+    if not len(geometry):
         raise BadInput("no link to an anchor: none of the devices with role anchor was measured; "
                        "fly nearer to them")
+    check_fit_data(geometry, level_db, needs_los=channel.uses_map)
+    return fit_once(channel, geometry, level_db, links.limit_db, seed)
+
+
+def _known_links(links: LinkData, device_m: np.ndarray) -> tuple[LinkGeometry, np.ndarray]:
+    """Return the m links of devices with a position in `device_m` (k, 3), and their levels."""
+    known = np.isfinite(device_m[:, :2]).all(axis=1)[links.device]
     geometry = link_geometry(device_m, links.receiver_m[known], links.device[known], links.city)
-    check_fit_data(geometry, links.level_db[known], needs_los=channel.uses_map)
-    return fit_once(channel, geometry, links.level_db[known], links.limit_db, seed)
+    return replace(geometry, frequency_hz=links.frequency_hz), links.level_db[known]
+
+
+def _published(links: LinkData, device_m: np.ndarray, scene: Scene,
+               law: type[PublishedLaw]) -> PublishedLaw:
+    """Return a law as it was published; warn of the transmit power, where levels are powers.
+
+    That is the median over detected links of anchors of what it must be, or the declared one.
+    """
+    geometry, level_db = _known_links(links, device_m)
+    fitted = law().fit(geometry, level_db, links.limit_db)
+    if links.is_gain:
+        return fitted
+    surplus_db = level_db - fitted.predict(geometry)[0]
+    if np.isfinite(surplus_db).sum() >= MIN_DETECTED:
+        fitted.power_dbm, how = float(np.nanmedian(surplus_db)), "fitted to the anchors' links"
+    else:
+        fitted.power_dbm, how = scene.config.radio.tx_power_dbm, "the scene's tx_power_dbm"
+    warnings.warn(f"levels are received powers, and {law.name} predicts gains: the transmit power "
+                  f"is taken for {fitted.power_dbm:.1f} dBm ({how})", stacklevel=4)
+    return fitted
 
 
 def _locate(links: LinkData, scene: Scene, channel: ChannelModel, unknown: np.ndarray, seed: int,
