@@ -106,4 +106,5 @@ class SolverSettings:
         """Return all that decides a gain, as attributes of a NetCDF file (without booleans)."""
         own = {name: int(value) if isinstance(value, bool) else value
                for name, value in asdict(self).items()}
-        return own | {"table_size": TABLE_SIZE, "diffraction_probability": DIFFRACTION_PROBABILITY}
+        return own | {"table_size": TABLE_SIZE, "diffraction_probability": DIFFRACTION_PROBABILITY,
+                      "paths_counted": "once"}
