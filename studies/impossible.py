@@ -36,7 +36,8 @@ def dense_city(number: int, side_m: float = 360.0) -> list[CityShape]:
     rng = np.random.default_rng([23, number])
     street_m, pitch_m, turn_deg = rng.uniform(4, 12), rng.uniform(22, 45), rng.uniform(0, 90)
     terraced = number % 3 == 2  # houses that share walls
-    solids, count = [], int(side_m / pitch_m)
+    solids: list[trimesh.Trimesh] = []
+    count = int(side_m / pitch_m)
     for row, column in np.ndindex(count, count):
         x_m, y_m = (np.array([row, column]) - (count - 1) / 2) * pitch_m
         wide_m, deep_m = pitch_m - street_m - rng.uniform(0, 3, 2)
@@ -52,7 +53,9 @@ def dense_city(number: int, side_m: float = 360.0) -> list[CityShape]:
     corners = [(x, y, 0) for x, y in ((-300, -300), (300, -300), (300, 300), (-300, 300))]
     ground = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
     concrete = itu_material("concrete")
-    return [CityShape("houses", trimesh.util.concatenate(solids), concrete),
+    houses = trimesh.Trimesh(*trimesh.util.append_faces(
+        [each.vertices for each in solids], [each.faces for each in solids]), process=False)
+    return [CityShape("houses", houses, concrete),
             CityShape("ground", ground, concrete)]
 
 
@@ -201,7 +204,8 @@ def impossible_table(rows: pd.DataFrame) -> str:
             bounds = [", ".join(str(part[f"{when}_above_bound_{step}"].sum()) for step in STEPS_DB)
                       for when in ("before", "after")]
             cells.append([name, f"{part['links'].sum():,}", *bounds,
-                          *(str(part[f"{when}_above_free_6"].sum()) for when in ("before", "after")),
+                          *(str(part[f"{when}_above_free_6"].sum())
+                            for when in ("before", "after")),
                           *(f"{part[f'{when}_highest_db'].max():.1f}"
                             for when in ("before", "after")),
                           *(str(part[name].sum()) for name in ("changed", "again", "impossible"))])

@@ -26,6 +26,7 @@ QUALITIES: dict[str, dict[str, int]] = {
     "high": {"samples_per_src": 500_000, "batch_receivers": 20},
 }
 
+FINER = 10  # factor of rays, for the estimate of the numerical noise
 # Entries of the table in which Sionna RT looks up whether a candidate path is new. Two candidates
 # with one entry are taken for one, and a path is dropped: at Sionna's 10^6 about 8 % of the
 # candidates of 60 receivers, and which ones depends on the other receivers in the call. A prime, as
