@@ -118,7 +118,7 @@ def measure_accuracy(seed: int, settings: dict) -> dict:
         los = np.stack([scene.city.line_of_sight(at_m[None], points_m) for at_m in scene.device_m])
         limit_db = scene.config.gain_limit_db
     both = (gain_db >= limit_db) & (finer_db >= limit_db)
-    results = {}
+    results: dict[str, float] = {}
     for kind, of_kind in (("los", los), ("nlos", ~los)):
         error_db = (gain_db - finer_db)[both & of_kind]
         results |= {f"{kind}_links": len(error_db), f"{kind}_bias_db": error_db.mean(),
