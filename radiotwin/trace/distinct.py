@@ -1,10 +1,11 @@
 """Paths of a link that Sionna RT returns more than once.
 
-Sionna RT 2.2.0 does so in two ways. Its repeatable search runs twice, to count the candidates and
-to store them. Where the two runs round differently, some candidates are counted but not stored.
-They remain blank, and a blank candidate is a direct path to the first receiver of the call: up to
-some hundred copies of it, 20 dB and more. And where the meshes of two buildings share an edge, each
-of them diffracts the same ray at the same point.
+Sionna RT 2.2.0 does so in two ways. Its repeatable search sends the rays twice, to count candidate
+paths and to store them. Some rays take another way the second time (in RBM, in one call of two in
+fifteen, single ones of 100,000, from their third interaction on), so that their candidates are
+counted but never written. Such a blank candidate is a direct path to the first receiver of the
+call. It appeared up to 400 times, 26 dB too much, and has no direction of departure. And where the
+meshes of two buildings share an edge, each of them diffracts the same ray at the same point.
 """
 
 import numpy as np
