@@ -90,7 +90,8 @@ class SionnaPaths:
 
     def _keep(self, paths: Any, antennas: Antennas) -> np.ndarray:
         rows = self._settings.batch_receivers
-        power = sum(np.array(part, dtype=float).reshape(rows, -1) ** 2 for part in paths.a)
+        real, imaginary = (np.array(part, dtype=float).reshape(rows, -1) for part in paths.a)
+        power = real**2 + imaginary**2
         length_m = speed_of_light * np.array(paths.tau, dtype=float).reshape(rows, -1)
         self._found = [[] for _ in range(rows)]
         if not power.size:
