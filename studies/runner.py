@@ -26,7 +26,7 @@ MODULES = {"models": "models", "curve": "learning", "federation": "learning", "t
            "options": "learning", "twin": "twins", "quality": "twins", "pays": "disturbances",
            "hidden": "closeloop", "null": "closeloop", "towers": "twins",
            "real": "closeloop_real", "tracer": "tracer", "speed": "speed", "load": "load",
-           "kill": "kill", "engine": "engine"}
+           "kill": "kill", "engine": "engine", "paths": "path_list"}
 """Name of a study -> its module in this package."""
 Run = Callable[[int, dict], dict]
 Todo = list[tuple[str, int, dict]]

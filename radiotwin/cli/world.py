@@ -1,4 +1,4 @@
-"""The commands that measure in a scene: trace, gains, survey."""
+"""The commands that measure in a scene: trace, gains, paths, survey."""
 
 from pathlib import Path
 from typing import Annotated
@@ -7,12 +7,14 @@ import typer
 
 from radiotwin.cli.options import Combining, OnlyDevices, Quality, RaySeed, SceneFolder, split_names
 from radiotwin.console import notice, say
+from radiotwin.errors import BadInput
 
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module to the app."""
     app.command("trace")(trace)
     app.command("gains")(gains)
+    app.command("paths")(paths)
     app.command("survey")(survey)
 
 
@@ -77,6 +79,46 @@ def gains(
     reasons = table.loc[table["reason"] != "", "reason"].value_counts()
     say(f"wrote {out}: {len(table)} links, {len(table) - reasons.sum()} with a gain"
         + "".join(f", {count} {reason}" for reason, count in reasons.items()))
+
+
+def paths(
+    folder: SceneFolder,
+    points: Annotated[Path, typer.Option(
+        help="CSV file with x_m, y_m, z_m; or latitude_deg, longitude_deg, z_m, where the scene "
+             "has an origin.")],
+    out: Annotated[Path, typer.Option(
+        "--out", "-o", help="NetCDF file (.nc).")] = Path("paths.nc"),
+    devices: OnlyDevices = None,
+    velocity: Annotated[str | None, typer.Option(
+        metavar="VX,VY,VZ", help="Velocity of the receiver east, north and up [m/s], for Doppler "
+                                 "shifts.")] = None,
+    bandwidth_hz: Annotated[float | None, typer.Option(
+        help="Add impulse responses of this bandwidth.")] = None,
+) -> None:
+    """List the paths to any points: powers, delays, angles, interactions.
+
+    Each link gets its delay spread, K factor and angular spreads. No ray tracer is needed.
+    """
+    from radiotwin.paths.listing import list_paths
+    from radiotwin.scene import Scene
+    from radiotwin.trace import read_points
+
+    scene = Scene.load(folder)
+    points_m = read_points(points, scene.config.origin)
+    found = list_paths(scene, points_m, out, split_names(devices),
+                       None if velocity is None else _speeds(velocity), bandwidth_hz)
+    reasons = found["reason"].to_series().value_counts()
+    say(f"wrote {out}: {found.sizes['path']} paths of {found.sizes['link']} links"
+        + "".join(f", {count} {reason}" for reason, count in reasons.items() if reason))
+
+
+def _speeds(text: str) -> list[float]:
+    try:
+        east, north, up = (float(part) for part in text.split(","))
+    except ValueError:
+        raise BadInput(f"--velocity {text!r} is not three numbers; give VX,VY,VZ [m/s], such as "
+                       "10,0,0 for eastwards") from None
+    return [east, north, up]
 
 
 def survey(

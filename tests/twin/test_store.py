@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,6 +14,8 @@ from radiotwin.closeloop.run import close_loop
 from radiotwin.errors import BadInput
 from radiotwin.links import prepare_links
 from radiotwin.measurements import read_measurements
+from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.materials import Material
 from radiotwin.twin import Twin, check_twin_target, fit_twin
 
 VERSION_1 = Path(__file__).parent / "version_1"  # made with radiotwin 0.1, see its README.md
@@ -69,11 +72,22 @@ def test_a_corrected_twin_of_version_0_1_predicts_the_same():
     np.testing.assert_allclose(reading.scale_db, before["read_scale_db"], atol=1e-6, rtol=0)
 
 
+@pytest.fixture
+def old_scene(small_scene, monkeypatch):
+    """The scene of half-spaces of concrete, which version 0.1 took all surfaces for: a slab too thick to look through."""
+    thick = Material("concrete", itu="concrete", thickness_m=100.0)
+    monkeypatch.setattr("radiotwin.scene.citymap.CONCRETE", thick)
+    monkeypatch.setattr("radiotwin.effects.missing_obstacle.CONCRETE", thick)
+    scene = replace(small_scene)
+    scene.__dict__["city"] = CityMap(small_scene.city.vertices, small_scene.city.faces, [thick])
+    return scene
+
+
 EFFECTS = json.loads((VERSION_1 / "effects.json").read_text(encoding="utf-8"))
 
 
 @pytest.mark.parametrize("number", range(len(EFFECTS)), ids=[f"{each['name']}-{i}" for i, each in enumerate(EFFECTS)])
-def test_an_effect_of_a_twin_of_version_0_1_does_the_same(number, small_scene, tmp_path):
+def test_an_effect_of_a_twin_of_version_0_1_does_the_same(number, old_scene, tmp_path):
     """One effect of each kind in place of those that were found; with a map some upon a law, others upon paths."""
     part, before = EFFECTS[number], np.load(VERSION_1 / "effects.npz")
     over_map = part["over"] == "map"
@@ -88,7 +102,7 @@ def test_an_effect_of_a_twin_of_version_0_1_does_the_same(number, small_scene, t
     twin = Twin.load(tmp_path / "twin")
     if over_map:
         asked = np.load(VERSION_1 / "raytrace.npz")
-        found = twin.predict(twin.links(asked["receiver_m"][::2], asked["device"][::2], small_scene))
+        found = twin.predict(twin.links(asked["receiver_m"][::2], asked["device"][::2], old_scene))
         values = [found.mean_db, found.sd_db]
     else:
         links = prepare_links(read_measurements(VERSION_1 / "links" / "measurements.csv"), None)
@@ -98,10 +112,10 @@ def test_an_effect_of_a_twin_of_version_0_1_does_the_same(number, small_scene, t
     np.testing.assert_allclose(values, before[f"{part['over']}_{number}"], atol=1e-6, rtol=0)
 
 
-def test_a_twin_of_version_0_1_that_follows_paths_predicts_the_same(small_scene):
+def test_a_twin_of_version_0_1_that_follows_paths_predicts_the_same(old_scene):
     twin, before = Twin.load(VERSION_1 / "raytrace"), np.load(VERSION_1 / "raytrace.npz")
     assert twin.channel.name == "image_paths" and not twin.is_corrected
-    links = twin.links(before["receiver_m"], before["device"], small_scene)
+    links = twin.links(before["receiver_m"], before["device"], old_scene)
     found = twin.predict(links)
     np.testing.assert_array_equal(links.los, before["los"])
     np.testing.assert_allclose(found.mean_db, before["mean_db"], atol=1e-6, rtol=0)
