@@ -88,7 +88,7 @@ class SionnaPaths:
             out += self._found[:len(receiver_m[part])]
         return out
 
-    def _keep(self, paths: Any, antennas: Antennas) -> np.ndarray:
+    def _keep(self, paths: Any, antennas: Antennas) -> tuple[np.ndarray, np.ndarray]:
         rows = self._settings.batch_receivers
         real, imaginary = (np.array(part, dtype=float).reshape(rows, -1) for part in paths.a)
         power = real**2 + imaginary**2

@@ -22,7 +22,7 @@ def path_amplitudes(
         candidates: that the paths were found with.
         wave_number: 2 π / wavelength [1/m].
         slabs: materials of the map.
-        wedge: LUEBBERS or SIONNA, see `radiotwin.paths.coefficients`.
+        wedge: as of `path_gains`.
         buffer: the paths.
         rows: (m,) paths of the buffer to compute.
         amplitude: (m,) complex output: received over sent field, with the phase of the delay, for

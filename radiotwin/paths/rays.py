@@ -11,7 +11,7 @@ from radiotwin.paths.candidates import candidate_search
 from radiotwin.paths.clearance import clear_paths
 from radiotwin.paths.coefficients import slabs_of
 from radiotwin.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, find_paths
-from radiotwin.paths.powers import WEDGES
+from radiotwin.paths.wedges import LUEBBERS
 from radiotwin.scene.citymap import CityMap
 
 RECEIVER_CHUNK = 500  # receivers at once
@@ -49,7 +49,7 @@ class Rays:
 
 
 def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, frequency_hz: float,
-                depth: int = 4, wedge: str = "sionna") -> Iterator[tuple[Rays, int]]:
+                depth: int = 4) -> Iterator[tuple[Rays, int]]:
     """Follow the paths from a device to receivers, some receivers at a time.
 
     Args:
@@ -58,7 +58,6 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
         receiver_m: (n, 3) positions [m].
         frequency_hz: carrier frequency [Hz].
         depth: maximum number of interactions of a path, 1 to 6.
-        wedge: coefficient of diffraction, as of `radiotwin.paths.path_powers`.
 
     Yields:
         The paths to the next receivers, whose rows are among all, and the number of these.
@@ -66,6 +65,7 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
     search = candidate_search(city, depth)
     candidates = search.candidates(device_m)
     kinds = _kinds(candidates)
+    # Fields are added here: with Sionna RT's wedge they would step at the shadow boundary
     wave_number = 2 * np.pi * frequency_hz / speed_of_light
     slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
     buffer = PathBuffer.allocate(PATH_CHUNK)
@@ -78,8 +78,8 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
                                        buffer)
             rows = clear_paths(city, search.surfaces, candidates, buffer, found)
             amplitude, length_m = np.empty(len(rows), dtype=complex), np.empty(len(rows))
-            path_amplitudes(search.surfaces, candidates, wave_number, slabs, WEDGES[wedge],
-                            buffer, rows, amplitude, length_m)
+            path_amplitudes(search.surfaces, candidates, wave_number, slabs, LUEBBERS, buffer,
+                            rows, amplitude, length_m)
             parts.append(_rays(buffer, rows, kinds[buffer.candidate[rows]], amplitude, length_m))
         yield _joined(parts, first), len(ends_m)
 

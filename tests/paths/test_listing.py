@@ -61,11 +61,11 @@ def test_figures_are_those_of_the_paths_of_each_link(listed, small_scene):
                 np.degrees(np.arcsin(way_m[2] / np.linalg.norm(way_m))))
 
 
-def test_gains_are_those_of_the_channel(listed, small_scene):
+def test_gains_are_those_of_the_powers(listed, small_scene):
     made, _ = listed
     device = np.repeat(np.arange(len(small_scene.device_m)), len(POINTS_M))
     total = path_powers(small_scene.city, small_scene.device_m, np.tile(POINTS_M, (len(small_scene.device_m), 1)),
-                        device, small_scene.config.radio.frequency_hz, "vertical").total
+                        device, small_scene.config.radio.frequency_hz, "vertical", wedge="luebbers").total
     found = made["reason"].to_numpy() == ""
     assert np.allclose(made["gain_db"].to_numpy()[found], 10 * np.log10(total[found]))
 
