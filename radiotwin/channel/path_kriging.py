@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, Self
 
 import numpy as np
 from typing_extensions import override
 
 from radiotwin.channel.base import ChannelModel, drop_uninformative
-from radiotwin.channel.image_paths import DIFFUSE_DEFAULT, ImagePaths, stored_diffuse
-from radiotwin.channel.map_error import (
-    DOF,
-    MapError,
-    estimate_map_error,
-    fit_class,
-    over,
-    paths_db,
-    scale_db,
-)
+from radiotwin.channel.class_fit import DOF, fit_class, scale_db
+from radiotwin.channel.image_paths import DIFFUSE_DEFAULT, stored_diffuse
+from radiotwin.channel.map_error import MapError, estimate_map_error
+from radiotwin.channel.path_levels import over, paths_db
 from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.channel.residual_field import ResidualField
 from radiotwin.channel.stored import (
@@ -35,7 +28,6 @@ from radiotwin.scene.perturbation import perturbed_map
 MEMBERS = 6  # maps with errors, beside the one that is given
 FOLDS = 4  # of the links that the weight is found with
 BLOCK_M = 60.0  # side of the squares of ground that are left out together
-WARN_WALL_M, WARN_HEIGHT_M = 1.0, 2.0  # errors of a map above which the user is told
 SPREAD_FACTOR = np.sqrt(DOF / (DOF - 2))  # standard deviation over scale of the errors
 
 
@@ -77,13 +69,9 @@ class PathKriging(ChannelModel):
             seed: int = 0) -> Self:
         links, level_db = drop_uninformative(links, level_db, limit_db)
         self.seed = seed
+        self.map_error, self.diffuse = estimate_map_error(links, level_db, limit_db, seed)
+        links = self.map_error.on_map(links)
         self.kriging.fit(links, level_db, limit_db, seed)
-        self.diffuse = ImagePaths().fit_diffuse(links, level_db, limit_db).diffuse
-        self.map_error = estimate_map_error(links, level_db, limit_db, self.diffuse, seed)
-        wall_m, height_m = self.map_error.wall_m[0], self.map_error.height_m[0]
-        if wall_m > WARN_WALL_M or height_m > WARN_HEIGHT_M:
-            warnings.warn(f"the 3D map seems to be off: {self.map_error}; predictions allow for "
-                          "it, and better data would make them better", stacklevel=2)
         paths = self._over_maps(links)
         self._fit_classes(links, level_db, limit_db, *paths)
         self._fit_field(links, level_db, limit_db, *paths)
@@ -92,6 +80,7 @@ class PathKriging(ChannelModel):
 
     @override
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        links = self.map_error.on_map(links)
         by_paths = self._with_field(self.field, links, *self._over_maps(links))
         share = self.weight[links.los.astype(int)]
         return _mixture(share, by_paths, self.kriging.predict(links))
@@ -108,12 +97,13 @@ class PathKriging(ChannelModel):
 
     def _over_maps(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         """Return mean level (n,) [dB] and its mean square change (n,) [dB²] over possible maps."""
-        levels_db = [paths_db(links, self.diffuse)]
+        power = self.diffuse, self.map_error.offsets_db
+        levels_db = [paths_db(links, *power)]
         if self.map_error.is_seen and links.city is not None:
             for member in range(MEMBERS):
                 wrong = perturbed_map(links.city, self.map_error.wall_m[0],
                                       self.map_error.height_m[0], self.seed + member)
-                levels_db.append(paths_db(over(links, wrong), self.diffuse))
+                levels_db.append(paths_db(over(links, wrong), *power))
         unbiased = len(levels_db) / max(len(levels_db) - 1, 1)
         return np.mean(levels_db, axis=0), unbiased * np.var(levels_db, axis=0)
 

@@ -70,11 +70,15 @@ def effect_named(name: str, variant: str) -> Effect:
     """Return a new instance of an effect.
 
     Raises:
-        BadInput: no such effect is installed.
+        BadInput: no such effect is installed, or one that describes the same otherwise.
     """
-    for effect in catalogue():
-        if (effect.name, effect.variant) == (name, variant):
+    named = [effect for effect in catalogue() if effect.name == name]
+    for effect in named:
+        if effect.variant == variant:
             return effect()
+    if named:
+        raise BadInput(f"the twin has the effect {name!r} as another version of radiotwin "
+                       "described it, with other parameters; run `radiotwin close-loop` again")
     known = ", ".join(sorted({effect.name for effect in catalogue()}))
     raise BadInput(f"the twin has the effect {name[:60]!r} ({variant[:60]!r}), which this version "
                    f"of radiotwin does not know; it knows {known}; an effect of a package's own "

@@ -15,7 +15,8 @@ from radiotwin.localize import LocalizeSettings
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import fit_links
-from radiotwin.twin.fit_paths import fit_along_paths, with_path_kriging
+from radiotwin.twin.fit_paths import fit_along_paths
+from radiotwin.twin.fit_wrong_map import fit_over_wrong_map
 from radiotwin.twin.twin import Twin
 
 # Of more links, so many are fitted. Measured on simulated links: with all of a million, the levels
@@ -61,9 +62,8 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
         links = prepare_links(measurements, scene)
         for note in links.notes:
             warnings.warn(note, stacklevel=2)
-        twin = fit_along_paths(links, scene, seed, start)
-        if channel is PathKriging:
-            twin = with_path_kriging(twin, links, seed)
+        fit = fit_along_paths if channel is ImagePaths else fit_over_wrong_map
+        twin = fit(links, scene, seed, start)
         twin.provenance.update(flights=flights, seed=seed)
         return twin
     _check_heights(measurements)

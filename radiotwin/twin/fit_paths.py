@@ -7,9 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from radiotwin.channel import ChannelModel, fit_once
+from radiotwin.channel import ChannelModel
 from radiotwin.channel.image_paths import ImagePaths
-from radiotwin.channel.path_kriging import PathKriging
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.fold_model import FoldModel
@@ -63,15 +62,6 @@ def fit_along_paths(links: LinkData, scene: Scene, seed: int, start: Twin | None
                       f"{MAX_DEVICES} at most: they are where a law of distance and line of sight "
                       "has them", stacklevel=4)
     return replace(twin, fitted=EffectModel.of(by_paths, fit))
-
-
-def with_path_kriging(twin: Twin, links: LinkData, seed: int) -> Twin:
-    """Return a twin with the same positions, and all that the links tell of map and errors."""
-    device_m = reliable_m(twin.devices, LOST_M)
-    rows = np.isfinite(device_m).all(axis=1)[links.device]
-    located = links.with_devices(np.where(np.isfinite(device_m), device_m, 0.0)).select(rows)
-    channel = fit_once(PathKriging, located.geometry, located.level_db, links.limit_db, seed)
-    return replace(twin, channel=channel, fitted=None)
 
 
 def fit_paths(links: LinkData, scene: Scene, law: Twin, relocation: Relocation) -> Twin:

@@ -30,8 +30,7 @@ def receivers_m():
 
 
 def test_the_field_has_no_step(corner, receivers_m):
-    rays, _ = next(follow_rays(CityMap(corner.vertices, corner.faces, [METAL]), DEVICE_M, receivers_m, 2.4e9, depth=1,
-                               wedge="luebbers"))
+    rays, _ = next(follow_rays(CityMap(corner.vertices, corner.faces, [METAL]), DEVICE_M, receivers_m, 2.4e9, depth=1))
     assert (np.bincount(rays.receiver[rays.kinds[:, 0] != 2]) == [2, 1]).all()  # of two paths one ends here
     field = np.array([rays.amplitude[rays.receiver == row].sum() for row in range(2)])
     reflected = np.abs(rays.amplitude[(rays.receiver == 0) & (rays.kinds[:, 0] == 1)][0])
