@@ -7,6 +7,7 @@ from scipy.stats import ttest_1samp
 
 from radiotwin.channel.class_fit import LinkFit
 from radiotwin.channel.image_paths import ImagePaths
+from radiotwin.channel.map_sizes import estimate_sizes
 from radiotwin.channel.path_levels import moved, paths_db
 from radiotwin.links import LinkGeometry
 from radiotwin.progress import progress
@@ -19,6 +20,7 @@ MAX_SHIFT_M = 12.0
 SEEN_SHIFT_M = 1.0  # below, errors of single walls look alike
 MIN_DEVICES = 2  # about one alone a few walls that are off look like a shift
 SURE = 0.05  # probability that devices which were left out gain so much by chance (t test)
+SURE_NATS = 4.6  # that a shift must explain beyond errors of single walls: 99 % (Wilks 1938)
 RADIUS_SDS = 2.146  # of the 90 % circle of a normal distribution, in its standard deviations
 
 Shift = tuple[float, float, float]
@@ -34,12 +36,12 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: float | 
         links: n links over a map; those to devices of estimated position are not looked at.
         level_db: (n,) [dB]; NaN: not detected.
         limit_db: below which levels are not detected [dB]; None: unknown.
-        seed: of the choice of links.
+        seed: of the choice of links, and of the maps' errors.
 
     Returns:
-        zeros where there are too few links, or no shift that is found without a device explains the
-        links of that device better, in the mean over devices: walls that are off each in their own
-        way look like another shift about each device.
+        zeros where there are too few links, or no shift. Walls that are off each in their own way
+        look like another shift about each device; so one that is found without a device must
+        explain the links of that device, and more than errors of single walls do.
     """
     known = np.isfinite(level_db) | (limit_db is not None)
     if links.estimated is not None:
@@ -61,8 +63,15 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: float | 
     # Of each device: the best shift for the others, and what it gains by that.
     without = (by_device.sum(axis=1)[:, None] - by_device).argmin(axis=0)
     gains = by_device[0] - by_device[without, np.arange(len(without))]
-    if np.hypot(*best) < SEEN_SHIFT_M or not ttest_1samp(gains, 0, alternative="greater"
-                                                         ).pvalue < SURE:
+    # The signed root of twice a likelihood ratio is near to normal, the ratio itself is skewed.
+    roots = np.sign(gains) * np.sqrt(2 * np.abs(gains))
+    chance = ttest_1samp(roots, 0, alternative="greater").pvalue
+    if np.hypot(*best) < SEEN_SHIFT_M or not chance < SURE:
+        return NO_SHIFT
+    diffuse, offsets_db = search.diffuse, (0.0, 0.0)
+    here, there = (estimate_sizes(each, level_db, limit_db, diffuse, offsets_db, seed)
+                   for each in (links, moved(links, *best)))
+    if here.nll - there.nll < SURE_NATS * there.as_one:  # walls that are off explain as much
         return NO_SHIFT
     # The jackknife (Tukey 1958), both axes taken together.
     square_m2 = ((shifts[without] - best)**2).sum() * (len(without) - 1) / len(without)
@@ -74,12 +83,13 @@ class _Search:
     """Shifts that were tried.
 
     Attributes:
+        diffuse: power beside the paths.
         nll: shift -> negative log-likelihood of each link (n,) [nats]; the first is no shift.
     """
 
     def __init__(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None) -> None:
         self._links, self._fit = links, LinkFit(level_db, limit_db)
-        self._diffuse = ImagePaths().fit_diffuse(links, level_db, limit_db).diffuse
+        self.diffuse = ImagePaths().fit_diffuse(links, level_db, limit_db).diffuse
         self.nll: dict[tuple[float, float], np.ndarray] = {}
 
     def best(self) -> tuple[float, float]:
@@ -107,4 +117,4 @@ class _Search:
         if shift in self.nll or np.hypot(*shift) > MAX_SHIFT_M:
             return
         over = moved(self._links, *shift)
-        self.nll[shift], _ = self._fit.fit(over.los, paths_db(over, self._diffuse))
+        self.nll[shift], _ = self._fit.fit(over.los, paths_db(over, self.diffuse))

@@ -1,7 +1,6 @@
 """The channel that follows paths over a map that may be wrong."""
 
 import json
-import warnings
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from radiotwin.links import LinkGeometry
 from radiotwin.scene.citymap import CityMap
 
 DEVICES_M = np.array([[45.0, 42.0, 1.5], [100.0, 155.0, 1.5], [160.0, 60.0, 1.5]])
-DIFFUSE = (-130.0, 3.0)  # gain at 100 m [dB], and exponent
 
 
 def houses(move_m=0.0, rise_m=0.0, seed=0):
@@ -61,24 +59,24 @@ def test_the_size_of_a_maps_errors_is_found(move_m, rise_m):
     receiver_m, device = flight(300, 3)
     level_db = levels(houses(), receiver_m, device, 5)
     wrong = links_over(houses(move_m, rise_m, seed=11), receiver_m, device)
-    found = estimate_map_error(wrong, level_db, None, DIFFUSE, 0)
+    found, _ = estimate_map_error(wrong, level_db, None, 0)
     for (size_m, low_m, high_m), true_m in ((found.wall_m, move_m), (found.height_m, rise_m)):
         assert low_m <= size_m <= high_m
-        assert low_m - 1.0 <= true_m <= high_m + 1.0  # the true errors of nine houses are few draws
-    assert not (found.is_seen and not move_m and not rise_m), "the true map is not blamed"
+        if not found.is_shifted:  # of nine houses the mean error is large enough to be called a shift
+            assert low_m - 1.0 <= true_m <= high_m + 1.0  # the true errors of nine houses are few draws
+    assert (found.is_seen or found.is_shifted) == bool(move_m or rise_m), "a map is blamed if it is wrong"
     assert found.is_seen or not rise_m, "heights show at most links"
 
 
 def test_few_links_say_nothing_of_a_map():
     receiver_m, device = flight(20, 3)
     links = links_over(houses(), receiver_m, device)
-    assert estimate_map_error(links, np.full(20, -90.0), None, DIFFUSE, 0) == MapError()
+    assert estimate_map_error(links, np.full(20, -90.0), None, 0)[0] == MapError()
 
 
 def test_error_of_a_map_is_kept_and_strange_ones_are_refused():
-    error = MapError((1.5, 1.0, 2.0), (3.0, 2.0, 4.5))
+    error = MapError((1.5, 1.0, 2.0), (3.0, 2.0, 4.5), (-2.0, 1.5, 0.5), (-6.0, 1.0))
     assert MapError.from_state(json.loads(json.dumps(error.state()))) == error
-    assert str(error) == "walls by 1.5 m (90 %: 1.0-2.0) and heights by 3.0 m (90 %: 2.0-4.5)"
     for bad in (None, {"wall_m": [1, 2, 3]}, error.state() | {"wall_m": [1, 2]}, error.state() | {"wall_m": [1, 2, "x"]},
                 error.state() | {"height_m": [1e9, 0, 0]}):
         with pytest.raises(ValueError):
@@ -95,11 +93,8 @@ def judged():
     found = {}
     for name, city in (("right", houses()), ("wrong", CityMap(houses().vertices + [30.0, 30.0, 0.0], houses().faces))):
         links, held = links_over(city, receiver_m, device), links_over(city, there_m, to)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            model = PathKriging()
-            model.fit(links, level_db, None, 0)
-            law = RegressionKriging().fit(links, level_db, None, 0)
+        model = PathKriging().fit(links, level_db, None, 0)
+        law = RegressionKriging().fit(links, level_db, None, 0)
         found[name] = model, held, law
     return found, true_db
 
