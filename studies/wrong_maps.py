@@ -217,7 +217,10 @@ def _located(twin: Twin, world: World) -> dict[str, list]:
 
 
 def _errors(twin: Twin, scene: Scene, world: World, devices: np.ndarray) -> dict[str, Any]:
-    """Return RMSE, bias and coverage of 90 % intervals by class of links at held-out receivers.
+    """Return RMSE, bias, coverage of 90 % intervals and median standard deviation.
+
+    Each is of a class of links at held-out receivers: all, with and without line of sight, and
+    those of anchors.
 
     Args:
         twin: to be judged.
@@ -233,6 +236,7 @@ def _errors(twin: Twin, scene: Scene, world: World, devices: np.ndarray) -> dict
     error_db = mean_if_detected(found.mean_db, found.sd_db, scene.config.gain_limit_db) - true_db
     held = np.abs(found.mean_db - true_db) <= SDS * found.sd_db
     parts = dict(zip(CLASSES, (np.ones(len(los), dtype=bool), los, ~los), strict=True))
+    parts["anchors"] = np.array(world.roles)[device] == "anchor"  # without errors of positions
     return {"rmse_db": {name: np.sqrt(np.mean(error_db[part]**2)) for name, part in parts.items()},
             "bias_db": {name: np.mean(error_db[part]) for name, part in parts.items()},
             "coverage": {name: np.mean(held[part]) for name, part in parts.items()},
