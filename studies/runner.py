@@ -27,7 +27,8 @@ MODULES = {"models": "models", "curve": "learning", "federation": "learning", "t
            "hidden": "closeloop", "null": "closeloop", "towers": "twins",
            "real": "closeloop_real", "tracer": "tracer", "speed": "speed", "load": "load",
            "kill": "kill", "paths": "path_list", "engine": "engine",
-           "impossible": "impossible", "accuracy": "tracer"}
+           "impossible": "impossible", "accuracy": "tracer",
+           "maps": "wrong_maps"}
 """Name of a study -> its module in this package."""
 Run = Callable[[int, dict], dict]
 Todo = list[tuple[str, int, dict]]
