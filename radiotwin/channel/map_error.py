@@ -6,7 +6,7 @@ each wall and each roof may be off.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -100,8 +100,12 @@ _BOUNDS = {"wall_m": [(0.0, 100.0)] * 3, "height_m": [(0.0, 100.0)] * 3,
            "offsets_db": [(-MAX_OFFSET_DB, MAX_OFFSET_DB)] * 2}
 
 
+Found = tuple[MapError, tuple[float, float]]
+"""Errors of a map, and the power beside its paths, see `ImagePaths`."""
+
+
 def estimate_map_error(links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
-                       seed: int) -> tuple[MapError, tuple[float, float]]:
+                       seed: int) -> Found:
     """Estimate the errors of the map that links lie over.
 
     Args:
@@ -111,18 +115,24 @@ def estimate_map_error(links: LinkGeometry, level_db: np.ndarray, limit_db: floa
         seed: of the choice of links, and of the maps' errors.
 
     Returns:
-        the errors, zeros where there are too few links to tell; and the power beside the paths, see
-        `ImagePaths`.
+        the errors, zeros where there are too few links to tell, and the diffuse power.
     """
-    error = MapError(shift_m=estimate_shift(links, level_db, limit_db, seed))
-    links = error.on_map(links)
+    shift_m = estimate_shift(links, level_db, limit_db, seed)
+    links = MapError(shift_m=shift_m).on_map(links)
+    error, diffuse = estimate_other_errors(links, level_db, limit_db, seed)
+    return replace(error, shift_m=shift_m), diffuse
+
+
+def estimate_other_errors(links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+                          seed: int) -> Found:
+    """Do as `estimate_map_error` for a map that is not shifted."""
     diffuse = ImagePaths().fit_diffuse(links, level_db, limit_db).diffuse
     known = np.flatnonzero(np.isfinite(level_db) | (limit_db is not None))
     if len(known) < MIN_LINKS:
-        return error, diffuse
+        return MapError(), diffuse
     rng = np.random.default_rng(seed)
     rows = np.sort(rng.choice(known, min(LINKS, len(known)), replace=False))
     links, level_db = links.select(rows), level_db[rows]
     offsets_db = fit_offsets(links, level_db, limit_db, diffuse)
     sizes = estimate_sizes(links, level_db, limit_db, diffuse, offsets_db, seed)
-    return MapError(sizes.wall_m, sizes.height_m, error.shift_m, offsets_db), diffuse
+    return MapError(sizes.wall_m, sizes.height_m, offsets_db=offsets_db), diffuse

@@ -22,7 +22,7 @@ MEMBERS = 3  # maps of each size of error
 WALL_SIZES_M = (0.0, 1.0, 2.0, 4.0)
 HEIGHT_SIZES_M = (0.0, 1.5, 3.0, 6.0)
 STEPS = 4  # tried sizes between two followed ones
-INTERVAL_NATS = 1.353  # drop of the profile likelihood at the ends of a 90 % interval (Wilks 1938)
+INTERVAL_NATS = 2.303  # drop of the likelihood at the ends of the 90 % region of both (Wilks 1938)
 
 Size = tuple[float, float, float]
 """A standard deviation: estimate, low and high end of its 90 % interval [m]."""
@@ -128,13 +128,16 @@ class _Profile:
 
     def sizes(self, links: LinkGeometry) -> Sizes:
         """Return the most likely sizes with their intervals."""
-        sizes: list[Size] = []
-        for best, places, scale_m in zip(self.best, self.likely(links),
-                                         (WALL_SIZES_M, HEIGHT_SIZES_M), strict=True):
-            three = np.array([best, places[0], places[-1]]) / STEPS
-            size, low, high = np.interp(three, np.arange(len(scale_m)), scale_m).tolist()
-            sizes.append((size, low, high))
-        return Sizes(*sizes, float(self.nll.min()), links_as_one(links, self.z))
+        wall_m, height_m = (self._size(*each) for each in zip(
+            self.best, self.likely(links), (WALL_SIZES_M, HEIGHT_SIZES_M), strict=True))
+        return Sizes(wall_m, height_m, float(self.nll.min()), links_as_one(links, self.z))
+
+    @staticmethod
+    def _size(best: int, places: np.ndarray, scale_m: tuple[float, ...]) -> Size:
+        """Return estimate and interval [m]; the ends are within a step of the last likely place."""
+        three = np.array([best, places[0] - 1, places[-1] + 1]) / STEPS
+        size, low, high = np.interp(three, np.arange(len(scale_m)), scale_m).tolist()
+        return size, low, high
 
 
 def _profile(spread: _Spread, reached: list[int], fit: LinkFit) -> _Profile:

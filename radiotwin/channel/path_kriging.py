@@ -10,7 +10,7 @@ from typing_extensions import override
 from radiotwin.channel.base import ChannelModel, drop_uninformative
 from radiotwin.channel.class_fit import DOF, fit_class, scale_db
 from radiotwin.channel.image_paths import DIFFUSE_DEFAULT, stored_diffuse
-from radiotwin.channel.map_error import MapError, estimate_map_error
+from radiotwin.channel.map_error import Found, MapError, estimate_map_error
 from radiotwin.channel.path_levels import over, paths_db
 from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.channel.residual_field import ResidualField
@@ -44,6 +44,8 @@ class PathKriging(ChannelModel):
     Attributes:
         diffuse: power beside the paths, see `ImagePaths`.
         map_error: of the map, as far as the links show it.
+        lost: devices whose positions are too uncertain to follow paths from; kriging alone predicts
+            their links.
         classes: (2, 2) level and own error scale [dB] of links without and with line of sight.
         field: interpolation of what paths leave.
         kriging: the other prediction.
@@ -55,9 +57,16 @@ class PathKriging(ChannelModel):
     uses_map = True
     follows_paths = True
 
-    def __init__(self) -> None:
-        self.diffuse: tuple[float, float] = DIFFUSE_DEFAULT
-        self.map_error = MapError()
+    def __init__(self, found: Found | None = None, lost: tuple[int, ...] = ()) -> None:
+        """Make a model to be fitted.
+
+        Args:
+            found: the map's error and the diffuse power where they are known already, as of
+                `estimate_map_error`.
+            lost: see the class.
+        """
+        self._found, self.lost = found, np.array(lost, dtype=np.int64)
+        self.map_error, self.diffuse = found or (MapError(), DIFFUSE_DEFAULT)
         self.classes = np.array([[0.0, 5.0], [0.0, 5.0]])
         self.field = ResidualField()
         self.kriging = RegressionKriging()
@@ -69,9 +78,12 @@ class PathKriging(ChannelModel):
             seed: int = 0) -> Self:
         links, level_db = drop_uninformative(links, level_db, limit_db)
         self.seed = seed
-        self.map_error, self.diffuse = estimate_map_error(links, level_db, limit_db, seed)
+        sure = ~np.isin(links.device, self.lost)
+        self.map_error, self.diffuse = self._found or estimate_map_error(
+            links.select(sure), level_db[sure], limit_db, seed)
         links = self.map_error.on_map(links)
         self.kriging.fit(links, level_db, limit_db, seed)
+        links, level_db = links.select(sure), level_db[sure]
         paths = self._over_maps(links)
         self._fit_classes(links, level_db, limit_db, *paths)
         self._fit_field(links, level_db, limit_db, *paths)
@@ -81,9 +93,13 @@ class PathKriging(ChannelModel):
     @override
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
         links = self.map_error.on_map(links)
-        by_paths = self._with_field(self.field, links, *self._over_maps(links))
-        share = self.weight[links.los.astype(int)]
-        return _mixture(share, by_paths, self.kriging.predict(links))
+        mean_db, sd_db = self.kriging.predict(links)
+        sure = np.flatnonzero(~np.isin(links.device, self.lost))
+        followed = links.select(sure)
+        by_paths = self._with_field(self.field, followed, *self._over_maps(followed))
+        share = self.weight[followed.los.astype(int)]
+        mean_db[sure], sd_db[sure] = _mixture(share, by_paths, (mean_db[sure], sd_db[sure]))
+        return mean_db, sd_db
 
     @property
     @override
@@ -178,20 +194,25 @@ class PathKriging(ChannelModel):
         arrays = {f"paths/{name}": value for name, value in own.items()} \
             | {f"law/{name}": value for name, value in law.items()}
         return arrays | {"classes": self.classes, "weight": self.weight}, {
+            "lost": self.lost.tolist(),
             "diffuse": list(self.diffuse), "map_error": self.map_error.state(),
             "paths": own_settings, "law": law_settings, "seed": self.seed}
 
     @classmethod
     @override
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
-        require_names("settings", settings, ["diffuse", "map_error", "paths", "law", "seed"])
+        require_names("settings", settings, ["diffuse", "map_error", "lost", "paths", "law",
+                                              "seed"])
         strange = [name for name in arrays if name not in ("classes", "weight")
                    and not name.startswith(("paths/", "law/"))]
         if strange:
             raise ValueError(f"array {strange[0][:60]!r} is unknown")
-        model = cls()
-        model.diffuse = stored_diffuse(settings["diffuse"])
-        model.map_error = MapError.from_state(settings["map_error"])
+        if not isinstance(settings["lost"], list):
+            raise ValueError("lost is no list of devices")
+        lost = {str(place): value for place, value in enumerate(settings["lost"])}
+        model = cls((MapError.from_state(settings["map_error"]),
+                     stored_diffuse(settings["diffuse"])),
+                    tuple(int(require_number(lost, place, 0, 2**31)) for place in lost))
         model.seed = int(require_number(settings, "seed", 0, 2**63))
         model.classes = require_array(arrays, "classes", (2, 2), -MAX_DB, MAX_DB)
         if not ((model.classes[:, 1] > 0) & (model.classes[:, 1] <= MAX_SD_DB)).all():
