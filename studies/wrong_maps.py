@@ -250,14 +250,16 @@ def maps_table(rows: pd.DataFrame) -> str:
     errors = markdown(
         ["map", "worlds", "RMSE of paths [dB]", "network", "kriging", "all combined",
          "worlds where that is at most the best", "its bias, LoS / NLoS [dB]",
-         "within 90 %, LoS / NLoS", "walls seem off by [m]", "heights [m]",
-         "worlds with a warning of the map"],
+         "within 90 %, LoS / NLoS", "its RMSE on anchors' links [dB]", "walls seem off by [m]",
+         "heights [m]", "shift [m]", "reflections [dB]", "worlds with a warning of the map"],
         [[title, str(len(part)), *(number(_rmse(part, model), 2) for model in (*SIMPLE, COMBINED)),
           str(_wins(part)), " / ".join(number(_mean(part, "bias_db", each), 2)
                                       for each in CLASSES[1:]),
           " / ".join(f"{100 * _mean(part, 'coverage', each):.0f} %" for each in CLASSES[1:]),
-          *(number(float(np.median([each[size][0] for each in part["map_error"]])), 1)
-            for size in ("wall_m", "height_m")),
+          number(float(np.sqrt(np.mean([each["rmse_db"]["anchors"]**2
+                                        for each in part[COMBINED]]))), 2),
+          *(number(float(np.median([value(each) for each in part["map_error"]])), 1)
+            for value in FOUND),
           str(sum(any("map" in text for text in each["warnings"]) for each in part[COMBINED]))]
          for title, part in lines],
         "RMSE over held-out links, root mean square over worlds")
@@ -276,6 +278,11 @@ def maps_table(rows: pd.DataFrame) -> str:
     return errors + "\n\n" + markdown(
         ["map", "twin", "unknown devices", "located", "within 90 % radius", "median error [m]",
          "median radius [m]"], located, "Unknown devices")
+
+
+FOUND = [lambda error: error["wall_m"][0], lambda error: error["height_m"][0],
+         lambda error: np.hypot(*error["shift_m"][:2]), lambda error: error["offsets_db"][0]]
+"""What the table has of a map's error as found."""
 
 
 def _rmse(rows: pd.DataFrame, model: str) -> float:

@@ -156,13 +156,14 @@ def test_twins_over_a_wrong_map_are_judged(monkeypatch):
     assert row["buildings"] == len(true_city(0)) - 4 and sum(row["links"].values()) == 80
     for model in (*SIMPLE, COMBINED):
         assert row[model]["rmse_db"]["all"] > 0 and len(row[model]["devices"]["error_m"]) == 1
-    assert row[COMBINED]["devices"] == row["raytrace"]["devices"] and set(row["map_error"]) == {"wall_m", "height_m"}
+    assert set(row["map_error"]) == {"wall_m", "height_m", "shift_m", "offsets_db"}
 
 
 def result(combined_db, held, error_m=2.0):
     """Results of a world: paths 3 dB, network 6 dB, kriging 4 dB."""
-    return {"map_error": {"wall_m": [1.5, 1.0, 2.0], "height_m": [3.0, 2.0, 4.0]}} | {model: {
-        "rmse_db": dict.fromkeys(CLASSES, rmse_db), "bias_db": dict.fromkeys(CLASSES, 0.5),
+    return {"map_error": {"wall_m": [1.5, 1.0, 2.0], "height_m": [3.0, 2.0, 4.0],
+                          "shift_m": [3.0, -4.0, 1.0], "offsets_db": [-6.0, 1.0]}} | {model: {
+        "rmse_db": dict.fromkeys((*CLASSES, "anchors"), rmse_db), "bias_db": dict.fromkeys(CLASSES, 0.5),
         "coverage": {"all": held, "LoS": held, "NLoS": held - 0.1},
         "devices": {"error_m": [error_m, None], "radius_m": [3.0, None], "located": [True, False]},
         "warnings": ["the 3D map seems to be off", "few links"] if held > 0.8 else ["few links"]}
@@ -173,6 +174,6 @@ def test_the_table_has_a_line_for_each_error_of_the_map():
     rows = [{"name": f"city{city}-{line}", "seed": 0, "settings": {}, "cpu_s": 1.0, "results": result(*results)}
             for line in ("missing", "exact") for city, results in enumerate([(2.0, 0.9), (4.0, 0.8, 5.0)])]
     lines = maps_table(read_frame(rows)).splitlines()
-    assert lines[4] == ("| exact | 2 | 3.00 | 6.00 | 4.00 | 3.16 | 1 | 0.50 / 0.50 | 85 % / 75 % | 1.5 | 3.0 | 1 |")
+    assert lines[4] == ("| exact | 2 | 3.00 | 6.00 | 4.00 | 3.16 | 1 | 0.50 / 0.50 | 85 % / 75 % | 3.16 | 1.5 | 3.0 | 5.0 | -6.0 | 1 |")
     assert lines[5].startswith("| 4 buildings missing | 2 |")
     assert "| exact | `path_kriging` | 4 | 2 | 50 % | 3.5 | 3.0 |" in lines
