@@ -26,7 +26,7 @@ from radiotwin.twin.fit_links import provenance, reliable_m
 from radiotwin.twin.fit_paths import LOST_M, fit_along_paths
 from radiotwin.twin.twin import Twin
 
-MAPS = 6  # over which devices are located again
+MAPS = 4  # over which devices are located again
 MAX_COPIES = 4  # anchors that are located as if they were unknown
 PRIOR_DEVICES = 2  # that the radii of the likelihood are worth, beside what those show
 
