@@ -43,7 +43,7 @@ def building_of_vertex(city: CityMap) -> np.ndarray:
     return (building.reshape(-1) - (~built).any())[index.reshape(-1)]
 
 
-@lru_cache(maxsize=32)  # the paths over a map are remembered by the map itself
+@lru_cache(maxsize=8)  # a map holds what was found for its paths: tens of MB
 def perturbed_map(city: CityMap, wall_sd_m: float, height_sd_m: float, seed: int) -> CityMap:
     """Return a map with the walls and roofs of every building moved by normal errors.
 
