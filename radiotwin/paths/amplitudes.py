@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 from radiotwin.paths.coefficients import Slabs
-from radiotwin.paths.fields import _follow, vertical
+from radiotwin.paths.fields import follow_field, take_legs, vertical
 from radiotwin.paths.images import Candidates, PathBuffer
 from radiotwin.paths.surfaces import Surfaces
 from radiotwin.paths.vectors import dot
@@ -34,15 +34,11 @@ def path_amplitudes(
     direction, length_m = np.empty((max_legs, 3)), np.empty(max_legs)
     for i in range(len(rows)):
         path = rows[i]
-        legs = buffer.count[path] - 1
-        for k in range(legs):
-            direction[k] = buffer.points_m[path, k + 1] - buffer.points_m[path, k]
-            length_m[k] = max(np.sqrt((direction[k] ** 2).sum()), 1e-9)
-            direction[k] /= length_m[k]
+        legs = take_legs(buffer, path, direction, length_m)
         sent = vertical(direction[0])
         for axis in range(3):
             field[axis] = sent[axis]
-        spread = _follow(surfaces.planes, surfaces.edges, candidates, buffer.candidate[path],
+        spread = follow_field(surfaces.planes, surfaces.edges, candidates, buffer.candidate[path],
                          wave_number, slabs, wedge, direction, length_m, legs, field)
         total_m[i] = length_m[:legs].sum()
         amplitude[i] = dot(field, vertical(direction[legs - 1])) * np.sqrt(spread) \

@@ -41,11 +41,7 @@ def path_gains(
     direction, length_m = np.empty((max_legs, 3)), np.empty(max_legs)
     for i in range(len(rows)):
         path = rows[i]
-        legs = buffer.count[path] - 1
-        for k in range(legs):
-            direction[k] = buffer.points_m[path, k + 1] - buffer.points_m[path, k]
-            length_m[k] = max(np.sqrt((direction[k] ** 2).sum()), 1e-9)
-            direction[k] /= length_m[k]
+        legs = take_legs(buffer, path, direction, length_m)
         power = 0.0
         for sent in range(1 + polarisation):
             polarised = vertical(direction[0])
@@ -53,7 +49,7 @@ def path_gains(
                 polarised = cross(direction[0], polarised)
             for axis in range(3):
                 field[axis] = polarised[axis]
-            spread = _follow(surfaces.planes, surfaces.edges, candidates, buffer.candidate[path],
+            spread = follow_field(surfaces.planes, surfaces.edges, candidates, buffer.candidate[path],
                              wave_number, slabs, wedge, direction, length_m, legs, field)
             if polarisation == VERTICAL:
                 polarised = vertical(direction[legs - 1])
@@ -65,7 +61,18 @@ def path_gains(
 
 
 @njit(cache=True, error_model="numpy")
-def _follow(
+def take_legs(buffer: PathBuffer, path: int, direction: np.ndarray, length_m: np.ndarray) -> int:
+    """Write the unit vector and the length of each leg of a path [m]; return how many there are."""
+    legs = buffer.count[path] - 1
+    for k in range(legs):
+        direction[k] = buffer.points_m[path, k + 1] - buffer.points_m[path, k]
+        length_m[k] = max(np.sqrt((direction[k] ** 2).sum()), 1e-9)
+        direction[k] /= length_m[k]
+    return legs
+
+
+@njit(cache=True, error_model="numpy")
+def follow_field(
     planes: np.ndarray, edges: np.ndarray, candidates: Candidates, row: int, wave_number: float,
     slabs: Slabs, wedge: int, direction: np.ndarray, length_m: np.ndarray, legs: int,
     field: np.ndarray,
