@@ -38,8 +38,9 @@ def path_amplitudes(
         sent = vertical(direction[0])
         for axis in range(3):
             field[axis] = sent[axis]
-        spread = follow_field(surfaces.planes, surfaces.edges, candidates, buffer.candidate[path],
-                         wave_number, slabs, wedge, direction, length_m, legs, field)
+        spread = follow_field(surfaces.planes, surfaces.edges, candidates,
+                              buffer.candidate[path], wave_number, slabs, wedge, direction,
+                              length_m, legs, field)
         total_m[i] = length_m[:legs].sum()
         amplitude[i] = dot(field, vertical(direction[legs - 1])) * np.sqrt(spread) \
             / (2.0 * wave_number) * np.exp(-1j * wave_number * total_m[i])

@@ -49,8 +49,9 @@ def path_gains(
                 polarised = cross(direction[0], polarised)
             for axis in range(3):
                 field[axis] = polarised[axis]
-            spread = follow_field(surfaces.planes, surfaces.edges, candidates, buffer.candidate[path],
-                             wave_number, slabs, wedge, direction, length_m, legs, field)
+            spread = follow_field(surfaces.planes, surfaces.edges, candidates,
+                                  buffer.candidate[path], wave_number, slabs, wedge, direction,
+                                  length_m, legs, field)
             if polarisation == VERTICAL:
                 polarised = vertical(direction[legs - 1])
                 power += spread * abs(dot(field, polarised)) ** 2
