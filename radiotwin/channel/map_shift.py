@@ -19,7 +19,7 @@ STEPS_M = (2.0, 1.0, 0.5)
 MAX_SHIFT_M = 12.0
 SEEN_SHIFT_M = 1.0  # below, errors of single walls look alike
 MIN_DEVICES = 2  # about one alone a few walls that are off look like a shift
-SURE = 0.05  # probability that devices which were left out gain so much by chance (t test)
+SURE = 0.1  # probability that devices which were left out gain so much by chance (t test)
 SURE_NATS = 4.6  # that a shift must explain beyond errors of single walls: 99 % (Wilks 1938)
 RADIUS_SDS = 2.146  # of the 90 % circle of a normal distribution, in its standard deviations
 
