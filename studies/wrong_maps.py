@@ -9,18 +9,22 @@ import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 from shapely import distance, points, union_all
 
+from marl.figures import COLOURS
 from radiotwin import Measurements, Scene, SolverSettings, Twin, fit_twin
 from radiotwin.channel.path_kriging import PathKriging
 from radiotwin.files import atomic_path, scratch_folder
 from radiotwin.inference.gaussian import mean_if_detected
 from radiotwin.pieces import keep_pieces
 from radiotwin.trace import trace_gains
+from studies import tables
 from studies.runner import Study
 from studies.tables import markdown, number
 from studies.wrong_cities import SIDE_M, Building, city_scene, true_city, wrong_map
@@ -280,6 +284,40 @@ def maps_table(rows: pd.DataFrame) -> str:
          "median radius [m]"], located, "Unknown devices")
 
 
+def maps_figures(rows: pd.DataFrame) -> dict[str, Figure]:
+    """Draw errors of the twins, and the share of devices within their radii, by line."""
+    line = rows["name"].str.split("-", n=1).str[1]
+    lines = [(title, rows[line == name]) for name, title in TITLES.items() if (line == name).any()]
+    figure, panels = tables.make_panels(2, 1, 3.4)
+    for index, (model, label) in enumerate(BARS.items()):
+        at = np.arange(len(lines)) + (index - 1.5) * 0.2
+        panels[0].bar(at, [_rmse(part, model) for _, part in lines], 0.18, color=COLOURS[index],
+                      label=label)
+        if model in WITH_RADII:
+            panels[1].bar(at, [_held(part, model) for _, part in lines], 0.18,
+                          color=COLOURS[index], label=label)
+    panels[0].set(ylabel="RMSE over held-out links [dB]")
+    panels[1].set(ylabel="devices within their 90 % radius", ylim=(0, 1.02))
+    panels[1].axhspan(0.8, 0.97, color="black", alpha=0.1, linewidth=0, label="80 to 97 %")
+    for axes in panels:
+        axes.set_xticks(range(len(lines)), [fill(title, 16) for title, _ in lines])
+        axes.grid(alpha=0.3, axis="y")
+    return {"maps": tables.with_legend(figure, panels, 5)}
+
+
+BARS = {"raytrace": "paths alone", "segmented_nn": "network", "regression_kriging": "kriging",
+        COMBINED: "path_kriging"}
+WITH_RADII = ("raytrace", COMBINED)
+
+
+def _held(rows: pd.DataFrame, model: str) -> float:
+    """Return the share of located devices whose position is within its radius."""
+    inside = [error_m <= radius_m for each in rows[model]
+              for error_m, radius_m in zip(each["devices"]["error_m"], each["devices"]["radius_m"],
+                                           strict=True) if error_m is not None]
+    return float(np.mean(inside)) if inside else np.nan
+
+
 FOUND = [lambda error: error["wall_m"][0], lambda error: error["height_m"][0],
          lambda error: np.hypot(*error["shift_m"][:2]), lambda error: error["offsets_db"][0]]
 """What the table has of a map's error as found."""
@@ -301,4 +339,4 @@ def _mean(rows: pd.DataFrame, what: str, links: str) -> float:
 
 
 STUDIES = {"maps": Study("How good are predictions and radii where the map is wrong?", judge_map,
-                         maps_cases, maps_table)}
+                         maps_cases, maps_table, maps_figures)}
