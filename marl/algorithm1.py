@@ -27,7 +27,7 @@ from radiotwin.twin import Twin, fit_twin
 from radiotwin.twin.shadowing import with_shadowing
 
 TWINS = {"nn": "segmented_nn", "log-distance": "log_distance", "kriging": "regression_kriging",
-         "raytrace": "raytrace"}
+         "raytrace": "raytrace", "path-kriging": "path_kriging"}
 """Name of a twin on the command line -> model of `fit_twin`."""
 
 

@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from marl.event_log import EventLog
 
 TRAINED_IN = {"nn": "NN twin", "log-distance": "log-distance twin", "kriging": "kriging twin",
-              "raytrace": "ray-traced twin", "truth": "the truth"}
+              "raytrace": "ray-traced twin", "path-kriging": "twin of a map that may be wrong",
+              "truth": "the truth"}
 BASELINES = ("planner", "greedy", "random")  # in every table
 
 

@@ -93,9 +93,10 @@ class RunSettings(BaseModel):
     truth: Literal["traced", "segmented"] = Field(
         "traced", description="map of the real flights: SCENE/truth.nc, or the paper's "
         "statistical truth")
-    twin: Literal["nn", "log-distance", "kriging", "raytrace", "truth"] = Field(
+    twin: Literal["nn", "log-distance", "kriging", "raytrace", "path-kriging", "truth"] = Field(
         "nn", description="model of the twin that is trained in; raytrace: paths over the 3D map, "
-        "minutes a round; truth: a perfect twin, no flight is needed")
+        "minutes a round; path-kriging: the same over a map that may be wrong; truth: a perfect "
+        "twin, no flight is needed")
     twin_shadowing: Literal["fitted", "slot"] = Field(
         "fitted", description="how long the twin's error lasts in a simulated flight: fitted to "
         "its residuals, or one slot; preset paper: slot")

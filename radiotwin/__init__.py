@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from radiotwin.compare import Comparison, compare_models, score_map, split_flights
     from radiotwin.errors import BadInput, RunFailed
     from radiotwin.measurements import Measurements, read_measurements
+    from radiotwin.paths.listing import list_paths
     from radiotwin.radiomap import RadioMap
     from radiotwin.report import read_run, write_report
     from radiotwin.scene import Scene
@@ -34,6 +35,7 @@ _MODULES = {
     "compare": ["Comparison", "compare_models", "score_map", "split_flights"],
     "errors": ["BadInput", "RunFailed"],
     "measurements": ["Measurements", "read_measurements"],
+    "paths.listing": ["list_paths"],
     "radiomap": ["RadioMap"],
     "report": ["read_run", "write_report"],
     "scene": ["Scene"],
@@ -49,8 +51,8 @@ __all__ = [  # noqa: F822 - names that __getattr__ finds
     "BadInput", "BuildOptions", "Comparison", "Loop", "Measurements", "RadioMap", "RunFailed",
     "Scene", "SelectionCriteria", "SolverSettings", "Twin", "__version__", "build_preset",
     "build_scene", "close_loop", "compare_models", "corrected_twin", "fit_twin", "fly_survey",
-    "make_report", "read_measurements", "read_run", "score_map", "segmented_truth", "split_flights",
-    "trace_map", "write_report"]
+    "list_paths", "make_report", "read_measurements", "read_run", "score_map", "segmented_truth",
+    "split_flights", "trace_map", "write_report"]
 
 
 def __getattr__(name: str) -> Any:

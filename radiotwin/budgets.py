@@ -114,6 +114,9 @@ MAP_AXIS = Budget("MAP_AXIS", 20_000_000, "coordinates", "one axis of a radio ma
 MAP_CHUNKS = Budget("MAP_CHUNKS", 1_000_000, "pieces", "a variable as HDF5 stores it")
 MAP_ATTRIBUTES = Budget("MAP_ATTRIBUTES", 1_000, "attributes", "one variable")
 MAP_PICTURES = Budget("MAP_PICTURES", 2_000, "pictures", "a KMZ file")
+# Paths
+PATHS = Budget("PATHS", 5_000_000, "paths", "a list of paths: 630 bytes each in memory")
+RESPONSE_VALUES = Budget("RESPONSE_VALUES", 50_000_000, "taps", "all impulse responses of a list")
 # Pages
 PAGE_VALUES = Budget("PAGE_VALUES", 1_000_000_000, "values", "all radio maps of a page")
 PAGE_MAPS = Budget("PAGE_MAPS", 200, "radio maps", "a page")

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from radiotwin.channel import channel_named
+from radiotwin.channel.published import MAX_FACTOR, PublishedLaw
 from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import mean_if_detected
 from radiotwin.measurements import Measurements
@@ -16,6 +18,8 @@ from radiotwin.twin import Twin, fit_twin
 
 # Models that are compared unless others are named.
 DEFAULT_MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging")
+# Published laws that `radiotwin compare` adds: nothing is fitted, so they cost only the search.
+PUBLISHED_MODELS = ("tr36777_uma", "tr36777_umi", "al_hourani_urban", "p1411", "cost231_wi")
 CLASSES = ("all", "LoS", "NLoS")  # of links, as the tables name them
 
 
@@ -41,14 +45,14 @@ class Comparison:
 
     def tables(self) -> list[tuple[str, dict[str, str], list[list]]]:
         """Return tables to show: (title, headings with their alignment, rows), scores first."""
-        tables = []
+        tables: list[tuple[str, dict[str, str], list[list]]] = []
         estimated = self.scores[self.scores["positions"] == "estimated"]
         for against, part in estimated.groupby("against", sort=False):
             columns = {"model": "left"} | dict.fromkeys(("RMSE", "MAE", "bias"), "right")
             rows = []
             for model, of_model in part.groupby("model", sort=False):
                 of_class = of_model.set_index("links")
-                rows.append([model, *(
+                rows.append([self._label(model), *(
                     "/".join(_short(of_class.loc[links, f"{measure}_db"]) for links in CLASSES)
                     for measure in ("rmse", "mae", "bias"))])
             links = part.groupby("links")["n"].max()
@@ -60,9 +64,16 @@ class Comparison:
             tables.append(("Error of the unknown devices' positions [m]",
                            {"model": "left"} | dict.fromkeys(
                                ("devices", "median", "90 %", "worst"), "right"),
-                           [[row.model, int(row.devices), row.median_m, row.p90_m, row.worst_m]
+                           [[self._label(row.model), int(row.devices), row.median_m, row.p90_m,
+                             row.worst_m]
                             for row in summary.itertuples()]))
         return tables
+
+    def _label(self, model: str) -> str:
+        """Return a model's name, and that it was fitted to nothing where that is so."""
+        twin = self.twins.get(model)
+        published = twin is not None and isinstance(twin.channel, PublishedLaw)
+        return f"{model} (no fit)" if published else model
 
     def location_summary(self) -> pd.DataFrame:
         """Return median, 90th percentile and worst position error [m] of each model."""
@@ -77,6 +88,20 @@ class Comparison:
 
 def _short(value: float) -> str:
     return "–" if np.isnan(value) else f"{value:.2f}"
+
+
+def published_models(frequency_hz: float) -> tuple[str, ...]:
+    """Return names of the `PUBLISHED_MODELS` that hold at a frequency [Hz].
+
+    Those that are used with a warning near their range are among them.
+    """
+    def holds(name: str) -> bool:
+        law = channel_named(name)
+        assert issubclass(law, PublishedLaw)
+        low_hz, high_hz = law.validity.frequency_hz
+        return low_hz / MAX_FACTOR <= frequency_hz <= high_hz * MAX_FACTOR
+
+    return tuple(filter(holds, PUBLISHED_MODELS))
 
 
 def split_flights(measurements: Measurements, held_out: int) -> tuple[Measurements, Measurements]:

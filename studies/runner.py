@@ -26,7 +26,9 @@ MODULES = {"models": "models", "curve": "learning", "federation": "learning", "t
            "options": "learning", "twin": "twins", "quality": "twins", "pays": "disturbances",
            "hidden": "closeloop", "null": "closeloop", "towers": "twins",
            "real": "closeloop_real", "tracer": "tracer", "speed": "speed", "load": "load",
-           "kill": "kill"}
+           "kill": "kill", "paths": "path_list", "engine": "engine",
+           "impossible": "impossible", "accuracy": "tracer",
+           "maps": "wrong_maps"}
 """Name of a study -> its module in this package."""
 Run = Callable[[int, dict], dict]
 Todo = list[tuple[str, int, dict]]

@@ -1,7 +1,8 @@
-"""Speed, memory and numerical error of tracing: `tracer`.
+"""Speed, memory and numerical error of tracing: `tracer` by settings, `accuracy` by scene.
 
-A random sample of a scene's lattice is solved for all devices, in a process of its own, and
-compared with a reference with ten times the default's rays.
+A random sample of a scene's lattice is solved for all devices, in `tracer` in a process of its own,
+and compared with a reference: with ten times the default's rays in `tracer`, with ten times its own
+in `accuracy`.
 """
 
 import multiprocessing
@@ -14,6 +15,10 @@ import numpy as np
 import pandas as pd
 
 from radiotwin import Scene, SolverSettings
+from radiotwin.files import scratch_folder
+from radiotwin.scene.build import BuildOptions, build_scene
+from radiotwin.trace import trace_gains
+from radiotwin.trace.settings import FINER
 from radiotwin.trace.solver import PathGains
 from studies.runner import Study
 from studies.tables import markdown, scene_folder
@@ -86,5 +91,54 @@ def tracer_table(rows: pd.DataFrame) -> str:
         for name, row in ((each, by_name.loc[each]) for each in ROWS if each in by_name.index)])
 
 
+def accuracy_cases(seed: int) -> dict[str, dict]:
+    """Return scenes and qualities; the reference of `high` takes half of the receivers."""
+    return {f"{name} `{quality}`": {"city": name, "quality": quality, "receivers": receivers}
+            for quality, receivers in (("default", 40), ("fast", 40), ("high", 20))
+            for name in ("sionna:munich", "rbm", "rdm")}
+
+
+def measure_accuracy(seed: int, settings: dict) -> dict:
+    """Compare gains with those of ten times the rays, over links detected in both.
+
+    Returns:
+        By line of sight: number of links, mean difference, RMS and 90th percentile [dB].
+    """
+    with scratch_folder() as folder:
+        name = settings["city"]
+        if name.startswith("sionna:"):
+            build_scene(name, folder / "scene", BuildOptions(devices=10))
+        scene = Scene.load(folder / "scene" if name.startswith("sionna:") else scene_folder(name))
+        rng, lattice_m = np.random.default_rng(seed), scene.lattice.positions_m
+        outdoors_m = lattice_m[~scene.blocked.ravel()]
+        points_m = outdoors_m[rng.choice(len(outdoors_m), settings["receivers"], replace=False)]
+        solver = SolverSettings.of_quality(settings["quality"], seed=seed + 1)
+        gain_db, finer_db = (trace_gains(scene, scene.device_m, points_m, each)
+                             for each in (solver, solver.finer(FINER)))
+        los = np.stack([scene.city.line_of_sight(at_m[None], points_m) for at_m in scene.device_m])
+        limit_db = scene.config.gain_limit_db
+    both = (gain_db >= limit_db) & (finer_db >= limit_db)
+    results: dict[str, float] = {}
+    for kind, of_kind in (("los", los), ("nlos", ~los)):
+        error_db = (gain_db - finer_db)[both & of_kind]
+        results |= {f"{kind}_links": len(error_db), f"{kind}_bias_db": error_db.mean(),
+                    f"{kind}_rms_db": np.sqrt(np.mean(error_db**2)),
+                    f"{kind}_p90_db": np.quantile(np.abs(error_db), 0.9)}
+    return results
+
+
+def accuracy_table(rows: pd.DataFrame) -> str:
+    """Return the differences by scene, quality and line of sight."""
+    heads = ["scene and quality", *(
+        f"{kind}: {what}" for kind in ("LoS", "NLoS")
+        for what in ("links", "mean [dB]", "RMS [dB]", "9 of 10 within [dB]"))]
+    return markdown(heads, [[row["name"], *(
+        str(row[f"{kind}_links"]) if what == "links" else f"{row[f'{kind}_{what}']:.2f}"
+        for kind in ("los", "nlos") for what in ("links", "bias_db", "rms_db", "p90_db"))]
+        for _, row in rows.iterrows()])
+
+
 STUDIES = {"tracer": Study("What do the ray tracer's settings cost and bring?", time_tracer,
-                           tracer_cases, tracer_table, seeds=1)}
+                           tracer_cases, tracer_table, seeds=1),
+           "accuracy": Study("How far are traced gains from those of ten times the rays?",
+                             measure_accuracy, accuracy_cases, accuracy_table, seeds=1)}

@@ -13,6 +13,7 @@ from radiotwin.effects.tilted_dipole import TiltedDipole
 from radiotwin.links.geometry import LinkGeometry
 from radiotwin.localize import LocalizeSettings
 from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.materials import itu_material
 
 DIFFERENT = [None, False, True, 0, 1, 0.0, -0.0, 1.0, float("nan"), "", "1", b"1", "ab", ("a", "b"), ("ab",), ((), ("a",)),
              (("a",), ()), {}, {"a": 1}, {"a": 2}, {"b": 1}, {1, 2}, np.zeros(0), np.zeros(2), np.zeros((2, 1)),
@@ -52,6 +53,8 @@ def test_a_city_is_its_triangles():
     vertices, faces = np.eye(3), np.array([[0, 1, 2]])
     one, same, other = CityMap(vertices, faces), CityMap(vertices, faces), CityMap(vertices + 1, faces)
     assert content_hash(one) == content_hash(same) != content_hash(other)
+    of_glass = [CityMap(vertices, faces, [itu_material("glass", thickness_m=each)]) for each in (0.1, 0.02)]
+    assert len({content_hash(each) for each in (one, *of_glass)}) == 3
 
 
 @dataclass

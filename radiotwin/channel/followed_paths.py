@@ -12,7 +12,7 @@ from radiotwin.links import LinkData, LinkGeometry
 from radiotwin.pieces import kept
 from radiotwin.scene.citymap import CityMap
 
-GRID_M = 1.0  # estimated positions of devices are rounded to it, and share their paths
+GRID_M = 0.5  # estimated positions of devices are rounded to it, and share their paths
 MAX_REMEMBERED = 300_000  # links: 200 MB
 MIN_REMEMBERED = 2  # devices, however many links they have
 
@@ -26,10 +26,30 @@ def path_gains(geometry: LinkGeometry, kinds: tuple[str, ...] | None = None) -> 
     """
     from radiotwin.paths.powers import COMPONENTS  # late, as everywhere here: numba is large
 
-    kinds = COMPONENTS if kinds is None else kinds
+    columns = [COMPONENTS.index(kind) for kind in (COMPONENTS if kinds is None else kinds)]
     power = np.zeros(len(geometry))
     for rows, followed, index in _by_device(geometry):
-        power[rows] = sum(followed.powers[index, COMPONENTS.index(kind)] for kind in kinds)
+        power[rows] = followed.powers[index][:, columns].sum(axis=1)
+    return power
+
+
+def interaction_gains(geometry: LinkGeometry) -> np.ndarray:
+    """Return the power gain (n, 3) of the direct, the reflected and the diffracted paths.
+
+    A path with an edge is diffracted, whatever else it has.
+
+    Args:
+        geometry: n links over a map.
+    """
+    from radiotwin.paths.powers import COMPONENTS
+
+    diffracted = np.array(["diffracted" in kind for kind in COMPONENTS])
+    direct = np.array([kind == "direct" for kind in COMPONENTS])
+    power = np.zeros((len(geometry), 3))
+    for rows, followed, index in _by_device(geometry):
+        by_kind = followed.powers[index]
+        power[rows] = np.column_stack([by_kind[:, which].sum(axis=1) for which in
+                                       (direct, ~direct & ~diffracted, diffracted)])
     return power
 
 

@@ -4,18 +4,30 @@ A package adds models under the entry-point group `radiotwin.channels`; a script
 `register`.
 """
 
+from radiotwin.channel.al_hourani import (
+    AlHouraniDenseUrban,
+    AlHouraniHighRise,
+    AlHouraniSuburban,
+    AlHouraniUrban,
+)
 from radiotwin.channel.base import ChannelModel
+from radiotwin.channel.cost231 import WalfischIkegami, WalfischIkegamiMetropolitan
 from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.channel.log_distance import LogDistance
+from radiotwin.channel.p1411 import P1411
+from radiotwin.channel.path_kriging import PathKriging
 from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.channel.segmented_nn import SegmentedNN
+from radiotwin.channel.tr36777 import UrbanMacro, UrbanMicro
 from radiotwin.errors import BadInput
 from radiotwin.plugins import load_plugins
 
 ENTRY_POINTS = "radiotwin.channels"  # group of the packages' entry points
 BUILT_IN: tuple[type[ChannelModel], ...] = (
-    LogDistance, SegmentedLogDistance, SegmentedNN, RegressionKriging, ImagePaths)
+    LogDistance, SegmentedLogDistance, SegmentedNN, RegressionKriging, ImagePaths, PathKriging,
+    UrbanMacro, UrbanMicro, AlHouraniSuburban, AlHouraniUrban, AlHouraniDenseUrban,
+    AlHouraniHighRise, P1411, WalfischIkegami, WalfischIkegamiMetropolitan)
 ALIASES = {"raytrace": ImagePaths.name}  # as the command line calls it
 
 _registered: dict[str, type[ChannelModel]] = {}

@@ -81,24 +81,40 @@ class ResidualField:
         """
         rng = np.random.default_rng(seed)
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
-        numbers = np.unique(series)
-        limit = int(np.clip(np.sqrt(MAX_PAIRS / max(len(numbers), 1)), MIN_POINTS, MAX_POINTS))
-        fitted = numbers
+        rows_of_series = self._store(series, position_m, residual, kind)
+        numbers = list(rows_of_series)
         if len(numbers) > MAX_SERIES_TO_FIT:
-            fitted = np.sort(rng.choice(numbers, MAX_SERIES_TO_FIT, replace=False))
-        order = np.argsort(series, kind="stable")
-        rows_of_series = np.split(order, np.searchsorted(series[order], numbers[1:]))
-        self.fields, samples = {}, []
-        for number, rows in zip(numbers, rows_of_series, strict=True):
-            points = position_m[rows], residual[rows], kind[rows]
-            field = _merged(*points, SAME_POINT_M)
-            if number in fitted:
-                samples.append(_sample(field, rng))
-            self.fields[int(number)] = (
-                field if len(field.residual) <= limit else _coarsened(*points, limit))
+            numbers = np.sort(rng.choice(numbers, MAX_SERIES_TO_FIT, replace=False)).tolist()
+        samples = [_sample(_merged(position_m[rows], residual[rows], kind[rows], SAME_POINT_M), rng)
+                   for rows in (rows_of_series[number] for number in numbers)]
         self._fit_correlation(samples, len(np.unique(kind)) > 1)
         self._factor()
         return self
+
+    def with_points(self, series: np.ndarray, position_m: np.ndarray,
+                    residual: np.ndarray) -> Self:
+        """Return a field of the same correlation with other points, as of `fit`."""
+        field = type(self)()
+        field.share, field.kind_share, field.length_m = self.share, self.kind_share, self.length_m
+        field._store(series, position_m, residual, np.zeros(len(series), dtype=int))
+        field._factor()
+        return field
+
+    def _store(self, series: np.ndarray, position_m: np.ndarray, residual: np.ndarray,
+               kind: np.ndarray) -> dict[int, np.ndarray]:
+        """Store the points, as of `fit`; return the rows of each series."""
+        numbers = np.unique(series)
+        limit = int(np.clip(np.sqrt(MAX_PAIRS / max(len(numbers), 1)), MIN_POINTS, MAX_POINTS))
+        order = np.argsort(series, kind="stable")
+        rows_of_series = dict(zip(map(int, numbers), np.split(
+            order, np.searchsorted(series[order], numbers[1:])), strict=True))
+        self.fields = {}
+        for number, rows in rows_of_series.items():
+            points = position_m[rows], residual[rows], kind[rows]
+            field = _merged(*points, SAME_POINT_M)
+            self.fields[number] = (
+                field if len(field.residual) <= limit else _coarsened(*points, limit))
+        return rows_of_series
 
     def predict(self, series: np.ndarray, position_m: np.ndarray,
                 kind: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -39,7 +39,10 @@ def fit(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of the twin.")] = Path("twin"),
     model: Annotated[str, typer.Option(
         help="segmented_nn, segmented_log_distance, log_distance, regression_kriging, or raytrace: "
-             "paths over the 3D map, also to find devices in narrow streets; takes minutes.")
+             "paths over the 3D map, also to find devices in narrow streets; takes minutes. "
+             "path_kriging: the same over a map that may be wrong. Or a "
+             "published law, which needs no anchor: tr36777_uma, tr36777_umi, al_hourani_urban "
+             "(_suburban, _dense_urban, _high_rise), p1411, cost231_wi (_metropolitan).")
         ] = "segmented_nn",
     devices: DeviceTable = None,
     start: Annotated[Path | None, typer.Option(
@@ -168,9 +171,10 @@ def compare(
 ) -> None:
     """Compare all channel models on held-out flights.
 
+    Published laws that hold at the scene's frequency are among them, fitted to nothing.
     With --truth they are compared with the truth map, too.
     """
-    from radiotwin.compare import DEFAULT_MODELS, compare_models, split_flights
+    from radiotwin.compare import DEFAULT_MODELS, compare_models, published_models, split_flights
     from radiotwin.comparison_output import judge_also, write_comparison
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
@@ -184,7 +188,8 @@ def compare(
     train, test = split_flights(read_measurements(measurements, devices), held_out)
     truth_map = read_truth(world, truth) if truth else None
     twins, maps = judge_also(also or [], truth_map, test.flights)
-    models = (*DEFAULT_MODELS, *["raytrace"] * raytrace)
+    models = (*DEFAULT_MODELS, *published_models(world.config.radio.frequency_hz),
+              *["raytrace"] * raytrace)
     with keep_pieces() as pieces:
         comparison = compare_models(train, test, world, truth_map, seed=seed, models=models,
                                     twins=twins, maps=maps)

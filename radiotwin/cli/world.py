@@ -1,18 +1,34 @@
-"""The commands that measure in a scene: trace, gains, survey."""
+"""The commands that measure in a scene: trace, gains, paths, survey."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from radiotwin.cli.options import Combining, OnlyDevices, Quality, RaySeed, SceneFolder, split_names
-from radiotwin.console import notice, say
+from radiotwin.cli.options import (
+    Combining,
+    OnlyDevices,
+    Quality,
+    RaySeed,
+    SceneFolder,
+    TargetDb,
+    split_names,
+)
+from radiotwin.console import notice, print_rows, say
+from radiotwin.errors import BadInput
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from radiotwin.scene import Scene
+    from radiotwin.trace import SolverSettings
 
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module to the app."""
     app.command("trace")(trace)
     app.command("gains")(gains)
+    app.command("paths")(paths)
     app.command("survey")(survey)
 
 
@@ -20,7 +36,8 @@ def trace(
     folder: SceneFolder,
     out: Annotated[Path | None, typer.Option(
         "--out", "-o", help="Radio map [SCENE/truth.nc, with --devices truth-A-B.nc].")] = None,
-    quality: Quality = "default",
+    quality: Quality = None,
+    target_db: TargetDb = None,
     solver: Annotated[str, typer.Option(
         help="paths (gain at points) or map (mean over lattice cells).")] = "paths",
     combining: Combining = "power",
@@ -32,16 +49,17 @@ def trace(
     A killed run is resumed, a finished one is reused.
     """
     from radiotwin.scene import Scene
-    from radiotwin.trace import SolverSettings, trace_map
+    from radiotwin.trace import trace_map
 
-    scene = Scene.load(folder)
-    settings = SolverSettings.of_quality(quality, solver=solver, combining=combining, seed=seed)
-    names = split_names(devices)
+    scene, names = Scene.load(folder), split_names(devices)
+    settings = _settings(scene, scene.lattice.positions_m, names, quality, target_db, solver=solver,
+                         combining=combining, seed=seed)
     out = out or folder / ("-".join(["truth", *(names or [])])[:100] + ".nc")
     facts = trace_map(scene, settings, out, names).dataset.attrs
     say(f"wrote {out}: {facts['links']} links, {facts['links_detected']} detected, "
         f"{facts['links_below_sensitivity']} below sensitivity, {facts['links_without_path']} "
-        f"without a path, {facts['links_inside_building']} inside buildings")
+        f"without a path, {facts['links_inside_building']} inside buildings"
+        + f", {facts['links_impossible']} impossible" * bool(facts["links_impossible"]))
     if "noise_floor_db" in facts:
         say(f"numerical noise: {facts['noise_floor_db']:.2f} dB RMS against ten times the rays; "
             f"nine links in ten are within {facts['noise_floor_p90_db']:.2f} dB")
@@ -57,7 +75,8 @@ def gains(
     devices: OnlyDevices = None,
     combining: Annotated[str, typer.Option(
         "--sum", help="power (of the paths' powers) or coherent (of their fields).")] = "power",
-    quality: Quality = "default",
+    quality: Quality = None,
+    target_db: TargetDb = None,
     seed: RaySeed = 1,
 ) -> None:
     """Ray-trace gains at any points.
@@ -66,17 +85,81 @@ def gains(
     """
     from radiotwin.pieces import keep_pieces
     from radiotwin.scene import Scene
-    from radiotwin.trace import SolverSettings, read_points, trace_points
+    from radiotwin.trace import read_points, trace_points
 
-    scene = Scene.load(folder)
-    settings = SolverSettings.of_quality(quality, combining=combining, seed=seed)
+    scene, names = Scene.load(folder), split_names(devices)
     points_m = read_points(points, scene.config.origin)
+    settings = _settings(scene, points_m, names, quality, target_db, combining=combining, seed=seed)
     with keep_pieces() as pieces:
-        table = trace_points(scene, points_m, settings, out, split_names(devices))
+        table = trace_points(scene, points_m, settings, out, names)
     notice(pieces.progress)
     reasons = table.loc[table["reason"] != "", "reason"].value_counts()
     say(f"wrote {out}: {len(table)} links, {len(table) - reasons.sum()} with a gain"
         + "".join(f", {count} {reason}" for reason, count in reasons.items()))
+
+
+def paths(
+    folder: SceneFolder,
+    points: Annotated[Path, typer.Option(
+        help="CSV file with x_m, y_m, z_m; or latitude_deg, longitude_deg, z_m, where the scene "
+             "has an origin.")],
+    out: Annotated[Path, typer.Option(
+        "--out", "-o", help="NetCDF file (.nc).")] = Path("paths.nc"),
+    devices: OnlyDevices = None,
+    velocity: Annotated[str | None, typer.Option(
+        metavar="VX,VY,VZ", help="Velocity of the receiver east, north and up [m/s], for Doppler "
+                                 "shifts.")] = None,
+    bandwidth_hz: Annotated[float | None, typer.Option(
+        help="Add impulse responses of this bandwidth.")] = None,
+) -> None:
+    """List the paths to any points: powers, delays, angles, interactions.
+
+    Each link gets its delay spread, K factor and angular spreads. No ray tracer is needed.
+    """
+    from radiotwin.paths.listing import list_paths
+    from radiotwin.scene import Scene
+    from radiotwin.trace import read_points
+
+    scene = Scene.load(folder)
+    points_m = read_points(points, scene.config.origin)
+    found = list_paths(scene, points_m, out, split_names(devices),
+                       None if velocity is None else _speeds(velocity), bandwidth_hz)
+    reasons = found["reason"].to_series().value_counts()
+    say(f"wrote {out}: {found.sizes['path']} paths of {found.sizes['link']} links"
+        + "".join(f", {count} {reason}" for reason, count in reasons.items() if reason))
+
+
+def _speeds(text: str) -> list[float]:
+    try:
+        east, north, up = (float(part) for part in text.split(","))
+    except ValueError:
+        raise BadInput(f"--velocity {text!r} is not three numbers; give VX,VY,VZ [m/s], such as "
+                       "10,0,0 for eastwards") from None
+    return [east, north, up]
+
+
+def _settings(scene: "Scene", points_m: "np.ndarray", devices: list[str] | None,
+              quality: str | None, target_db: float | None, **others: str | int
+              ) -> "SolverSettings":
+    """Return the settings of a quality, or those that reach a target, with what they cost."""
+    from radiotwin.pieces import keep_pieces
+    from radiotwin.trace import SolverSettings, choose_quality
+
+    if target_db is None:
+        return SolverSettings.of_quality(quality or "default", **others)
+    if quality is not None:
+        raise BadInput("--quality and --target-db both say how many rays there are; give one")
+    with keep_pieces():
+        tried = choose_quality(scene, points_m, target_db, devices, **others)
+    links = len(points_m) * len(devices or scene.config.devices)
+    print_rows(f"numerical error against ten times the rays, {tried[-1].links} links",
+               {"quality": "left", "RMS [dB]": "right", "9 of 10 within [dB]": "right",
+                "bias [dB]": "right", f"minutes for {links} links": "right"},
+               [[rung.quality, rung.rms_db, rung.p90_db, rung.bias_db,
+                 links * rung.seconds_per_link / 60] for rung in tried])
+    say(f"--target-db {target_db:g}: quality {tried[-1].quality} "
+        f"({tried[-1].settings.samples_per_src} rays a device)")
+    return tried[-1].settings
 
 
 def survey(

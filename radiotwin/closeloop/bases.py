@@ -13,7 +13,8 @@ from radiotwin.channel.log_distance import LogDistance
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.links import LinkData
 from radiotwin.scene import Scene
-from radiotwin.twin.fit import LOST_M, fit_known, fit_links, fit_paths, reliable_m, relocation_from
+from radiotwin.twin.fit_links import fit_known, fit_links, reliable_m
+from radiotwin.twin.fit_paths import LOST_M, fit_paths, relocation_from
 from radiotwin.twin.twin import Twin
 
 MAX_RADIUS_M = 100.0  # of a device's circle by the law, for paths to be followed to locate it

@@ -71,7 +71,7 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
     label, centres_m = buildings(scene.city)
     gone = [each.params.building for each in effects if isinstance(each.effect, RemovedObstacle)]
     keep = ~np.isin(label, gone)
-    city = CityMap(scene.city.vertices, scene.city.faces[keep]) if keep.any() else None
+    city = scene.city.without(~keep) if keep.any() else None
     config, moves = _moved(loop, scene, city)
     free_m = np.array([*((d.x_m, d.y_m, d.z_m) for d in config.devices),
                        *((x_m, y_m, uav.altitude_m) for uav in config.uavs

@@ -16,7 +16,7 @@ from radiotwin.effects.fold_model import FoldModel
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.student import mean_if_detected
 from radiotwin.links import LinkData
-from radiotwin.twin.fit import best_dof
+from radiotwin.twin.fit_paths import best_dof
 from radiotwin.twin.twin import Twin
 
 

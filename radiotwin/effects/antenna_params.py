@@ -25,12 +25,12 @@ class AntennaParams(EffectParams):
         return given
 
 
-Pattern = TypeVar("Pattern", bound=AntennaParams)
+Pattern = TypeVar("Pattern", bound=EffectParams)
 
 
 def vary_patterns(patterns: dict[int, Pattern],
                   params: Callable[[dict[int, Pattern]], Any]) -> Variation:
-    """Return how the patterns of several antennas may be refined, each by itself.
+    """Return how the patterns of several antennas, or bodies, may be refined, each by itself.
 
     Args:
         patterns: pattern of each device or receiver.

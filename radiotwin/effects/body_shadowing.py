@@ -1,7 +1,9 @@
-"""The receiver's body is in the way: loss depends on the direction in the body frame only.
+"""The receiver's body is in the way: loss depends on the direction of arrival in the body frame.
 
-First harmonic of the loss over the direction of arrival. Airframe shadowing is described by Khawaja
-et al., 'A survey of air-to-ground propagation channel modeling for unmanned aerial vehicles', IEEE
+The loss is greatest where the body is, nothing on the opposite side, and in between
+depth (1 + cos angle) / 2, with the angle between the arrival and the body, in azimuth and elevation
+together: the first harmonic that is never a gain. Airframe shadowing is described by Khawaja et
+al., 'A survey of air-to-ground propagation channel modeling for unmanned aerial vehicles', IEEE
 COMST 21(3), 2019.
 """
 
@@ -9,29 +11,59 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
+from radiotwin.effects.antenna_params import vary_patterns
 from radiotwin.effects.arrays import frequent_labels
-from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, Unique
-from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.effects.base import GainEffect
+from radiotwin.effects.params import (
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Variation,
+    quantities,
+    quantity,
+)
+from radiotwin.effects.residual_view import ResidualView
 from radiotwin.effects.tilted_dipole import TiltedDipole
 from radiotwin.links import LinkData
 
-MIN_LINKS = 100  # of a receiver, with a heading
-PRIOR_SD_DB = 8.0  # of each of the two amplitudes
+MIN_LINKS = 100  # of a receiver, detected and with a heading
+MIN_NATS = 4.0  # that a body must gain to be proposed
+AMPLITUDE_SD_DB = 8.0  # prior of half the depth along each axis, which steadies the proposal
+
+
+class Body(EffectParams):
+    """Where the body is, seen from one receiver's antenna, and what it takes."""
+
+    depth_db: float = quantity(0.0, unit="dB", low=0.0, high=40.0, step=2.0,
+                               description="Loss of what arrives through its middle.")
+    azimuth_deg: float = quantity(0.0, unit="deg", low=-720.0, high=1080.0, step=15.0,
+                                  description="Direction of its middle, clockwise from the nose.")
+    elevation_deg: float = quantity(0.0, unit="deg", low=-90.0, high=90.0, step=15.0,
+                                    description="Direction of its middle, up from the deck.")
+
+    def loss_db(self, arrival: np.ndarray) -> np.ndarray:
+        """Return the loss (n,) [dB], of arrivals (n, 3) as unit vectors right, nose, top."""
+        azimuth, elevation = np.radians(self.azimuth_deg), np.radians(self.elevation_deg)
+        middle = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation),
+                           np.sin(elevation)])
+        return self.depth_db * (1 + arrival @ middle) / 2
 
 
 class BodyShadowing(GainEffect):
     """Receivers that lose more on one side."""
 
     name = "body_shadowing"
+    variant = "loss around the body"
     figure = "pattern"
     of_receiver = True
     confused_with = ("antenna_pattern",)
 
     class Params(EffectParams):
-        """Receivers whose bodies shadow."""
+        """Bodies that shadow."""
 
-        members: Unique[ReceiverIndex] = Field(description="Indices of the receivers.")
+        receivers: dict[ReceiverIndex, Body] = Field(
+            min_length=1, description="Body of each receiver, by index.")
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
@@ -39,29 +71,60 @@ class BodyShadowing(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        headed = np.isfinite(view.links.heading_deg)
-        members = frequent_labels(view.links.receiver[headed], MIN_LINKS)
-        return [self.Params(members=members)] if members else []
+        links, found = view.links, {}
+        usable = np.isfinite(links.heading_deg) & np.isfinite(links.level_db)
+        for receiver in frequent_labels(links.receiver[usable], MIN_LINKS):
+            body = _best_body(view, np.flatnonzero((links.receiver == receiver) & usable))
+            if body is not None:
+                found[receiver] = body
+        return [self.Params(receivers=found)] if found else []
 
     @override
-    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
-        psi = np.radians(links.body_azimuth_deg)
-        columns = []
-        for member in params.members:
-            mine = (links.receiver == member) & np.isfinite(psi)
-            columns += [np.where(mine, wave, 0.0) for wave in (np.cos(psi), np.sin(psi))]
-        return Term.of_columns(np.column_stack(columns), PRIOR_SD_DB)
+    def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
+        gain_db = np.zeros(len(links))
+        for receiver, body in params.receivers.items():
+            rows = np.flatnonzero((links.receiver == receiver) & np.isfinite(links.heading_deg))
+            gain_db[rows] = -body.loss_db(_arrivals(links.select(rows)))
+        return gain_db
+
+    @override
+    def variation(self, params: Params) -> Variation:
+        return vary_patterns(params.receivers,
+                             lambda receivers: self.Params(receivers=receivers))
 
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
-        result = {}
-        for member, (front_db, right_db), sd_db in zip(
-                params.members, estimate.coefficients.reshape(-1, 2),
-                estimate.coefficients_sd.reshape(-1, 2).mean(axis=1)):
-            name, size_db = links.receiver_names[member], np.hypot(front_db, right_db)
-            result[f"front_to_back_db[{name}]"] = Parameter.normal(2 * size_db, 2 * sd_db, "dB")
-            result[f"clearest_side_deg[{name}]"] = Parameter.normal(
-                np.degrees(np.arctan2(right_db, front_db)) % 360,
-                np.degrees(sd_db / max(size_db, 0.1)), "deg")
-        return result
+        reported: dict[str, Parameter] = {}
+        bodies_sd = np.reshape(estimate.params_sd, (len(params.receivers), -1))
+        for (receiver, body), sd in zip(params.receivers.items(), bodies_sd, strict=True):
+            for (field, each), field_sd in zip(quantities(body).items(), sd, strict=True):
+                value = getattr(body, field)
+                value = value % 360 if field == "azimuth_deg" else value
+                reported[f"body_{field}[{links.receiver_names[receiver]}]"] = Parameter.normal(
+                    value, field_sd, each["unit"])
+        return reported
+
+
+def _arrivals(links: LinkData) -> np.ndarray:
+    """Return unit vectors (n, 3) towards the devices, along right, nose and top of the receiver."""
+    length_m = np.maximum(np.linalg.norm(links.offset_m, axis=1), 1e-9)
+    return np.einsum("nij,nj->ni", links.receiver_axes, -links.offset_m / length_m[:, None])
+
+
+def _best_body(view: ResidualView, rows: np.ndarray) -> Body | None:
+    """Return the body that fits links best, a level beside it; None if it gains little."""
+    arrival, weight = _arrivals(view.links.select(rows)), view.weight[rows]
+    columns = np.column_stack([np.ones(len(rows)), arrival])
+    moments = columns.T @ (weight * view.residual_db[rows])
+    precision = (columns.T * weight) @ columns
+    steady = np.diag([0.0, *[AMPLITUDE_SD_DB**-2] * 3])
+    level_and_amplitude_db = np.linalg.solve(precision + steady, moments)
+    gain_nats = 0.5 * (moments @ level_and_amplitude_db - moments[0] ** 2 / precision[0, 0])
+    right_db, nose_db, top_db = -level_and_amplitude_db[1:]
+    size_db = float(np.linalg.norm([right_db, nose_db, top_db]))
+    if gain_nats <= MIN_NATS or size_db == 0.0:
+        return None
+    return Body(depth_db=min(2 * size_db, 40.0),
+                azimuth_deg=float(np.degrees(np.arctan2(right_db, nose_db)) % 360),
+                elevation_deg=float(np.degrees(np.arcsin(top_db / size_db))))

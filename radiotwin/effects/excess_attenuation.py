@@ -1,21 +1,30 @@
 """Loss in proportion to distance: gas, rain, haze, or vegetation everywhere.
 
-Specific attenuation γ [dB/km] times path length [km] (ITU-R P.676-13, P.838-3, P.833-10). Its
+Specific attenuation γ [dB/km] times path length [km] (ITU-R P.676-12, P.838-3, P.833-10). Its
 density may fall with height as exp(-z / h), as that of water vapour does (ITU-R P.835-6, Sec. 1.2).
+
+Where the frequency is known, it is bounded by what there is to absorb: humid air and rain of 150
+mm/h at all heights, and woodland everywhere, as far as the profile lies below the tops of trees.
 """
 
 import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
+from radiotwin.effects.atmosphere import max_gas_db_km, max_rain_db_km
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
 from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.effects.vegetation import specific_db_m
 from radiotwin.links import LinkData
 
 PRIOR_SD_DB_KM = 30.0  # wide: heavy rain at 60 GHz is 15 dB/km
 SCALE_HEIGHTS_M = (5000.0, 150.0, 50.0)  # to begin with: the atmosphere, haze, vegetation
 MIN_HEIGHT_M, MAX_HEIGHT_M = 15.0, 5000.0
+TREES_M = 30.0  # height of tall trees
+HEIGHT_SD = 2.0  # of the logarithm of a scale height: a weak prior
+# ITU-R P.833-10 calls its specific attenuations typical: species, density and water differ widely.
+DENSEST = 2.0  # woodland, relative to the typical one
 
 
 class ExcessAttenuation(GainEffect):
@@ -29,10 +38,15 @@ class ExcessAttenuation(GainEffect):
 
         scale_height_m: float = Field(
             ge=1e-3, le=1e9, description="Height over which the density falls to 1/e [m].")
+        frequency_hz: float | None = Field(
+            None, gt=0, le=1e12, description="Of the radio [Hz]; None: unknown, no bound.")
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        return [self.Params(scale_height_m=height_m) for height_m in SCALE_HEIGHTS_M]
+        frequency_hz = view.links.frequency_hz
+        known_hz = float(frequency_hz) if np.isfinite(frequency_hz) else None
+        return [self.Params(scale_height_m=height_m, frequency_hz=known_hz)
+                for height_m in SCALE_HEIGHTS_M]
 
     @override
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
@@ -46,12 +60,26 @@ class ExcessAttenuation(GainEffect):
     def variation(self, params: Params) -> Variation:
         return Variation(np.log([params.scale_height_m]), np.array([0.4]), np.log([MIN_HEIGHT_M]),
                          np.log([MAX_HEIGHT_M]),
-                         lambda numbers: self.Params(scale_height_m=float(np.exp(numbers[0]))))
+                         lambda numbers: params.model_copy(
+                             update={"scale_height_m": float(np.exp(numbers[0]))}))
+
+    @override
+    def neg_log_prior(self, params: Params) -> float:
+        # Receivers that fly at one height do not tell: of profiles that fit alike, the lower one.
+        return 0.5 * (np.log(params.scale_height_m / TREES_M) / HEIGHT_SD) ** 2
 
     @override
     def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
         if coefficients[0] < 0:
             return f"it would have to amplify, by {-coefficients[0]:.1f} dB/km"
+        if params.frequency_hz is None:
+            return None
+        most_db_km = max_at_ground_db_km(params.frequency_hz, params.scale_height_m)
+        if coefficients[0] > most_db_km:
+            return (f"{coefficients[0]:.3g} dB/km at the ground, over a scale height of "
+                    f"{params.scale_height_m:.0f} m, is more than air, rain and woodland take at "
+                    f"{params.frequency_hz / 1e9:g} GHz: {most_db_km:.3g} dB/km (ITU-R P.676, "
+                    "P.838, P.833)")
         return None
 
     @override
@@ -61,3 +89,18 @@ class ExcessAttenuation(GainEffect):
                     estimate.coefficients[0], estimate.coefficients_sd[0], "dB/km"),
                 "scale_height_m": Parameter.log_normal(params.scale_height_m,
                                                        estimate.params_sd[0], "m")}
+
+
+def max_at_ground_db_km(frequency_hz: float, scale_height_m: float) -> float:
+    """Return the most that air, rain and woodland take at the ground [dB/km].
+
+    Woodland takes straight up what trees of `TREES_M` take. A profile stands for it with the share
+    of its density that lies below their tops: one that reaches high is air.
+
+    Args:
+        frequency_hz: of the radio [Hz].
+        scale_height_m: over which the density falls to 1/e [m].
+    """
+    relative = TREES_M / scale_height_m
+    woodland_db_km = 1000 * DENSEST * specific_db_m(frequency_hz) * relative * -np.expm1(-relative)
+    return float(max_gas_db_km(frequency_hz) + max_rain_db_km(frequency_hz) + woodland_db_km)

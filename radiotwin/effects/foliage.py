@@ -1,8 +1,9 @@
 """Vegetation that the map does not show.
 
-Loss of d metres through it: A_m (1 − exp(−γ d / A_m)), which saturates (ITU-R P.833-10, Eq. 1). It
-is located by back-projection. A grove that only links of one device pass cannot be located along
-these links: the box then gives the direction in which it lies.
+Loss of d metres through it: A_m (1 − exp(−γ d / A_m)), which saturates (ITU-R P.833-10, Eq. 1), at
+most at that recommendation's own A_m of the frequency. It is located by back-projection. A grove
+that only links of one device pass cannot be located along these links: the box then gives the
+direction in which it lies.
 """
 
 from typing import Annotated, NamedTuple
@@ -23,6 +24,7 @@ from radiotwin.effects.boxes import (
 )
 from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
 from radiotwin.effects.residual_view import ResidualView
+from radiotwin.effects.vegetation import max_loss_db
 from radiotwin.links import LinkData
 
 MIN_NATS = 6.0  # that a cell must gain to be proposed
@@ -30,7 +32,7 @@ MAX_CELLS = 3  # that are proposed, with each of `SIDES_M`
 SIDES_M = (25.0, 55.0)  # of a proposed box
 MIN_HEIGHT_M, MAX_PROPOSED_HEIGHT_M = 3.0, 26.0  # of tree tops
 LOSSES_DB = (3.0, 6.0, 9.0, 12.0, 16.0, 20.0)  # of a link through it, equally likely
-MAX_LOSS_DB = 25.0  # anything that costs more is not vegetation
+UNKNOWN_MAX_LOSS_DB = 25.0  # where the frequency is unknown: of ITU-R P.833 at 1 GHz
 
 
 class VegetationLoss(NamedTuple):
@@ -59,6 +61,8 @@ class Foliage(GainEffect):
 
         box: Box = Field(description="Up to the tree tops.")
         law: VegetationLoss = Field(VegetationLoss(), description="Loss over the metres inside.")
+        ceiling_db: float = Field(UNKNOWN_MAX_LOSS_DB, gt=0, le=1000, description=(
+            "Greatest loss of vegetation at the frequency [dB]; what costs more is none."))
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
@@ -67,7 +71,11 @@ class Foliage(GainEffect):
         centres_m, total = back_project(links.device_m[links.device], links.receiver_m, nats)
         allowed = [i for i, height_m in enumerate(HEIGHTS_M)
                    if MIN_HEIGHT_M <= height_m <= MAX_PROPOSED_HEIGHT_M]
-        return [self.Params(box=Box(x_m, y_m, side_m, side_m, HEIGHTS_M[allowed[height]], 0.0))
+        ceiling_db = (max_loss_db(links.frequency_hz) if np.isfinite(links.frequency_hz)
+                      else UNKNOWN_MAX_LOSS_DB)
+        law = VegetationLoss(max_db=min(VegetationLoss().max_db, ceiling_db))
+        return [self.Params(box=Box(x_m, y_m, side_m, side_m, HEIGHTS_M[allowed[height]], 0.0),
+                            law=law, ceiling_db=ceiling_db)
                 for (x_m, y_m), height, gain in best_cells(centres_m, total[:, allowed], MAX_CELLS)
                 if gain > MIN_NATS for side_m in SIDES_M]
 
@@ -80,14 +88,17 @@ class Foliage(GainEffect):
     @override
     def variation(self, params: Params) -> Variation:
         x_m, y_m = params.box[:2]
-        low = [x_m - 80, y_m - 80, 5.0, 5.0, MIN_HEIGHT_M, -90.0, np.log(0.05), np.log(3.0)]
-        high = [x_m + 80, y_m + 80, 200.0, 200.0, 30.0, 90.0, np.log(5.0), np.log(MAX_LOSS_DB)]
+        low = [x_m - 80, y_m - 80, 5.0, 5.0, MIN_HEIGHT_M, -90.0, np.log(0.05),
+               np.log(min(3.0, params.ceiling_db))]
+        high = [x_m + 80, y_m + 80, 200.0, 200.0, 30.0, 90.0, np.log(5.0),
+                np.log(params.ceiling_db)]
         return Variation(
             np.array([*params.box, *np.log(params.law)]),
             np.array([CELL_M, CELL_M, 12.0, 12.0, 3.0, 20.0, 0.4, 0.3]),
             np.array(low), np.array(high),
-            lambda numbers: self.Params(box=Box(*numbers[:6].tolist()),
-                                        law=VegetationLoss(*np.exp(numbers[6:]).tolist())))
+            lambda numbers: params.model_copy(update={
+                "box": Box(*numbers[:6].tolist()),
+                "law": VegetationLoss(*np.exp(numbers[6:]).tolist())}))
 
     @override
     def parameters(self, links: LinkData, params: Params,

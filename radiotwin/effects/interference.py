@@ -2,7 +2,8 @@
 
 Powers of signal and interference add (ITU-R SM.1753), and that of the emitter falls by the
 free-space law, 20 log10 d (ITU-R P.525). It depends on the receiver's position only. The emitter is
-assumed to be near the ground.
+assumed to be near the ground. Where there is a 3D map, receivers that it does not see get less, by
+a loss that is fitted.
 """
 
 from collections.abc import Sequence
@@ -11,6 +12,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
+from radiotwin.channel.segmented_log_distance import NLOS_LOSS_DB, NLOS_LOSS_SD_DB
 from radiotwin.effects.arrays import subsample
 from radiotwin.effects.base import ReceiverEffect
 from radiotwin.effects.params import Decibels, EffectParams, Estimate, Metres, Parameter, Variation
@@ -28,6 +30,7 @@ QUANTILES = (0.05, 0.2, 0.4, 0.6, 0.8)  # of the readings, tried as the emitter'
 MAX_LINKS = 2000  # that the search looks at
 MAX_PROPOSALS, APART_M = 2, 60.0  # and their distance from each other
 MIN_NATS = 4.0  # that an emitter must gain to be proposed
+MAX_HIDDEN_LOSS_DB = 60.0  # behind buildings
 
 
 class Interference(ReceiverEffect):
@@ -44,6 +47,8 @@ class Interference(ReceiverEffect):
         level_db: Decibels = Field(description="Its level at a distance of 100 m [dB].")
         within_m: tuple[Metres, Metres, Metres, Metres] = Field(
             description="Least x and y, and greatest x and y, of the searched area [m].")
+        hidden_loss_db: float | None = Field(None, ge=0, le=1000, description=(
+            "Loss where buildings hide it [dB]; None: it was found without a 3D map."))
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
@@ -61,6 +66,9 @@ class Interference(ReceiverEffect):
         step_m = max(MIN_CELL_M, float(np.sqrt(np.prod(high - low) / MAX_CELLS)))
         axes = (np.arange(a, b, step_m) for a, b in zip(low, high))
         positions_m = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+        if links.city is not None:
+            height_m = np.full(len(positions_m), HEIGHT_M)
+            positions_m = positions_m[~links.city.inside(np.column_stack([positions_m, height_m]))]
         levels_db = np.nanquantile(links.level_db, QUANTILES)
         rows = subsample(np.arange(len(links)), MAX_LINKS)
         nats = _gains(view, rows, positions_m, levels_db) * len(links) / len(rows)
@@ -72,12 +80,14 @@ class Interference(ReceiverEffect):
             if all(np.hypot(*(position_m - other.place_m)) > APART_M for other in found):
                 found.append(self.Params(place_m=tuple(position_m.tolist()),
                                          level_db=float(levels_db[nats[number].argmax()]),
-                                         within_m=(*low.tolist(), *high.tolist())))
+                                         within_m=(*low.tolist(), *high.tolist()),
+                                         hidden_loss_db=_hidden_loss_db(links)))
         return found
 
     @override
     def inputs(self, links: LinkData, params: Params) -> np.ndarray:
-        return np.exp(interference_db(links.receiver_m, params.place_m, params.level_db) * NEPERS)
+        return np.exp(_arriving_db(links, params.place_m, params.level_db, params.hidden_loss_db)
+                      * NEPERS)
 
     @override
     def response(self, level_db: np.ndarray, params: Params,
@@ -86,13 +96,25 @@ class Interference(ReceiverEffect):
 
     @override
     def variation(self, params: Params) -> Variation:
-        level_db = params.level_db
-        return Variation(
-            np.array([*params.place_m, level_db]), np.array([20.0, 20.0, 3.0]),
-            np.array([*params.within_m[:2], level_db - 40]),
-            np.array([*params.within_m[2:], level_db + 40]),
-            lambda numbers: params.model_copy(update={"place_m": tuple(numbers[:2].tolist()),
-                                                      "level_db": float(numbers[2])}))
+        level_db, hidden_db = params.level_db, params.hidden_loss_db
+        values = np.array([*params.place_m, level_db, hidden_db or 0.0])
+        steps = np.array([20.0, 20.0, 3.0, 5.0])
+        low = np.array([*params.within_m[:2], level_db - 40, 0.0])
+        high = np.array([*params.within_m[2:], level_db + 40, MAX_HIDDEN_LOSS_DB])
+        count = 3 if hidden_db is None else 4
+
+        def changed(numbers: np.ndarray) -> Interference.Params:
+            x_m, y_m, level_db, *hidden = numbers.tolist()
+            return params.model_copy(update={"place_m": (x_m, y_m), "level_db": level_db,
+                                             "hidden_loss_db": hidden[0] if hidden else None})
+
+        return Variation(values[:count], steps[:count], low[:count], high[:count], changed)
+
+    @override
+    def neg_log_prior(self, params: Params) -> float:
+        if params.hidden_loss_db is None:
+            return 0.0
+        return 0.5 * ((params.hidden_loss_db - NLOS_LOSS_DB) / NLOS_LOSS_SD_DB) ** 2
 
     @override
     def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
@@ -105,9 +127,9 @@ class Interference(ReceiverEffect):
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
-        names = "x_m", "y_m", f"level_at_{REFERENCE_M:.0f}_m"
-        units = "m", "m", "dB" if links.is_gain else "dBm"
-        values = *params.place_m, params.level_db
+        names = "x_m", "y_m", f"level_at_{REFERENCE_M:.0f}_m", "hidden_loss_db"
+        units = "m", "m", "dB" if links.is_gain else "dBm", "dB"
+        values = self.variation(params).values.tolist()
         return {name: Parameter.normal(value, sd, unit)
                 for name, value, sd, unit in zip(names, values, estimate.params_sd, units)}
 
@@ -126,6 +148,21 @@ def interference_db(receiver_m: np.ndarray, position_m: Sequence[float] | np.nda
     """
     distance_m = np.linalg.norm(receiver_m - [*position_m, HEIGHT_M], axis=1)
     return level_db - 20 * np.log10(np.maximum(distance_m, 1.0) / REFERENCE_M)
+
+
+def _hidden_loss_db(links: LinkData) -> float | None:
+    """Return the loss behind buildings that a search begins with [dB]; None without a map."""
+    return None if links.city is None else NLOS_LOSS_DB
+
+
+def _arriving_db(links: LinkData, position_m: Sequence[float] | np.ndarray, level_db: float,
+                 hidden_loss_db: float | None) -> np.ndarray:
+    """Return the level (n,) of an emitter at the receivers, behind buildings less [dB]."""
+    arriving_db = interference_db(links.receiver_m, position_m, level_db)
+    if hidden_loss_db is None or links.city is None:
+        return arriving_db
+    seen = links.city.line_of_sight(np.array([*position_m, HEIGHT_M]), links.receiver_m)
+    return np.where(seen, arriving_db, arriving_db - hidden_loss_db)
 
 
 def _gains(view: ResidualView, rows: np.ndarray, positions_m: np.ndarray,
@@ -154,7 +191,7 @@ def _gains(view: ResidualView, rows: np.ndarray, positions_m: np.ndarray,
     target = target - basis @ (basis.T @ target)
     nats = np.empty((len(positions_m), len(levels_db)))
     for number, position_m in enumerate(positions_m):
-        power_db = interference_db(part.receiver_m, position_m, 0.0) + levels_db[:, None]
+        power_db = _arriving_db(part, position_m, 0.0, _hidden_loss_db(part)) + levels_db[:, None]
         rise_db = root * 10 * np.log10(1 + 10 ** ((power_db - view.mean_db[rows]) / 10))
         rise_db = rise_db - (rise_db @ basis) @ basis.T
         nats[number] = rise_db @ target - 0.5 * (rise_db**2).sum(axis=1)

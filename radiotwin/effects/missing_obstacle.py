@@ -38,7 +38,7 @@ from radiotwin.effects.params import (
 )
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.links import LinkData
-from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.citymap import CONCRETE, CityMap
 
 MIN_NATS = 6.0  # that a cell must gain to be proposed
 MAX_PROPOSALS = 4
@@ -167,5 +167,7 @@ def _with_box(city: CityMap, box: Box) -> CityMap:
     pose = trimesh.transformations.rotation_matrix(np.radians(box.turn_deg), (0, 0, 1))
     pose[:3, 3] = box.x_m, box.y_m, 0.5 * box.height_m
     mesh = trimesh.creation.box((box.length_m, box.width_m, box.height_m), pose)
+    material = np.concatenate([city.material, np.full(len(mesh.faces), len(city.materials))])
     return CityMap(np.vstack([city.vertices, mesh.vertices]),
-                   np.vstack([city.faces, mesh.faces + len(city.vertices)]))
+                   np.vstack([city.faces, mesh.faces + len(city.vertices)]),
+                   (*city.materials, CONCRETE), material)

@@ -91,8 +91,8 @@ class WallReflection(_Paths):
 
 
 class Diffraction(_Paths):
-    """Paths over one roof edge or round one corner, also with bounces; relative to theory."""
+    """Paths over one or two roof edges or round corners, also with bounces; relative to theory."""
 
     name = "diffraction"
-    kinds = ("diffracted", "reflected_diffracted")
+    kinds = ("diffracted", "reflected_diffracted", "diffracted_2")
     confused_with = ("wall_reflection",)

@@ -6,6 +6,7 @@ A package adds effects under the entry-point group `radiotwin.effects`; a script
 
 from radiotwin.effects.base import Effect
 from radiotwin.effects.body_shadowing import BodyShadowing
+from radiotwin.effects.building_entry import BuildingEntry
 from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.detection_limit import DetectionLimit
 from radiotwin.effects.excess_attenuation import ExcessAttenuation
@@ -31,7 +32,8 @@ BUILT_IN: tuple[type[Effect], ...] = (
     DeviceGainOffset, ReceiverGainOffset, DeviceDrift, ReceiverDrift, ReceiverSaturation,
     NoiseFloor, DetectionLimit, SectorAntenna, TiltedDipole, BodyShadowing, ExcessAttenuation,
     DevicePositionError, ReceiverPositionError, ReceiverClockOffset, MissingObstacle,
-    RemovedObstacle, Foliage, WallReflection, Diffraction, GroundReflection, Interference, LockLoss)
+    RemovedObstacle, BuildingEntry, Foliage, WallReflection, Diffraction, GroundReflection,
+    Interference, LockLoss)
 
 _registered: list[type[Effect]] = []
 
@@ -68,11 +70,15 @@ def effect_named(name: str, variant: str) -> Effect:
     """Return a new instance of an effect.
 
     Raises:
-        BadInput: no such effect is installed.
+        BadInput: no such effect is installed, or one that describes the same otherwise.
     """
-    for effect in catalogue():
-        if (effect.name, effect.variant) == (name, variant):
+    named = [effect for effect in catalogue() if effect.name == name]
+    for effect in named:
+        if effect.variant == variant:
             return effect()
+    if named:
+        raise BadInput(f"the twin has the effect {name!r} as another version of radiotwin "
+                       "described it, with other parameters; run `radiotwin close-loop` again")
     known = ", ".join(sorted({effect.name for effect in catalogue()}))
     raise BadInput(f"the twin has the effect {name[:60]!r} ({variant[:60]!r}), which this version "
                    f"of radiotwin does not know; it knows {known}; an effect of a package's own "

@@ -146,5 +146,5 @@ def _without(city: CityMap, building: int) -> tuple[CityMap, Box]:
     corners_m = city.vertices[city.faces[mine]].reshape(-1, 3)
     low_m, high_m = corners_m.min(axis=0), corners_m.max(axis=0)
     (x_m, y_m, _), (length_m, width_m, _) = (low_m + high_m) / 2, high_m - low_m
-    return (CityMap(city.vertices, city.faces[~mine]),
+    return (city.without(mine),
             Box(x_m, y_m, length_m, width_m, high_m[2], 0.0))

@@ -91,9 +91,10 @@ def _off_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
             "give measurements and scene in one frame, in metres; "
             "feet and degrees are not converted")
     return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}: do measurements and "
-            "scene share one frame and unit?"
-            for odd, where in ((inside, "inside a building"), (outside, "outside the 3D map"))
-            if odd.any()]
+            f"scene share one frame and unit?{otherwise}"
+            for odd, where, otherwise in (
+                (inside, "inside a building", " If they do, it is indoors (see building_entry)"),
+                (outside, "outside the 3D map", "")) if odd.any()]
 
 
 def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,

@@ -1,6 +1,5 @@
 """Sequences of interactions that are tried from one device."""
 
-from collections.abc import Iterator
 from functools import lru_cache
 
 import numpy as np
@@ -11,12 +10,14 @@ from radiotwin.paths.images import Candidates
 from radiotwin.paths.shooting import FacetSequences, device_sequences, edge_sequences
 from radiotwin.paths.surfaces import OFFSET, pack
 from radiotwin.paths.topology import build_topology, expand
+from radiotwin.paths.two_edges import FacetEdges
+from radiotwin.paths.ways import open_ways, with_facets_after
 from radiotwin.scene.citymap import CityMap
 
-MAX_AFTER_EDGE = 1  # reflections; a second one would double the time for 0.01 dB
+EDGE_CHUNK = 500  # edges at once whose surroundings are searched: about 100 MB
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=12)  # a map and those with errors that stand beside it
 def candidate_search(city: CityMap, depth: int) -> "CandidateSearch":
     """Return the search of a city, made once: it keeps the surroundings of edges it has seen."""
     return CandidateSearch(city, depth)
@@ -34,6 +35,7 @@ class CandidateSearch:
         edges: of the city.
         surfaces: both, for compiled code.
         ground: row of the ground in `surfaces.planes`.
+        facet_edges: edges at each facet.
     """
 
     def __init__(self, city: CityMap, depth: int) -> None:
@@ -43,13 +45,13 @@ class CandidateSearch:
         self.surfaces = pack(self.facets, self.edges)
         self.ground = len(self.facets)
         self._city, self._depth = city, depth
-        self._after = min(MAX_AFTER_EDGE, depth - 1)
-        self._from_edge: dict[int, FacetSequences] = {}
+        self._after = np.empty((0, depth - 1), dtype=int)
+        self._first_after, self._end_after = np.full((2, len(self.edges)), -1)
         facet = self.edges.facet.ravel()
         edge = np.repeat(np.arange(len(self.edges)), 2)
         order = np.lexsort((edge, facet))
-        self._edge_of_facet = edge[order]
-        self._first_edge = np.searchsorted(facet[order], np.arange(len(self.facets) + 2))
+        self.facet_edges = FacetEdges(self.facets.of_face, edge[order], np.searchsorted(
+            facet[order], np.arange(len(self.facets) + 2)))
 
     def candidates(self, device_m: np.ndarray) -> Candidates:
         """Find the sequences from a device, those without an edge first.
@@ -67,28 +69,14 @@ class CandidateSearch:
         single[:, 0] = facing
         reflections = np.unique(np.concatenate([sequences.facets[sequences.order > 0], single]),
                                 axis=0)
-        none = np.full((len(reflections), max(self._after, 1)), -1)
-        over_edges = self._over_edges(*self._to_edges(sequences, facing))
-        rows = [(reflections, none[:, 0], none), *over_edges]
-        before, edge, after = (np.concatenate(part) for part in zip(*rows))
-        interactions = (before >= 0).sum(axis=1) + (edge >= 0) + (after >= 0).sum(axis=1)
-        keep = interactions <= self._depth
-        return Candidates(np.ascontiguousarray(before[keep]), edge[keep],
-                          np.ascontiguousarray(after[keep]))
-
-    def _over_edges(
-        self, before: np.ndarray, edge: np.ndarray
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Combine each sequence up to an edge with each sequence after that edge."""
-        seen = [self._sequences_from_edge(row) for row in edge]
-        for order in range(self._after + 1):
-            after = [sequences.facets[sequences.order == order] for sequences in seen]
-            repeats = [len(part) for part in after]
-            if sum(repeats):
-                facets = np.concatenate(after)
-                padded = np.full((len(facets), max(self._after, 1)), -1)
-                padded[:, :facets.shape[1]] = facets
-                yield np.repeat(before, repeats, axis=0), np.repeat(edge, repeats), padded
+        ways = open_ways(self._city, self.surfaces, *self._to_edges(sequences, facing), device_m)
+        self._look_around(np.unique(ways.edge[self._first_after[ways.edge] < 0]))
+        way, row = with_facets_after(self.surfaces, ways, self._first_after, self._end_after,
+                                     self._after, self._depth)
+        none = np.full((len(reflections), self._depth), -1)
+        return Candidates(np.concatenate([reflections, ways.before[way]]),
+                          np.concatenate([none[:, 0], ways.edge[way]]),
+                          np.concatenate([none[:, 1:], self._after[row]]))
 
     def _to_edges(
         self, sequences: FacetSequences, facing: np.ndarray
@@ -98,14 +86,20 @@ class CandidateSearch:
         reflected = sequences.next_facets[sequences.next_facets[:, 0] > 0]
         pairs = np.concatenate([direct, reflected])
         pairs = pairs[sequences.order[pairs[:, 0]] < self._depth]
-        first = self._first_edge[pairs[:, 1]]
-        row, within = expand(self._first_edge[pairs[:, 1] + 1] - first)
-        both = np.unique(np.column_stack([pairs[row, 0], self._edge_of_facet[first[row] + within]]),
-                         axis=0)
+        first = self.facet_edges.first[pairs[:, 1]]
+        row, within = expand(self.facet_edges.first[pairs[:, 1] + 1] - first)
+        edge = self.facet_edges.edge[first[row] + within]
+        both = np.unique(np.column_stack([pairs[row, 0], edge]), axis=0)
         return sequences.facets[both[:, 0]], both[:, 1]
 
-    def _sequences_from_edge(self, edge: int) -> FacetSequences:
-        if edge not in self._from_edge:
-            self._from_edge[edge] = edge_sequences(
-                self._city, self.facets, self.surfaces.planes[:, :3], self.edges, edge, self._after)
-        return self._from_edge[edge]
+    def _look_around(self, edges: np.ndarray) -> None:
+        """Find the sequences of facets after edges (n,)."""
+        for start in range(0, len(edges), EDGE_CHUNK):
+            part = edges[start:start + EDGE_CHUNK]
+            found = edge_sequences(self._city, self.facets, self.surfaces.planes[:, :3],
+                                   self.edges, part, self._depth - 1)
+            order = np.argsort(found.source, kind="stable")
+            bounds = np.searchsorted(found.source[order], np.arange(len(part) + 1))
+            self._first_after[part] = len(self._after) + bounds[:-1]
+            self._end_after[part] = len(self._after) + bounds[1:]
+            self._after = np.concatenate([self._after, found.facets[order]])

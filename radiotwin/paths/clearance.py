@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 from radiotwin.paths.images import Candidates, PathBuffer, sequence_length
-from radiotwin.paths.surfaces import NORMAL_0, NORMAL_N, Surfaces
+from radiotwin.paths.surfaces import NORMAL, NORMAL_0, NORMAL_N, Surfaces
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
 
@@ -44,18 +44,26 @@ def _move_off_surfaces(
     surfaces: Surfaces, candidates: Candidates, buffer: PathBuffer, skin_m: float,
     points_m: np.ndarray,
 ) -> None:
+    planes, edges = surfaces.planes, surfaces.edges
     for path in range(len(points_m)):
         row, last = buffer.candidate[path], buffer.count[path] - 1
         before = sequence_length(candidates.before, row)
-        points_m[path] = buffer.points_m[path]
-        for k in range(1, last):
-            if k == before + 1:
+        for k in range(last + 1):
+            x = y = z = 0.0
+            if k == 0 or k == last:
+                pass
+            elif k == before + 1:
                 edge = candidates.edge[row]
-                outward = surfaces.edges[edge, NORMAL_0:NORMAL_0 + 3] \
-                    + surfaces.edges[edge, NORMAL_N:NORMAL_N + 3]
-                outward /= np.sqrt((outward ** 2).sum())
-            elif k <= before:
-                outward = surfaces.planes[candidates.before[row, k - 1], :3]
+                x = edges[edge, NORMAL_0] + edges[edge, NORMAL_N]
+                y = edges[edge, NORMAL_0 + 1] + edges[edge, NORMAL_N + 1]
+                z = edges[edge, NORMAL_0 + 2] + edges[edge, NORMAL_N + 2]
+                size = np.sqrt(x * x + y * y + z * z)
+                x, y, z = x / size, y / size, z / size
             else:
-                outward = surfaces.planes[candidates.after[row, k - before - 2], :3]
-            points_m[path, k] += skin_m * outward
+                facet = candidates.before[row, k - 1] if k <= before \
+                    else candidates.after[row, k - before - 2]
+                x, y, z = planes[facet, NORMAL], planes[facet, NORMAL + 1], \
+                    planes[facet, NORMAL + 2]
+            points_m[path, k, 0] = buffer.points_m[path, k, 0] + skin_m * x
+            points_m[path, k, 1] = buffer.points_m[path, k, 1] + skin_m * y
+            points_m[path, k, 2] = buffer.points_m[path, k, 2] + skin_m * z

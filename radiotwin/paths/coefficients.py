@@ -1,46 +1,78 @@
 """Reflection coefficients of surfaces and diffraction coefficients of edges.
 
-A wall is a half space of one dielectric [1]. An edge is a wedge in the uniform theory of
-diffraction [2] with Luebbers' heuristic for faces that are not conductors [3]. The knife edge of
-ITU-R P.526 is not used: it has neither the angle of the wedge nor its material nor the
-polarisation, and it holds close to the shadow boundary only.
+A surface is a slab of one dielectric, of the thickness that its material declares [1]: behind a
+thin wall is air again, which reflects, too. What a rough surface scatters is missing from its
+reflection: with the scattering coefficient S the field is sqrt(1 - S²) times as strong [5].
 
-Luebbers takes the angles of reflection at the faces from the incident ray, so that his
-coefficient changes when the two ends are swapped. Here the smaller of the angles of the incident
-and the diffracted ray to each face is taken. It is the same at the reflection boundaries and in
-the shadow behind a lit face, for which he gave it, and it is reciprocal everywhere.
+An edge is a wedge in the uniform theory of diffraction [2]. For faces that are not conductors there
+are heuristics only, which differ by many decibels away from the boundaries of shadow and
+reflection. There are two here:
 
-[1] Recommendation ITU-R P.2040-3, "Effects of building materials and structures on radiowave
-    propagation above about 100 MHz", 2023: Table 3.
+- Luebbers' [3] multiplies the two terms of the reflection boundaries by the reflection at the
+  face. He takes the angles of reflection from the incident ray, so that his coefficient changes
+  when the two ends are swapped. Here the smaller of the angles of the incident and the diffracted
+  ray to each face is taken. It is the same at the reflection boundaries and in the shadow behind a
+  lit face, for which he gave it, and it is reciprocal everywhere. For conductors it is exact.
+- Sionna RT's [6] multiplies all four terms by the reflection of the incident ray at one of the
+  faces, or by -1 where that face lies in the shadow. It is not reciprocal, and for a conductor not
+  that of [2] for the field across the edge, except near the boundaries.
+
+The knife edge of ITU-R P.526 is not used: it has neither the angle of the wedge nor its material
+nor the polarisation, and it holds close to the shadow boundary only.
+
+[1] Recommendation ITU-R P.2040-4, "Effects of building materials and structures on radiowave
+    propagation above about 100 MHz", 2025: section 2.2.2 and Table 3.
 [2] Kouyoumjian and Pathak, "A uniform geometrical theory of diffraction for an edge in a perfectly
     conducting surface", Proc. IEEE 62(11), 1974: eq. 25-29 and 33.
 [3] Luebbers, "Finite conductivity uniform GTD versus knife edge diffraction in prediction of
     propagation path loss", IEEE Trans. Antennas Propag. 32(1), 1984.
 [4] Balanis, "Advanced Engineering Electromagnetics", 2nd ed., 2012: section 5.3.
+[5] Degli-Esposti et al., "Measurement and modelling of scattering from buildings", IEEE Trans.
+    Antennas Propag. 55(1), 2007: eq. 2.
+[6] Aït Aoudia et al., "Sionna RT: Technical Report", arXiv:2504.21719, 2025, in the form of Sionna
+    RT 2.2, which names Hashimoto et al. as its source.
 """
+
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
+from scipy.constants import speed_of_light
 
-from radiotwin.scene.materials import ITU_TABLE
+from radiotwin.scene.materials import Material, constants
 
 VACUUM_PERMITTIVITY_F_M = 8.8541878128e-12  # [F/m], CODATA 2018
+MIN_SINE = 1e-9  # of the angle between ray and surface; -1 is the limit of all coefficients at 0
 
 
-def concrete_permittivity(frequency_hz: float) -> complex:
-    """Return the complex relative permittivity of concrete [1].
+class Slabs(NamedTuple):
+    """Materials of a city at one frequency, that of the ground after the last one.
 
-    The power law of the table holds from 1 to 100 GHz and is extrapolated outside this range.
+    Attributes:
+        permittivity: (m,) complex relative permittivities, for fields that vary as exp(+j ω t).
+        phase_rad: (m,) thickness times wave number in vacuum [rad].
+        specular: (m,) field that is left to the reflection over that of a smooth surface.
+    """
+
+    permittivity: np.ndarray
+    phase_rad: np.ndarray
+    specular: np.ndarray
+
+
+def slabs_of(materials: Sequence[Material], frequency_hz: float) -> Slabs:
+    """Return materials at a frequency; outside ITU's ranges as `materials.constants` says.
 
     Args:
+        materials: m materials; of a city that of the ground last, see `CityMap.ground_material`.
         frequency_hz: frequency [Hz].
-
-    Returns:
-        The permittivity for fields that vary as exp(+j ω t).
     """
-    _, _, real, _, c, d = ITU_TABLE["concrete"][0]
-    conductivity_s_m = c * (frequency_hz / 1e9) ** d
-    return complex(real, -conductivity_s_m / (2 * np.pi * frequency_hz * VACUUM_PERMITTIVITY_F_M))
+    angular = 2 * np.pi * frequency_hz
+    real, conductivity_s_m, _ = np.array([constants(each, frequency_hz) for each in materials]).T
+    thickness_m, scattering = np.array([(each.thickness_m, each.scattering_coefficient)
+                                        for each in materials]).T
+    return Slabs(real - 1j * conductivity_s_m / (angular * VACUUM_PERMITTIVITY_F_M),
+                 angular / speed_of_light * thickness_m, np.sqrt(1 - scattering**2))
 
 
 @njit(cache=True)
@@ -58,6 +90,29 @@ def fresnel(sine: float, permittivity: complex) -> tuple[complex, complex]:
     root = np.sqrt(permittivity - (1.0 - sine * sine) + 0j)
     te = (sine - root) / (sine + root)
     return te, (permittivity * sine - root) / (permittivity * sine + root)
+
+
+@njit(cache=True)
+def reflection(sine: float, slabs: Slabs, row: int) -> tuple[complex, complex]:
+    """Return the reflection coefficients of a slab in air [1, eq. 43a and 44].
+
+    Args:
+        sine: sine of the angle between ray and surface.
+        slabs: materials.
+        row: of the slab's material.
+
+    Returns:
+        The coefficients across (TE) and in (TM) the plane of incidence, with the signs of
+        `fresnel`, without what is scattered.
+    """
+    sine = max(sine, MIN_SINE)
+    permittivity = slabs.permittivity[row]
+    te, tm = fresnel(sine, permittivity)
+    root = np.sqrt(permittivity - (1.0 - sine * sine) + 0j)
+    there_and_back = np.exp(-2j * slabs.phase_rad[row] * root)
+    rest = slabs.specular[row] * (1.0 - there_and_back)
+    return (te * rest / (1.0 - te * te * there_and_back),
+            tm * rest / (1.0 - tm * tm * there_and_back))
 
 
 @njit(cache=True)
@@ -92,9 +147,35 @@ def _fresnel_tail(a: float) -> complex:
 
 
 @njit(cache=True)
+def wedge_terms(
+    phi: float, phi_in: float, sine_edge: float, distance_m: float, wave_number: float, n: float
+) -> tuple[complex, complex]:
+    """Return the diffraction coefficients of a wedge, parted by its faces [2, eq. 25-28, 3].
+
+    Args:
+        phi: angle of the diffracted ray from face 0, across the edge [rad], 0 to n π.
+        phi_in: the same angle of the incident ray.
+        sine_edge: sine of the angle between ray and edge.
+        distance_m: s s' sin² / (s + s') of the distances s' before and s after the edge [m].
+        wave_number: 2 π / wavelength [1/m].
+        n: exterior angle of the wedge divided by π.
+
+    Returns:
+        The parts [√m] that the reflections at face 0 and at face n multiply; -1 of the sum is the
+        soft coefficient of a perfect conductor.
+    """
+    x = wave_number * distance_m
+    scale = -np.exp(-0.25j * np.pi) / (2.0 * n * np.sqrt(2.0 * np.pi * wave_number) * sine_edge)
+    return (scale * (_cotangent_term(phi - phi_in, x, n, 1)
+                     - _cotangent_term(phi + phi_in, x, n, -1)),
+            scale * (_cotangent_term(phi - phi_in, x, n, -1)
+                     - _cotangent_term(phi + phi_in, x, n, 1)))
+
+
+@njit(cache=True)
 def wedge_coefficients(
     phi: float, phi_in: float, sine_edge: float, distance_m: float, wave_number: float, n: float,
-    permittivity: complex,
+    face_0: tuple[complex, complex], face_n: tuple[complex, complex],
 ) -> tuple[complex, complex]:
     """Return the diffraction coefficients of a wedge [2, eq. 25-28, 3].
 
@@ -105,18 +186,15 @@ def wedge_coefficients(
         distance_m: s s' sin² / (s + s') of the distances s' before and s after the edge [m].
         wave_number: 2 π / wavelength [1/m].
         n: exterior angle of the wedge divided by π.
-        permittivity: of both faces; an infinite real part stands for a perfect conductor.
+        face_0: reflection coefficients (TE and TM) of face 0 at the first of `face_sines`; -1 and 1
+            stand for a perfect conductor.
+        face_n: those of face n at the second.
 
     Returns:
         The coefficients for the field along (soft) and across (hard) the edge [√m].
     """
-    sine_0 = sine_edge * abs(np.sin(min(phi, phi_in)))
-    sine_n = sine_edge * abs(np.sin(n * np.pi - max(phi, phi_in)))
-    if np.isinf(permittivity.real):
-        soft_0, soft_n, hard_0, hard_n = -1.0 + 0j, -1.0 + 0j, 1.0 + 0j, 1.0 + 0j
-    else:
-        soft_0, hard_0 = fresnel(sine_0, permittivity)
-        soft_n, hard_n = fresnel(sine_n, permittivity)
+    soft_0, hard_0 = face_0
+    soft_n, hard_n = face_n
     x = wave_number * distance_m
     incident = _cotangent_term(phi - phi_in, x, n, 1) + _cotangent_term(phi - phi_in, x, n, -1)
     at_n = _cotangent_term(phi + phi_in, x, n, 1)
@@ -124,6 +202,20 @@ def wedge_coefficients(
     scale = -np.exp(-0.25j * np.pi) / (2.0 * n * np.sqrt(2.0 * np.pi * wave_number) * sine_edge)
     return (scale * (incident + soft_n * at_n + soft_0 * at_0),
             scale * (incident + hard_n * at_n + hard_0 * at_0))
+
+
+@njit(cache=True)
+def face_sines(phi: float, phi_in: float, sine_edge: float, n: float) -> tuple[float, float]:
+    """Return the sines of the angles at which faces 0 and n reflect, see the head of this module.
+
+    Args:
+        phi: as of `wedge_coefficients`, like the others.
+        phi_in: angle of the incident ray [rad].
+        sine_edge: sine of the angle between ray and edge.
+        n: exterior angle of the wedge divided by π.
+    """
+    return (sine_edge * abs(np.sin(min(phi, phi_in))),
+            sine_edge * abs(np.sin(n * np.pi - max(phi, phi_in))))
 
 
 @njit(cache=True)

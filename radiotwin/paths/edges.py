@@ -1,5 +1,9 @@
 """Edges of a city that diffract: roof edges and corners of buildings.
 
+Faces of two materials form no edge. In Sionna RT, whose gains are the truth here, they belong to
+two meshes, and no ray is diffracted where two meshes meet; `build-scene --material` gives a
+building one material where its roof is to diffract.
+
 Around a segment the triangles that meet there are sorted by angle; an open sector of more than
 180 degrees between two of them is a wedge. This also holds where several buildings touch: a shared
 wall that is built over leaves no wedge.
@@ -12,7 +16,7 @@ from numba import njit
 
 from radiotwin.paths.facets import COPLANAR_M, Facets, extract_facets
 from radiotwin.paths.topology import Topology, build_topology
-from radiotwin.paths.vectors import cross
+from radiotwin.paths.vectors import cross, dot
 from radiotwin.scene.citymap import CityMap
 
 
@@ -75,7 +79,8 @@ def extract_edges(
                     topology.owner, topology.group, np.pi + 0.1)
     segment = topology.segments[found[:, 0]]
     pair = np.sort(facets.of_face[topology.source[found[:, 1:]]], axis=1)
-    keep = pair[:, 0] != pair[:, 1]
+    keep = (pair[:, 0] != pair[:, 1]) \
+        & (facets.material[pair[:, 0]] == facets.material[pair[:, 1]])
     start_m, end_m, pair = _join(topology.vertices_m[segment[keep]], pair[keep])
     direction = end_m - start_m
     direction /= np.maximum(np.linalg.norm(direction, axis=1), 1e-12)[:, None]
@@ -97,28 +102,40 @@ def _tangent(direction: np.ndarray, normal: np.ndarray, other: np.ndarray) -> np
 
 def _join(ends_m: np.ndarray, pair: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Join consecutive pieces between the same two facets; return starts, ends and facets."""
-    if not len(pair):
-        return np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 2), dtype=int)
     order = np.lexsort((pair[:, 1], pair[:, 0]))
     ends_m, pair = ends_m[order], pair[order]
-    begins = np.flatnonzero(np.append(True, (pair[1:] != pair[:-1]).any(axis=1)))
-    start_m, end_m, joined = [], [], []
-    for a, b in zip(begins, np.append(begins[1:], len(pair))):
-        pieces = ends_m[a:b]
-        longest = pieces[np.argmax(np.linalg.norm(pieces[:, 1] - pieces[:, 0], axis=1))]
-        along = (longest[1] - longest[0]) / np.linalg.norm(longest[1] - longest[0])
-        at_m = np.sort(pieces @ along, axis=1)
-        flip = (pieces[:, 0] @ along) > (pieces[:, 1] @ along)
-        pieces = np.where(flip[:, None, None], pieces[:, ::-1], pieces)
-        by_start = np.argsort(at_m[:, 0], kind="stable")
-        pieces, at_m = pieces[by_start], at_m[by_start]
-        reached_m = np.maximum.accumulate(at_m[:, 1])[:-1]
-        breaks = np.flatnonzero(at_m[1:, 0] > reached_m + COPLANAR_M) + 1
-        for c, d in zip(np.append(0, breaks), np.append(breaks, len(pieces))):
-            start_m.append(pieces[c, 0])
-            end_m.append(pieces[c + np.argmax(at_m[c:d, 1]), 1])
-            joined.append(pair[a])
-    return np.array(start_m), np.array(end_m), np.array(joined)
+    is_new = np.append(True, (pair[1:] != pair[:-1]).any(axis=1))[:len(pair)]
+    first = np.append(np.flatnonzero(is_new), len(pair))
+    joined_m, row = _joined(ends_m, first)
+    return joined_m[:, 0], joined_m[:, 1], pair[row]
+
+
+@njit(cache=True)
+def _joined(ends_m: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Join pieces (p, 2, 3) of groups that overlap; return ends (e, 2, 3) and one row (e,) each."""
+    out_m, row = np.empty_like(ends_m), np.empty(len(ends_m), dtype=np.int64)
+    count = 0
+    for g in range(len(first) - 1):
+        pieces = ends_m[first[g]:first[g + 1]].copy()
+        along = pieces[np.argmax(((pieces[:, 1] - pieces[:, 0]) ** 2).sum(axis=1))]
+        along = along[1] - along[0]
+        along = along / np.sqrt(dot(along, along))
+        low_m, high_m = np.empty(len(pieces)), np.empty(len(pieces))
+        for k in range(len(pieces)):
+            low_m[k], high_m[k] = dot(pieces[k, 0], along), dot(pieces[k, 1], along)
+            if low_m[k] > high_m[k]:
+                low_m[k], high_m[k] = high_m[k], low_m[k]
+                pieces[k] = pieces[k, ::-1].copy()
+        reached_m = -np.inf
+        for k in np.argsort(low_m, kind="mergesort"):
+            if low_m[k] > reached_m + COPLANAR_M:
+                out_m[count], row[count] = pieces[k], first[g]
+                reached_m = high_m[k]
+                count += 1
+            elif high_m[k] > reached_m:
+                out_m[count - 1, 1] = pieces[k, 1]
+                reached_m = high_m[k]
+    return out_m[:count], row[:count]
 
 
 @njit(cache=True)

@@ -1,16 +1,20 @@
-"""Planar facets of a city: triangles that share a segment and lie in one plane."""
+"""Planar facets of a city: triangles of one material that share a segment and lie in one plane."""
 
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from radiotwin.paths.topology import Topology, build_topology
+from radiotwin.paths.vectors import cross as cross_product
+from radiotwin.paths.vectors import dot
 from radiotwin.scene.citymap import CityMap
 
 COPLANAR_M = 0.005  # [m], maximum distance of a neighbour's corner from the plane
 MAX_TRIANGLES_AT_SEGMENT = 12  # triangles that may meet at one segment
+TRIED_SIDES = 16  # of a facet's triangles, to lay its bounding rectangle along
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +32,7 @@ class Facets:
         first: (f + 1,) first row in `triangle_uv_m` of each facet.
         triangle_uv_m: (t, 6) corners u, v, u, v, u, v of the triangles in the plane [m].
         of_face: (city faces,) facet of each face of the city; -1: a sliver, or on the ground.
+        material: (f,) row of the city's materials.
     """
 
     normal: np.ndarray
@@ -40,6 +45,7 @@ class Facets:
     first: np.ndarray
     triangle_uv_m: np.ndarray
     of_face: np.ndarray
+    material: np.ndarray
 
     def __len__(self) -> int:
         return len(self.normal)
@@ -59,15 +65,15 @@ def extract_facets(city: CityMap, topology: Topology | None = None) -> Facets:
         BadInput: a corner is not finite.
     """
     topology = topology or build_topology(city)
-    label = _coplanar_groups(topology)
+    material = city.material[topology.source]
+    label = _coplanar_groups(topology, material)
     count = int(label.max()) + 1 if len(label) else 0
     order = np.argsort(label, kind="stable")
     first = np.searchsorted(label[order], np.arange(count + 1))
     corners_m = topology.vertices_m[topology.triangles[order]]
     cross = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
-    frames = np.array([_frame(corners_m[a:b], cross[a:b]) for a, b in zip(first[:-1], first[1:])])
     normal, origin_m, axis_u, axis_v, size_m, full = np.split(
-        frames.reshape(-1, 15), [3, 6, 9, 12, 14], axis=1)
+        _frames(corners_m, cross, first), [3, 6, 9, 12, 14], axis=1)
     of_row = label[order]
     offset_m = corners_m - origin_m[of_row, None]
     uv_m = np.stack([np.einsum("ikj,ij->ik", offset_m, axis[of_row]) for axis in (axis_u, axis_v)],
@@ -75,11 +81,12 @@ def extract_facets(city: CityMap, topology: Topology | None = None) -> Facets:
     of_face = np.full(len(city.faces), -1)
     of_face[topology.source] = label
     return Facets(normal, np.einsum("ij,ij->i", normal, origin_m), origin_m, axis_u, axis_v,
-                  size_m, full[:, 0] > 0, first, uv_m.reshape(-1, 6), of_face)
+                  size_m, full[:, 0] > 0, first, uv_m.reshape(-1, 6), of_face,
+                  material[order][first[:-1]])
 
 
-def _coplanar_groups(topology: Topology) -> np.ndarray:
-    """Return the facet (t,) of each triangle."""
+def _coplanar_groups(topology: Topology, material: np.ndarray) -> np.ndarray:
+    """Return the facet (t,) of each triangle, which is of a material (t,)."""
     size = np.diff(topology.group)
     pairs = [np.empty((0, 2), dtype=int)]
     for i in range(MAX_TRIANGLES_AT_SEGMENT):
@@ -90,6 +97,7 @@ def _coplanar_groups(topology: Topology) -> np.ndarray:
     corners_m = topology.vertices_m[topology.triangles]
     normal = topology.normal
     same = np.einsum("ij,ij->i", normal[a], normal[b]) > np.cos(np.radians(0.5))
+    same &= material[a] == material[b]
     for one, other in ((a, b), (b, a)):
         off_m = np.einsum("ikj,ij->ik", corners_m[other] - corners_m[one][:, :1], normal[one])
         same &= (np.abs(off_m) < COPLANAR_M).all(axis=1)
@@ -97,35 +105,52 @@ def _coplanar_groups(topology: Topology) -> np.ndarray:
     return connected_components(graph, directed=False)[1]
 
 
-def _frame(corners_m: np.ndarray, cross: np.ndarray) -> np.ndarray:
-    """Return the plane of one facet and its smallest bounding rectangle.
+@njit(cache=True)
+def _frames(corners_m: np.ndarray, cross: np.ndarray, first: np.ndarray) -> np.ndarray:
+    """Return the planes of facets and their smallest bounding rectangles.
 
-    The rectangle is tried along the 16 longest sides of the triangles.
+    A rectangle is tried along the `TRIED_SIDES` longest sides of a facet's triangles.
 
     Args:
-        corners_m: (t, 3, 3) triangles [m].
+        corners_m: (t, 3, 3) triangles, facet after facet [m].
         cross: (t, 3) outward normals of the triangles, twice as long as their areas [m²].
+        first: (f + 1,) first triangle of each facet.
 
     Returns:
-        (15,) normal, origin, axes u and v, size, and whether the facet fills the rectangle.
+        (f, 15) normal, origin, axes u and v, size, and whether the facet fills the rectangle.
     """
-    normal = cross.sum(axis=0)
-    area_m2 = np.linalg.norm(normal) / 2
-    normal = normal / (2 * area_m2)
-    sides = (np.roll(corners_m, -1, axis=1) - corners_m).reshape(-1, 3)
-    longest = np.argsort(-np.linalg.norm(sides, axis=1), kind="stable")[:16]
-    min_area_m2 = np.inf
-    for side in sides[longest]:
-        along = side - (side @ normal) * normal
-        along /= np.linalg.norm(along)
-        across = np.cross(normal, along)
-        uv_m = corners_m.reshape(-1, 3) @ np.column_stack([along, across])
-        extent_m = np.ptp(uv_m, axis=0)
-        if extent_m.prod() < min_area_m2 * (1 - 1e-9):
-            axis_u, axis_v, low_m, size_m = along, across, uv_m.min(axis=0), extent_m
-            min_area_m2 = size_m.prod()
-    distance_m = np.average((corners_m @ normal).mean(axis=1),
-                            weights=np.linalg.norm(cross, axis=1))
-    origin_m = low_m[0] * axis_u + low_m[1] * axis_v + distance_m * normal
-    full = area_m2 >= (1 - 1e-6) * min_area_m2
-    return np.concatenate([normal, origin_m, axis_u, axis_v, size_m, [full]])
+    out = np.empty((len(first) - 1, 15))
+    for facet in range(len(first) - 1):
+        points_m = corners_m[first[facet]:first[facet + 1]].copy().reshape(-1, 3)
+        weight = cross[first[facet]:first[facet + 1]]
+        normal = weight.sum(axis=0)
+        area_m2 = np.sqrt(dot(normal, normal)) / 2.0
+        normal = normal / (2.0 * area_m2)
+        distance_m = whole = 0.0
+        sides = np.empty_like(points_m)
+        for k in range(len(points_m)):
+            sides[k] = points_m[k + 1 if k % 3 < 2 else k - 2] - points_m[k]
+            share = np.sqrt(dot(weight[k // 3], weight[k // 3]))
+            distance_m += share * dot(points_m[k], normal)
+            whole += share
+        longest = np.argsort(-(sides ** 2).sum(axis=1), kind="mergesort")[:TRIED_SIDES]
+        min_area_m2 = np.inf
+        for k in longest:
+            along = sides[k] - dot(sides[k], normal) * normal
+            along = along / np.sqrt(dot(along, along))
+            across = cross_product(normal, along)
+            low_u = low_v = np.inf
+            high_u = high_v = -np.inf
+            for point_m in points_m:
+                u, v = dot(point_m, along), dot(point_m, across)
+                low_u, high_u = min(low_u, u), max(high_u, u)
+                low_v, high_v = min(low_v, v), max(high_v, v)
+            tried_m2 = (high_u - low_u) * (high_v - low_v)
+            if tried_m2 < min_area_m2 * (1.0 - 1e-9):
+                min_area_m2 = tried_m2
+                out[facet, 3:6] = low_u * along + low_v * across + distance_m / whole * normal
+                out[facet, 6:9], out[facet, 9:12] = along, across
+                out[facet, 12], out[facet, 13] = high_u - low_u, high_v - low_v
+        out[facet, :3] = normal
+        out[facet, 14] = area_m2 >= (1.0 - 1e-6) * min_area_m2
+    return out

@@ -7,9 +7,10 @@ the vertical polarisation more strongly than the horizontal one.
 import numpy as np
 from numba import njit
 
-from radiotwin.paths.coefficients import fresnel
+from radiotwin.paths.coefficients import Slabs
 from radiotwin.paths.images import Candidates, PathBuffer, sequence_length
-from radiotwin.paths.surfaces import Surfaces
+from radiotwin.paths.reflections import reflect
+from radiotwin.paths.surfaces import MATERIAL, Surfaces
 from radiotwin.paths.vectors import cross, dot
 from radiotwin.paths.wedges import diffract
 
@@ -18,8 +19,8 @@ VERTICAL, AVERAGE = 0, 1
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def path_gains(
-    surfaces: Surfaces, candidates: Candidates, wave_number: float, permittivity: complex,
-    polarisation: int, buffer: PathBuffer, rows: np.ndarray, gain: np.ndarray,
+    surfaces: Surfaces, candidates: Candidates, wave_number: float, slabs: Slabs,
+    polarisation: int, wedge: int, buffer: PathBuffer, rows: np.ndarray, gain: np.ndarray,
 ) -> None:
     """Compute the power gains of paths between isotropic antennas.
 
@@ -27,9 +28,10 @@ def path_gains(
         surfaces: of the map.
         candidates: that the paths were found with.
         wave_number: 2 π / wavelength [1/m].
-        permittivity: complex relative permittivity of all surfaces.
+        slabs: materials of the map.
         polarisation: VERTICAL of both antennas; or AVERAGE over those of the transmitting one,
             where the receiving one takes in all.
+        wedge: LUEBBERS or SIONNA, see `radiotwin.paths.coefficients`.
         buffer: the paths.
         rows: (m,) paths of the buffer to compute.
         gain: (m,) output, linear.
@@ -39,22 +41,19 @@ def path_gains(
     direction, length_m = np.empty((max_legs, 3)), np.empty(max_legs)
     for i in range(len(rows)):
         path = rows[i]
-        legs = buffer.count[path] - 1
-        for k in range(legs):
-            direction[k] = buffer.points_m[path, k + 1] - buffer.points_m[path, k]
-            length_m[k] = max(np.sqrt((direction[k] ** 2).sum()), 1e-9)
-            direction[k] /= length_m[k]
+        legs = take_legs(buffer, path, direction, length_m)
         power = 0.0
         for sent in range(1 + polarisation):
-            polarised = _vertical(direction[0])
+            polarised = vertical(direction[0])
             if sent == 1:
                 polarised = cross(direction[0], polarised)
             for axis in range(3):
                 field[axis] = polarised[axis]
-            spread = _follow(surfaces.planes, surfaces.edges, candidates, buffer.candidate[path],
-                             wave_number, permittivity, direction, length_m, legs, field)
+            spread = follow_field(surfaces.planes, surfaces.edges, candidates,
+                                  buffer.candidate[path], wave_number, slabs, wedge, direction,
+                                  length_m, legs, field)
             if polarisation == VERTICAL:
-                polarised = _vertical(direction[legs - 1])
+                polarised = vertical(direction[legs - 1])
                 power += spread * abs(dot(field, polarised)) ** 2
             else:
                 power += 0.5 * spread \
@@ -63,9 +62,20 @@ def path_gains(
 
 
 @njit(cache=True, error_model="numpy")
-def _follow(
+def take_legs(buffer: PathBuffer, path: int, direction: np.ndarray, length_m: np.ndarray) -> int:
+    """Write the unit vector and the length of each leg of a path [m]; return how many there are."""
+    legs = buffer.count[path] - 1
+    for k in range(legs):
+        direction[k] = buffer.points_m[path, k + 1] - buffer.points_m[path, k]
+        length_m[k] = max(np.sqrt((direction[k] ** 2).sum()), 1e-9)
+        direction[k] /= length_m[k]
+    return legs
+
+
+@njit(cache=True, error_model="numpy")
+def follow_field(
     planes: np.ndarray, edges: np.ndarray, candidates: Candidates, row: int, wave_number: float,
-    permittivity: complex, direction: np.ndarray, length_m: np.ndarray, legs: int,
+    slabs: Slabs, wedge: int, direction: np.ndarray, length_m: np.ndarray, legs: int,
     field: np.ndarray,
 ) -> float:
     """Change the field along one path; return the spreading factor of its power [1/m²]."""
@@ -73,14 +83,14 @@ def _follow(
     edge = candidates.edge[row]
     for k in range(legs - 1):
         if k < before:
-            _reflect(planes[candidates.before[row, k], :3], direction[k], direction[k + 1],
-                     permittivity, field)
+            facet = candidates.before[row, k]
+            reflect(planes[facet, :3], int(planes[facet, MATERIAL]), direction[k], slabs, field)
         elif k > before:
             facet = candidates.after[row, k - before - 1]
-            _reflect(planes[facet, :3], direction[k], direction[k + 1], permittivity, field)
+            reflect(planes[facet, :3], int(planes[facet, MATERIAL]), direction[k], slabs, field)
         else:
             diffract(edges, edge, direction[k], direction[k + 1], length_m[:before + 1].sum(),
-                     length_m[before + 1:legs].sum(), wave_number, permittivity, field)
+                     length_m[before + 1:legs].sum(), wave_number, slabs, wedge, field)
     if edge < 0:
         return 1.0 / length_m[:legs].sum() ** 2
     before_m, after_m = length_m[:before + 1].sum(), length_m[before + 1:legs].sum()
@@ -88,31 +98,9 @@ def _follow(
 
 
 @njit(cache=True, error_model="numpy")
-def _vertical(direction: np.ndarray) -> np.ndarray:
+def vertical(direction: np.ndarray) -> np.ndarray:
     """Return the unit vector of a ray's vertical polarisation; north for a vertical ray."""
     flat2 = direction[0] ** 2 + direction[1] ** 2
     if flat2 < 1e-12:
         return np.array([0.0, 1.0, 0.0])
     return (np.array([0.0, 0.0, 1.0]) - direction[2] * direction) / np.sqrt(flat2)
-
-
-@njit(cache=True, error_model="numpy")
-def _reflect(
-    normal: np.ndarray, direction_in: np.ndarray, direction: np.ndarray, permittivity: complex,
-    field: np.ndarray,
-) -> None:
-    """Reflect the field of a ray at a facet, in place."""
-    sine = abs(dot(direction_in, normal))
-    across = cross(direction_in, normal)
-    size2 = dot(across, across)
-    if size2 < 1e-12:  # normal incidence: any direction in the plane is across
-        other = np.array([1.0, 0.0, 0.0]) if abs(normal[0]) < 0.7 else np.array([0.0, 1.0, 0.0])
-        across = cross(direction_in, other)
-        size2 = dot(across, across)
-    across /= np.sqrt(size2)
-    within_in, within = cross(across, direction_in), cross(across, direction)
-    te, tm = fresnel(sine, permittivity)
-    field_te = te * dot(field, across)
-    field_tm = tm * dot(field, within_in)
-    for i in range(3):
-        field[i] = field_te * across[i] + field_tm * within[i]

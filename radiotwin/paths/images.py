@@ -98,7 +98,7 @@ def find_paths(
         before = sequence_length(candidates.before, row)
         after = sequence_length(candidates.after, row)
         facets_before, facets_after = candidates.before[row, :before], candidates.after[row, :after]
-        if not _source_images(planes, facets_before, device_m, image):
+        if not source_images(planes, facets_before, device_m, image):
             continue
         edge = candidates.edge[row]
         along_m = across_m = 0.0
@@ -129,7 +129,7 @@ def find_paths(
                 if not ok:
                     continue
                 interactions += after + 1
-            if not _before_edge(planes, uv_m, facets_before, x, y, z, image, points_m):
+            if not reflections_back(planes, uv_m, facets_before, x, y, z, image, points_m):
                 continue
             points_m[0] = device_m
             points_m[interactions + 1] = receiver_m[at]
@@ -140,7 +140,7 @@ def find_paths(
 
 
 @njit(cache=True, error_model="numpy")
-def _source_images(
+def source_images(
     planes: np.ndarray, facets: np.ndarray, device_m: np.ndarray, image: np.ndarray
 ) -> bool:
     """Mirror the device in facets, one after another; return whether it lies before each."""
@@ -154,7 +154,7 @@ def _source_images(
 
 
 @njit(cache=True, error_model="numpy")
-def _before_edge(
+def reflections_back(
     planes: np.ndarray, uv_m: np.ndarray, facets: np.ndarray, x: float, y: float, z: float,
     image: np.ndarray, points_m: np.ndarray,
 ) -> bool:

@@ -8,14 +8,18 @@ from scipy.constants import speed_of_light
 from radiotwin.errors import BadInput
 from radiotwin.paths.candidates import candidate_search
 from radiotwin.paths.clearance import clear_paths
-from radiotwin.paths.coefficients import concrete_permittivity
+from radiotwin.paths.coefficients import slabs_of
 from radiotwin.paths.fields import AVERAGE, VERTICAL, path_gains
 from radiotwin.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, find_paths
+from radiotwin.paths.two_edges import paths_over_two_edges, two_edge_gains
+from radiotwin.paths.wedges import LUEBBERS, SIONNA
 from radiotwin.progress import progress
 from radiotwin.scene.citymap import CityMap
 
 POLARISATIONS = {"average": AVERAGE, "vertical": VERTICAL}
+WEDGES = {"luebbers": LUEBBERS, "sionna": SIONNA}
 PATH_CHUNK = 50_000  # paths at once: about 30 MB
+DARK_CHUNK = 100  # receivers at once that only two edges may reach
 SECTORS = 24  # of azimuth, 15 degrees each
 
 
@@ -34,6 +38,7 @@ class PathPowers:
         reflected_more: three or more reflections.
         diffracted: one diffraction, on either side of the shadow boundary.
         reflected_diffracted: one diffraction, and reflections before or after it.
+        diffracted_2: diffractions at two edges; looked for where there is no other path.
         ground: one reflection, by the ground z = 0.
         departures: (n, SECTORS, 3) power times the unit vector from the device along the path,
             summed over the paths that leave the device in each sector of azimuth; the first
@@ -47,6 +52,7 @@ class PathPowers:
     reflected_more: np.ndarray
     diffracted: np.ndarray
     reflected_diffracted: np.ndarray
+    diffracted_2: np.ndarray
     ground: np.ndarray
     departures: np.ndarray
     arrivals: np.ndarray
@@ -63,12 +69,14 @@ COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-2]
 def path_powers(
     city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray,
     frequency_hz: float, polarisation: str = "average", depth: int = 4,
+    wedge: str = "sionna",
 ) -> PathPowers:
     """Follow the paths from devices to receivers and add up their powers.
 
-    All surfaces are concrete. Ends inside buildings are accepted, but their results mean little.
-    In the shadow of a dense city (scenes/rbm) the standard deviation from a ray tracer's gains is
-    5.5, 2.5, 1.5 and 1.4 dB at depth 2, 3, 4 and 5; each step takes about a third more time.
+    Surfaces are slabs of the map's materials, and the ground z = 0 one of `city.ground_material`.
+    Ends inside buildings are accepted, but their results mean little. At the depth of 4 the RMS
+    difference from Sionna RT with a million rays is 0.9 dB in scenes/rbm and 3.7 dB in Munich,
+    without line of sight (`python -m studies engine`).
 
     Args:
         city: 3D map.
@@ -78,6 +86,8 @@ def path_powers(
         frequency_hz: carrier frequency [Hz].
         polarisation: `vertical` of both antennas, or `average` over all.
         depth: maximum number of interactions of a path, 1 to 6.
+        wedge: coefficient of diffraction: `luebbers`, reciprocal and exact for conductors; or
+            `sionna`, that of Sionna RT. See `radiotwin.paths.coefficients`.
 
     Returns:
         The powers of the n links.
@@ -89,7 +99,7 @@ def path_powers(
     device_m = np.asarray(device_m, dtype=float)
     receiver_m = np.ascontiguousarray(receiver_m, dtype=float)
     device = np.asarray(device)
-    _check(device_m, receiver_m, device, frequency_hz, polarisation, depth)
+    _check(device_m, receiver_m, device, frequency_hz, polarisation, depth, wedge)
     wave_number = 2 * np.pi * frequency_hz / speed_of_light
     powers = np.zeros((len(COMPONENTS), len(receiver_m)))
     powers[0] = _direct(city, device_m[device], receiver_m, wave_number)
@@ -99,7 +109,7 @@ def path_powers(
     _add_rays(arrivals, np.arange(len(receiver_m)), -straight_m, powers[0])
     search = candidate_search(city, depth)
     buffer = PathBuffer.allocate(PATH_CHUNK)
-    permittivity = concrete_permittivity(frequency_hz)
+    slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
     rows = np.unique(device)
     with progress("following paths", total=len(rows)) as advance:
         for row in rows:
@@ -112,13 +122,27 @@ def path_powers(
                                            cursor, buffer)
                 clear = clear_paths(city, search.surfaces, candidates, buffer, found)
                 gain = np.empty(len(clear))
-                path_gains(search.surfaces, candidates, wave_number, permittivity,
-                           POLARISATIONS[polarisation], buffer, clear, gain)
+                path_gains(search.surfaces, candidates, wave_number, slabs,
+                           POLARISATIONS[polarisation], WEDGES[wedge], buffer, clear,
+                           gain)
                 link, points_m = links[buffer.receiver[clear]], buffer.points_m[clear]
                 last, path = buffer.count[clear] - 1, np.arange(len(clear))
                 np.add.at(powers, (kind[buffer.candidate[clear]], link), gain)
                 _add_rays(departures, link, points_m[:, 1] - points_m[:, 0], gain)
                 _add_rays(arrivals, link, points_m[path, last - 1] - points_m[path, last], gain)
+            dark = links[powers[:, links].sum(axis=0) == 0]
+            seen = np.unique(candidates.edge[(candidates.before[:, 0] < 0)])
+            for first in range(0, len(dark) if depth > 1 else 0, DARK_CHUNK):
+                part = dark[first:first + DARK_CHUNK]
+                pairs = paths_over_two_edges(city, search.surfaces, search.facet_edges, seen,
+                                             device_m[row], receiver_m[part])
+                gain = two_edge_gains(search.surfaces, wave_number, slabs,
+                                      POLARISATIONS[polarisation], WEDGES[wedge], pairs.edge,
+                                      pairs.points_m)
+                link, legs_m = part[pairs.receiver], np.diff(pairs.points_m, axis=1)
+                np.add.at(powers, (COMPONENTS.index("diffracted_2"), link), gain)
+                _add_rays(departures, link, legs_m[:, 0], gain)
+                _add_rays(arrivals, link, -legs_m[:, 2], gain)
             advance(1)
     return PathPowers(*powers, departures, arrivals)  # type: ignore[call-arg]  # a row a kind
 
@@ -152,7 +176,7 @@ def _kinds(candidates: Candidates, ground: int) -> np.ndarray:
 
 def _check(
     device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray, frequency_hz: float,
-    polarisation: str, depth: int,
+    polarisation: str, depth: int, wedge: str,
 ) -> None:
     for name, points_m in (("device_m", device_m), ("receiver_m", receiver_m)):
         if points_m.ndim != 2 or points_m.shape[1] != 3 or not np.isfinite(points_m).all():
@@ -168,5 +192,7 @@ def _check(
         raise BadInput(f"frequency_hz is {frequency_hz}; it must be positive")
     if polarisation not in POLARISATIONS:
         raise BadInput(f"polarisation is {polarisation!r}; allowed are {', '.join(POLARISATIONS)}")
+    if wedge not in WEDGES:
+        raise BadInput(f"wedge is {wedge!r}; allowed are {', '.join(WEDGES)}")
     if not 1 <= depth <= MAX_INTERACTIONS:
         raise BadInput(f"depth is {depth}; allowed are 1 to {MAX_INTERACTIONS}")

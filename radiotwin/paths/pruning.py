@@ -82,6 +82,70 @@ def lit_part(
 
 
 @njit(cache=True, error_model="numpy")
+def cone_misses(
+    planes: np.ndarray, edges: np.ndarray, edge: int, after: np.ndarray, lit_m: np.ndarray,
+    source_m: np.ndarray,
+) -> bool:
+    """Return whether diffracted rays from the lit part of an edge miss one of the facets after it.
+
+    A ray to a point at q along the edge and r from its line leaves the edge at t, where
+    (q - s) d = (t - s) (d + r), with the source at s along the edge and d from its line. So t is
+    above a bound where (q - s) d > (bound - s) (d + r). For all points of a facet that holds if it
+    holds at the corners of its rectangle: r is convex, and where that is the wrong way round, a
+    lower bound of r that is linear takes its place.
+
+    Args:
+        planes: of `Surfaces`.
+        edges: of `Surfaces`.
+        edge: row of `edges`.
+        after: (b,) facets after the edge.
+        lit_m: (2,) start and end of the lit part [m].
+        source_m: (2,) position of the source along the edge, and distance from its line [m].
+
+    Returns:
+        Whether none of the rays goes through all facets; False may be wrong, True never is.
+    """
+    start, along = edges[edge, START:START + 3], edges[edge, ALONG:ALONG + 3]
+    corner, centre = np.empty((4, 3)), np.empty(3)
+    for k in range(len(after)):
+        facet = after[k]
+        if facet == len(planes) - 1:
+            continue
+        for i in range(4):
+            for axis in range(3):
+                corner[i, axis] = planes[facet, ORIGIN + axis] \
+                    + (i % 2) * planes[facet, SIZE] * planes[facet, AXIS_U + axis] \
+                    + (i // 2) * planes[facet, SIZE + 1] * planes[facet, AXIS_V + axis]
+            for j in range(k - 1, -1, -1):
+                corner[i, 0], corner[i, 1], corner[i, 2] = mirrored(
+                    planes, after[j], corner[i, 0], corner[i, 1], corner[i, 2])
+            for axis in range(3):
+                corner[i, axis] -= start[axis]
+        for axis in range(3):
+            centre[axis] = corner[:, axis].sum()
+        centre_along = centre[0] * along[0] + centre[1] * along[1] + centre[2] * along[2]
+        for axis in range(3):
+            centre[axis] -= centre_along * along[axis]
+        size = np.sqrt((centre ** 2).sum())
+        below = above = True
+        low_m, high_m = lit_m[0] - source_m[0], lit_m[1] - source_m[0]
+        for i in range(4):
+            at_m = corner[i, 0] * along[0] + corner[i, 1] * along[1] + corner[i, 2] * along[2]
+            across2 = (corner[i] ** 2).sum() - at_m * at_m
+            across_m = source_m[1] + np.sqrt(max(across2, 0.0))
+            least_m = source_m[1]
+            if size > 0.0:
+                least_m += (corner[i, 0] * centre[0] + corner[i, 1] * centre[1]
+                            + corner[i, 2] * centre[2]) / size
+            leans_m = (at_m - source_m[0]) * source_m[1]
+            below = below and leans_m < low_m * (least_m if low_m > 0.0 else across_m)
+            above = above and leans_m > high_m * (across_m if high_m > 0.0 else least_m)
+        if below or above:
+            return True
+    return False
+
+
+@njit(cache=True, error_model="numpy")
 def _coordinate(point_m: np.ndarray, origin_m: np.ndarray, axis: np.ndarray) -> float:
     """Return a point's coordinate along an axis from an origin [m]."""
     return (point_m[0] - origin_m[0]) * axis[0] + (point_m[1] - origin_m[1]) * axis[1] \

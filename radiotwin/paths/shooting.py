@@ -13,21 +13,26 @@ import numpy as np
 
 from radiotwin.paths.edges import Edges
 from radiotwin.paths.facets import Facets
+from radiotwin.paths.topology import expand
 from radiotwin.scene.citymap import SKIN_M, CityMap
 
 RAY_CHUNK = 200_000  # rays at once: about 60 MB
+DEVICE_RAYS = 100_000  # about half a degree apart
+EDGE_RAYS = 300  # about 12 degrees apart
 
 
 @dataclass(frozen=True, eq=False)
 class FacetSequences:
-    """Sequences of facets; each adds one facet to its parent, and row 0 is the empty sequence.
+    """Sequences of facets that rays from sources visit; the first row of each source is empty.
 
     Attributes:
+        source: (c,) row of the source.
         facets: (c, depth) rows of `Surfaces`, then -1.
         order: (c,) number of facets.
         next_facets: (m, 2) a sequence, and a facet that rays hit after it.
     """
 
+    source: np.ndarray
     facets: np.ndarray
     order: np.ndarray
     next_facets: np.ndarray
@@ -46,8 +51,6 @@ def device_sequences(
 ) -> FacetSequences:
     """Find the sequences of facets that rays from a device visit.
 
-    Rays are about half a degree apart.
-
     Args:
         city: 3D map.
         facets: of the city.
@@ -58,17 +61,18 @@ def device_sequences(
     Returns:
         The sequences of up to `depth` facets.
     """
-    direction = sphere(100_000)
+    direction = sphere(DEVICE_RAYS)
     start_m = np.broadcast_to(device_m, direction.shape)
-    return _shoot(city, facets, normal, start_m, direction, depth)
+    return _shoot(city, facets, normal, start_m, direction, np.zeros(len(direction), dtype=int), 1,
+                  depth)
 
 
 def edge_sequences(
-    city: CityMap, facets: Facets, normal: np.ndarray, edges: Edges, edge: int, depth: int
+    city: CityMap, facets: Facets, normal: np.ndarray, edges: Edges, rows: np.ndarray, depth: int
 ) -> FacetSequences:
-    """Find the sequences of facets that rays from an edge visit.
+    """Find the sequences of facets that rays from edges visit.
 
-    Rays start at most 20 m apart along the edge. The surroundings of an edge are seen from many
+    Rays start at most 20 m apart along an edge. The surroundings of an edge are seen from many
     starts, so fewer rays do than from a device.
 
     Args:
@@ -76,35 +80,36 @@ def edge_sequences(
         facets: of the city.
         normal: (f + 1, 3) of `Surfaces`.
         edges: of the city.
-        edge: row of `edges`.
+        rows: (n,) rows of `edges`: the sources.
         depth: maximum number of facets of a sequence.
 
     Returns:
         The sequences of up to `depth` facets.
     """
-    length_m = np.linalg.norm(edges.end_m[edge] - edges.start_m[edge])
-    count = max(int(np.ceil(length_m / 20.0)), 1)
-    outward = edges.normal_0[edge] + edges.normal_n[edge]
-    along_m = ((np.arange(count) + 0.5) / count * length_m)[:, None]
-    start_m = edges.start_m[edge] + along_m * edges.direction[edge] \
-        + SKIN_M * outward / np.linalg.norm(outward)
-    direction = sphere(300)
-    open_to = np.maximum(direction @ edges.normal_0[edge], direction @ edges.normal_n[edge]) > 0
-    direction = direction[open_to]
-    return _shoot(city, facets, normal, np.repeat(start_m, len(direction), axis=0),
-                  np.tile(direction, (count, 1)), depth)
+    offset_m = (edges.end_m - edges.start_m)[rows]
+    starts = np.maximum(np.ceil(np.linalg.norm(offset_m, axis=1) / 20.0).astype(int), 1)
+    source, within = expand(starts)
+    outward = (edges.normal_0 + edges.normal_n)[rows]
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    share = (within + 0.5) / starts[source]
+    start_m = edges.start_m[rows[source]] + share[:, None] * offset_m[source] \
+        + SKIN_M * outward[source]
+    direction = sphere(EDGE_RAYS)
+    is_open = np.maximum(edges.normal_0[rows] @ direction.T, edges.normal_n[rows] @ direction.T) > 0
+    at, ray = np.nonzero(is_open[source])
+    return _shoot(city, facets, normal, start_m[at], direction[ray], source[at], len(rows), depth)
 
 
 def _shoot(
     city: CityMap, facets: Facets, normal: np.ndarray, start_m: np.ndarray, direction: np.ndarray,
-    depth: int,
+    source: np.ndarray, sources: int, depth: int,
 ) -> FacetSequences:
-    """Follow rays (n, 3) of one source through `depth` reflections, and to the facet after them."""
-    row = np.zeros(len(start_m), dtype=int)  # of each ray: the sequence that it has visited
-    sequences = [np.empty((1, 0), dtype=int)]
+    """Follow rays (n, 3) of sources (n,) through `depth` reflections, and to the facet after."""
+    row = source  # of each ray: the sequence that it has visited
+    sequences, of_source = [np.empty((sources, 0), dtype=int)], [np.arange(sources)]
     first = [0]
     seen = []
-    count = 1
+    count = sources
     for level in range(depth + 1):
         distance_m, facet = np.concatenate(
             [_first_facets(city, facets, start_m[a:a + RAY_CHUNK], direction[a:a + RAY_CHUNK])
@@ -117,6 +122,7 @@ def _shoot(
         if level == depth:
             break
         sequences.append(np.column_stack([sequences[-1][parent - first[-1]], last]))
+        of_source.append(of_source[-1][parent - first[-1]])
         first.append(count)
         row = count + inverse.reshape(-1)
         count += len(pairs)
@@ -126,7 +132,8 @@ def _shoot(
     padded = [np.pad(part, ((0, 0), (0, depth - part.shape[1])), constant_values=-1)
               for part in sequences]
     order = np.repeat(np.arange(len(sequences)), [len(part) for part in sequences])
-    return FacetSequences(np.concatenate(padded), order, np.concatenate(seen))
+    return FacetSequences(np.concatenate(of_source), np.concatenate(padded), order,
+                          np.concatenate(seen))
 
 
 def _first_facets(

@@ -9,23 +9,26 @@ from radiotwin.paths.edges import Edges
 from radiotwin.paths.facets import Facets
 
 ON_PLANE_M = 1e-4  # [m], a point this close to a plane is on neither side of it
+GROUND_MATERIAL = -1  # last row of `Slabs`
 
 # First columns of the fields of `Surfaces.planes` and `Surfaces.edges`. Numba counts references to
 # each array that a function is given; with an array for each field, that would take longer than
 # the geometry.
-NORMAL, OFFSET, ORIGIN, AXIS_U, AXIS_V, SIZE, FULL, FIRST, END = 0, 3, 4, 7, 10, 13, 15, 16, 17
-START, ALONG, LENGTH, TANGENT, NORMAL_0, NORMAL_N, EXTERIOR = 0, 3, 6, 7, 10, 13, 16
+NORMAL, OFFSET, ORIGIN, AXIS_U, AXIS_V, SIZE, FULL, FIRST, END, MATERIAL = (
+    0, 3, 4, 7, 10, 13, 15, 16, 17, 18)
+START, ALONG, LENGTH, TANGENT, NORMAL_0, NORMAL_N, EXTERIOR, MATERIAL_0, MATERIAL_N = (
+    0, 3, 6, 7, 10, 13, 16, 17, 18)
 
 
 class Surfaces(NamedTuple):
     """Facets, with the ground after the last one, and edges.
 
     Attributes:
-        planes: (f + 1, 18) of `Facets`: unit normal, offset, origin, axes u and v, sizes, whether
-            it is full, its first triangle and the one after its last.
+        planes: (f + 1, 19) of `Facets`: unit normal, offset, origin, axes u and v, sizes, whether
+            it is full, its first triangle and the one after its last, material.
         triangle_uv_m: (t, 6) as in `Facets`.
-        edges: (e, 17) of `Edges`: start, direction, length, tangent in face 0, normals of face 0
-            and face n, exterior angle.
+        edges: (e, 19) of `Edges`: start, direction, length, tangent in face 0, normals of face 0
+            and face n, exterior angle, materials of face 0 and face n.
     """
 
     planes: np.ndarray
@@ -37,14 +40,16 @@ def pack(facets: Facets, edges: Edges) -> Surfaces:
     """Put facets, the ground and edges into arrays for compiled code."""
     planes = np.column_stack([
         facets.normal, facets.offset_m, facets.origin_m, facets.axis_u, facets.axis_v,
-        facets.size_m, facets.full, facets.first[:-1], facets.first[1:]])
-    ground = [0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0, np.inf, np.inf, 1, 0, 0]
+        facets.size_m, facets.full, facets.first[:-1], facets.first[1:], facets.material])
+    ground = [0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0, np.inf, np.inf, 1, 0, 0,
+              GROUND_MATERIAL]
     length_m = np.linalg.norm(edges.end_m - edges.start_m, axis=1)
     return Surfaces(
         np.concatenate([planes, [ground]]).astype(float),
         np.ascontiguousarray(facets.triangle_uv_m, dtype=float),
         np.column_stack([edges.start_m, edges.direction, length_m, edges.tangent_0, edges.normal_0,
-                         edges.normal_n, edges.exterior_rad]).astype(float))
+                         edges.normal_n, edges.exterior_rad,
+                         facets.material[edges.facet]]).astype(float))
 
 
 @njit(cache=True, error_model="numpy")

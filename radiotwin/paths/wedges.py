@@ -7,10 +7,27 @@ the half planes before and after the edge are folded into one.
 import numpy as np
 from numba import njit
 
-from radiotwin.paths.coefficients import wedge_coefficients
-from radiotwin.paths.surfaces import ALONG, EXTERIOR, NORMAL_0, NORMAL_N, START, TANGENT
+from radiotwin.paths.coefficients import (
+    Slabs,
+    face_sines,
+    reflection,
+    wedge_coefficients,
+    wedge_terms,
+)
+from radiotwin.paths.reflections import reflect
+from radiotwin.paths.surfaces import (
+    ALONG,
+    EXTERIOR,
+    MATERIAL_0,
+    MATERIAL_N,
+    NORMAL_0,
+    NORMAL_N,
+    START,
+    TANGENT,
+)
 from radiotwin.paths.vectors import cross, dot
 
+LUEBBERS, SIONNA = 0, 1
 MIN_SINE = 1e-4  # of the angle between ray and face; rays closer to a face are not followed
 
 
@@ -45,7 +62,7 @@ def around_edge(
 @njit(cache=True, error_model="numpy")
 def diffract(
     edges: np.ndarray, edge: int, direction_in: np.ndarray, direction: np.ndarray, before_m: float,
-    after_m: float, wave_number: float, permittivity: complex, field: np.ndarray,
+    after_m: float, wave_number: float, slabs: Slabs, wedge: int, field: np.ndarray,
 ) -> None:
     """Diffract the field of a ray at an edge (Kouyoumjian and Pathak, eq. 9-13), without spreading.
 
@@ -57,21 +74,53 @@ def diffract(
         before_m: length of the path before the edge [m].
         after_m: length of the path after the edge [m].
         wave_number: 2 π / wavelength [1/m].
-        permittivity: complex relative permittivity of both faces.
+        slabs: materials of the city.
+        wedge: LUEBBERS or SIONNA, see `radiotwin.paths.coefficients`.
         field: (3,) complex, changed in place.
     """
-    along, tangent = edges[edge, ALONG:ALONG + 3], edges[edge, TANGENT:TANGENT + 3]
-    normal = edges[edge, NORMAL_0:NORMAL_0 + 3]
-    phi_in = np.arctan2(-dot(direction_in, normal), -dot(direction_in, tangent)) % (2.0 * np.pi)
-    phi = np.arctan2(dot(direction, normal), dot(direction, tangent)) % (2.0 * np.pi)
-    across_in, across = cross(along, direction_in), cross(along, direction)
+    row = edges[edge]
+    along, tangent = row[ALONG:ALONG + 3], row[TANGENT:TANGENT + 3]
+    normal_0, normal_n = row[NORMAL_0:NORMAL_0 + 3], row[NORMAL_N:NORMAL_N + 3]
+    material_0, material_n = int(row[MATERIAL_0]), int(row[MATERIAL_N])
+    exterior = row[EXTERIOR]
+    phi_in = np.arctan2(-dot(direction_in, normal_0), -dot(direction_in, tangent)) % (2.0 * np.pi)
+    phi = np.arctan2(dot(direction, normal_0), dot(direction, tangent)) % (2.0 * np.pi)
+    if dot(direction_in, normal_0) >= 0.0:  # face 0 is one that the source sees
+        phi_in, phi = exterior - phi_in, exterior - phi
+        normal_0, normal_n = normal_n, normal_0
+        material_0, material_n = material_n, material_0
+    across_in, across = cross(direction_in, along), cross(along, direction)
     sine = np.sqrt(dot(across, across))
+    across_in, across = across_in / np.sqrt(dot(across_in, across_in)), across / sine
+    upright_in, upright = cross(direction_in, across_in), cross(direction, across)
     distance_m = before_m * after_m / (before_m + after_m) * sine * sine
-    soft, hard = wedge_coefficients(phi, phi_in, sine, distance_m, wave_number,
-                                    edges[edge, EXTERIOR] / np.pi, permittivity)
-    across_in = -across_in / np.sqrt(dot(across_in, across_in))
-    across = across / sine
-    upright_in, upright = cross(across_in, direction_in), cross(across, direction)
-    field_soft, field_hard = -soft * dot(field, upright_in), -hard * dot(field, across_in)
+    if wedge == LUEBBERS:
+        sine_0, sine_n = face_sines(phi, phi_in, sine, exterior / np.pi)
+        soft, hard = wedge_coefficients(
+            phi, phi_in, sine, distance_m, wave_number, exterior / np.pi,
+            reflection(sine_0, slabs, material_0), reflection(sine_n, slabs, material_n))
+        field_soft, field_hard = -soft * dot(field, upright_in), -hard * dot(field, across_in)
+    else:
+        at_0, at_n = wedge_terms(phi, phi_in, sine, distance_m, wave_number, exterior / np.pi)
+        soft, hard = _reflected(normal_0, material_0, direction_in, along, slabs, field)
+        field_soft, field_hard = at_0 * soft, at_0 * hard
+        if exterior > np.pi + phi_in:  # face n lies in the shadow
+            soft, hard = -dot(field, upright_in), -dot(field, across_in)
+        else:
+            soft, hard = _reflected(normal_n, material_n, direction_in, along, slabs, field)
+        field_soft, field_hard = field_soft + at_n * soft, field_hard + at_n * hard
     for i in range(3):
         field[i] = field_soft * upright[i] + field_hard * across[i]
+
+
+@njit(cache=True, error_model="numpy")
+def _reflected(
+    normal: np.ndarray, material: int, direction_in: np.ndarray, along: np.ndarray, slabs: Slabs,
+    field: np.ndarray,
+) -> tuple[complex, complex]:
+    """Return a ray's field that a face reflects, in the plane of ray and edge and across it."""
+    reflected = field.copy()
+    ray = reflect(normal, material, direction_in, slabs, reflected)
+    across = cross(along, ray)
+    across /= np.sqrt(dot(across, across))
+    return dot(reflected, cross(ray, across)), dot(reflected, across)

@@ -14,6 +14,7 @@ from radiotwin.report.style import LOS_COLOUR, NLOS_COLOUR, plain, save
 from radiotwin.scene import Scene
 from radiotwin.scene.preview import draw_heights, height_grid
 
+MAX_COLUMNS = 5  # panels in a row
 SHOWN = ("log_distance", "segmented_nn")  # models with maps and located devices
 
 
@@ -53,7 +54,10 @@ def scatter_figure(comparison: Comparison, models: list[str]) -> Figure:
         comparison: with its held-out predictions.
         models: names of the models, a panel for each.
     """
-    figure, axes = panels(1, len(models), 4.2, 4.6)
+    columns = min(len(models), MAX_COLUMNS)
+    figure, axes = panels(-(-len(models) // columns), columns, 4.2, 4.6)
+    for unused in axes.flat[len(models):]:
+        unused.set_visible(False)
     links = comparison.predictions.dropna(subset=["measured_db"])
     levels_db = [links["measured_db"], *(links[model].dropna() for model in models)]
     both_db = np.concatenate(levels_db)

@@ -24,7 +24,9 @@ PARAMETERS = {
     "azimuth_deg": "boresight", "front_to_back_db": "front-to-back ratio", "tilt_deg": "tilt",
     "vertical_beamwidth_deg": "vertical beamwidth", "beamwidth_deg": "beamwidth",
     "lean_azimuth_deg": "azimuth of the tilt, from the heading",
-    "clearest_side_deg": "least obstructed side, from the heading",
+    "body_depth_db": "loss through the body", "body_azimuth_deg": "body, from the heading",
+    "body_elevation_deg": "body, up from the deck", "entry_loss_db": "building entry loss",
+    "hidden_loss_db": "loss behind buildings",
     "limit": "limit of detection", "floor": "noise floor", "saturation_level": "saturation level",
     "strength_db": "strength relative to theory",
     "specific_attenuation_db_km": "specific attenuation",
@@ -43,7 +45,10 @@ SUFFIXES = {"_db_km": "dB/km", "_db_m": "dB/m", "_deg": "°", "_db": "dB", "_dbm
             "_m": "m", "_s": "s"}
 NAMES = {"log_distance": "log-distance law", "raytrace": "ray tracer"}
 MODELS = {"log_distance": "log-distance", "segmented_log_distance": "segmented log-distance",
-          "segmented_nn": "segmented NN", "regression_kriging": "regression kriging"}
+          "segmented_nn": "segmented NN", "regression_kriging": "regression kriging",
+          "tr36777_uma": "TR 36.777 UMa", "tr36777_umi": "TR 36.777 UMi",
+          "al_hourani_urban": "Al-Hourani urban", "p1411": "ITU-R P.1411",
+          "cost231_wi": "COST 231 W-I"}
 INTERPOLATIONS = ("correlated_shadowing", "unexplained_trend")
 """Effects that fit what is left without a cause."""
 

@@ -6,17 +6,21 @@ Rays are cast with Embree [1], which computes in single precision: distances are
 [1] Wald et al., "Embree: a kernel framework for efficient CPU ray tracing", ACM TOG 33(4), 2014.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from radiotwin.errors import RunFailed
+from radiotwin.scene.materials import Material
 from radiotwin.scene.reader import read_triangles
 
 SKIN_M = 0.01  # step past a surface before the next is looked for [m]
+GROUND_M = 0.05  # faces this close to z = 0 are the ground [m]
 CHUNK = 1_000_000  # rays per call: bounds the memory of any query to about 100 MB
+CONCRETE = Material("concrete", itu="concrete")  # of faces whose material is not known
 
 
 def _embree_scene(triangles: np.ndarray) -> Any:
@@ -38,13 +42,20 @@ class CityMap:
     Args:
         vertices: (v, 3) positions [m].
         faces: (f, 3) indices of vertices, counter-clockwise seen from outside.
+        materials: Of the city; by default one, a slab of concrete of `Material`'s thickness.
+        material: (f,) row of `materials` of each face; None: all are of the first.
     """
 
     never_changes = True
 
-    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray,
+                 materials: Sequence[Material] = (CONCRETE,),
+                 material: np.ndarray | None = None) -> None:
         self.vertices = np.asarray(vertices, dtype=float)
         self.faces = np.asarray(faces, dtype=int)
+        self.materials = tuple(materials)
+        self.material = np.zeros(len(self.faces), dtype=int) if material is None \
+            else np.asarray(material, dtype=int)
         triangles = self.vertices[self.faces]
         self._scene = _embree_scene(triangles)
         self._normals = np.cross(triangles[:, 1] - triangles[:, 0],
@@ -53,7 +64,7 @@ class CityMap:
 
     @classmethod
     def from_xml(cls, xml_path: Path | str) -> "CityMap":
-        """Read the meshes that a scene folder's `city.xml` names.
+        """Read the meshes that a scene folder's `city.xml` names, and what they are made of.
 
         Args:
             xml_path: The file.
@@ -62,14 +73,33 @@ class CityMap:
             BadInput: No such file, malformed XML, a mesh that cannot be read, or one outside the
                 folder.
         """
-        meshes = read_triangles(xml_path)
-        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-        return cls(np.concatenate([mesh.vertices for mesh in meshes]),
-                   np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts)]))
+        shapes = [(mesh, material or CONCRETE) for mesh, material in read_triangles(xml_path)]
+        starts = np.cumsum([0, *(len(mesh.vertices) for mesh, _ in shapes)])
+        materials = list(dict.fromkeys(material for _, material in shapes))
+        return cls(np.concatenate([mesh.vertices for mesh, _ in shapes]),
+                   np.concatenate([mesh.faces + start for (mesh, _), start in zip(shapes, starts)]),
+                   materials, np.repeat([materials.index(material) for _, material in shapes],
+                                        [len(mesh.faces) for mesh, _ in shapes]))
 
-    def state(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return all that decides the answers of a map."""
-        return self.vertices, self.faces
+    @cached_property
+    def ground_material(self) -> Material:
+        """Material of the ground z = 0: that of most faces there that look up; else concrete."""
+        area_m2 = np.where(self.on_ground & (self._normals[:, 2] > 0), self._normals[:, 2] / 2, 0.0)
+        by_material = np.bincount(self.material, weights=area_m2, minlength=len(self.materials))
+        return self.materials[int(by_material.argmax())] if by_material.any() else CONCRETE
+
+    @cached_property
+    def on_ground(self) -> np.ndarray:
+        """(f,) bool: faces within `GROUND_M` of the ground z = 0."""
+        return (np.abs(self.vertices[self.faces][:, :, 2]) < GROUND_M).all(axis=1)
+
+    def without(self, faces: np.ndarray) -> "CityMap":
+        """Return the map without some faces, (f,) bool."""
+        return CityMap(self.vertices, self.faces[~faces], self.materials, self.material[~faces])
+
+    def state(self) -> tuple[np.ndarray, np.ndarray, tuple[Material, ...], np.ndarray]:
+        """Return all that decides the answers of a map, and what paths over it are."""
+        return self.vertices, self.faces, self.materials, self.material
 
     def line_of_sight(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
         """Return whether no surface lies between points.

@@ -12,6 +12,7 @@ import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.scene.material_mapping import map_materials
+from radiotwin.scene.materials import Material
 from radiotwin.scene.meshes import RawMesh, load_shapes
 from radiotwin.scene.mitsuba_xml import DeclaredCity, read_mitsuba_xml
 from radiotwin.scene.names import RESERVED_NAMES, Names, safe_name, unique_name
@@ -19,20 +20,22 @@ from radiotwin.scene.writer import CityShape
 from radiotwin.tables import MAX_COORDINATE_M
 
 
-def read_triangles(xml_path: Path | str) -> list[RawMesh]:
+def read_triangles(xml_path: Path | str) -> list[tuple[RawMesh, Material | None]]:
     """Read the triangles of every shape, whatever it is made of.
 
     Args:
         xml_path: `city.xml` of a scene folder.
 
     Returns:
-        The meshes in the file's order.
+        The mesh and the material of each shape in the file's order; None: no known material.
 
     Raises:
         BadInput: No such file, malformed XML, an element or a mesh that cannot be read, or a file
             outside the folder.
     """
-    return _meshes(Path(xml_path), _declared(Path(xml_path)))
+    declared = _declared(Path(xml_path))
+    materials = map_materials(declared.shapes, declared.materials, {})[0]
+    return list(zip(_meshes(Path(xml_path), declared), materials, strict=True))
 
 
 def read_city(xml_path: Path | str) -> list[CityShape]:

@@ -11,6 +11,7 @@ from radiotwin.scene import Scene
 from radiotwin.scene.config import UavConfig
 from radiotwin.survey.grid import MOVE_COST, FlightGrid
 from radiotwin.survey.patterns import PATTERNS
+from radiotwin.survey.truth import require_possible
 
 _MAX_FLIGHTS = 100_000  # far beyond any campaign: a typing error
 _MAX_NOISE_DB = 50.0  # as is this: receivers are off by some decibels
@@ -33,7 +34,8 @@ def fly_survey(scene: Scene, truth: RadioMap, *, flights: int, pattern: str, see
         The measurements; unknown devices are without x and y.
 
     Raises:
-        BadInput: An unknown pattern, no flight, no UAV, or a map of another scene.
+        BadInput: An unknown pattern, no flight, no UAV, a map of another scene, or one with gains
+            that physics does not allow.
     """
     _check(scene, truth, flights, pattern, noise_db)
     limit_db = scene.config.gain_limit_db
@@ -180,3 +182,4 @@ def _check(scene: Scene, truth: RadioMap, flights: int, pattern: str, noise_db: 
                        "[[devices]]\ndevice = 'd0'\nx_m = 10.0\ny_m = 20.0\nz_m = 1.5\n"
                        "role = 'anchor'\n\nor build the scene with --devices N")
     scene.check_map(truth)
+    require_possible(scene, truth)

@@ -1,5 +1,8 @@
 """The radio map that a simulated flight meets: traced, statistical, or any other."""
 
+import numpy as np
+from scipy.constants import speed_of_light
+
 from radiotwin.errors import BadInput
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
@@ -25,3 +28,42 @@ def read_truth(scene: Scene, truth: str) -> RadioMap:
                            "use --truth segmented")
         return RadioMap.read(path)
     return RadioMap.read(truth)
+
+
+# A map says nothing of its links' paths. In a street, two walls and the ground give 16 paths of at
+# most four reflections, each weaker than the direct one: 9 off the walls, 7 off the ground, too.
+_MAX_PATHS = 16
+
+
+def require_possible(scene: Scene, truth: RadioMap) -> None:
+    """Raise BadInput if a traced link with line of sight is far above free space.
+
+    The bound is free space (ITU-R P.525-4, eq. 4) between the peaks of the antennas, and 12 dB, or
+    24 dB where fields were added: 16 paths as strong as the direct one. Maps that are not of gains
+    at points (the solver `map`, statistical truths) are not checked.
+
+    Args:
+        scene: Scene that the map was made for.
+        truth: Map with all its devices.
+    """
+    attributes = truth.dataset.attrs
+    if attributes.get("source") != "raytrace" or attributes.get("solver") != "paths":
+        return
+    coherent = attributes.get("combining") == "coherent"
+    bound_db = (20 if coherent else 10) * np.log10(_MAX_PATHS)
+    positions_m, frequency_hz = scene.lattice.positions_m, scene.config.radio.frequency_hz
+    for device, at_m, antenna in zip(scene.config.devices, scene.device_m, scene.device_antennas):
+        row = truth.devices.index(device.device)
+        distance_m = np.maximum(np.linalg.norm(positions_m - at_m, axis=1), 0.01)
+        above_db = (truth.gain_db[row].ravel() - sum(
+            end.pattern.peak_dbi for end in (antenna, scene.uav_antenna) if end is not None)
+            - 20 * np.log10(speed_of_light / (4 * np.pi * frequency_hz * distance_m)))
+        wrong = truth.los[row].ravel() & (above_db > bound_db)
+        if wrong.any():
+            worst = int(np.where(wrong, above_db, -np.inf).argmax())
+            position = ", ".join(f"{value:g}" for value in positions_m[worst])
+            raise BadInput(
+                f"{wrong.sum()} links with line of sight of {device.device} lie more than "
+                f"{bound_db:.0f} dB above free space (at {position} m {above_db[worst]:+.1f} dB), "
+                "which no reflections bring; versions that counted a direct path several times "
+                "made such maps: run `radiotwin trace` again")

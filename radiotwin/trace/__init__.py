@@ -1,7 +1,9 @@
 """Ray tracing with Sionna RT: the physical truth. Tracing needs libLLVM; importing does not."""
 
+from radiotwin.trace.pilot import Rung, choose_quality
 from radiotwin.trace.points import read_points, trace_gains, trace_points
 from radiotwin.trace.run import trace_map
 from radiotwin.trace.settings import QUALITIES, SolverSettings
 
-__all__ = ["QUALITIES", "SolverSettings", "read_points", "trace_gains", "trace_map", "trace_points"]
+__all__ = ["QUALITIES", "Rung", "SolverSettings", "choose_quality", "read_points", "trace_gains",
+           "trace_map", "trace_points"]

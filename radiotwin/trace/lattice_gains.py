@@ -9,10 +9,9 @@ from radiotwin.progress import progress
 from radiotwin.scene import Scene
 from radiotwin.trace.batches import BatchStore
 from radiotwin.trace.cell_gains import CellGains
-from radiotwin.trace.settings import SolverSettings
+from radiotwin.trace.settings import FINER, SolverSettings
 from radiotwin.trace.solver import PathGains
 
-_FINER = 10  # factor of rays, for the estimate of the numerical noise
 # Solves one device (index), positions (n, 3) [m] and reports its progress
 _Solve = Callable[[int, np.ndarray, Callable[..., None]], np.ndarray]
 
@@ -76,7 +75,7 @@ def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index
     else:
         columns, rows = np.arange(_plane(scene)), slice(0, 1)
     work = [(f"device-{device:03d}-finer", device, columns) for device in index[rows]]
-    gains = _solve(scene, settings.finer(_FINER), store, work, "numerical noise")
+    gains = _solve(scene, settings.finer(FINER), store, work, "numerical noise")
     return rows, columns, np.stack(gains)
 
 

@@ -20,7 +20,7 @@ from radiotwin.scene import Scene
 from radiotwin.tables import MAX_COORDINATE_M, Origin
 from radiotwin.trace.run import device_indices
 from radiotwin.trace.settings import SolverSettings
-from radiotwin.trace.solver import Antennas, PathGains
+from radiotwin.trace.solver import IMPOSSIBLE_DB, Antennas, PathGains
 
 
 def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settings: SolverSettings,
@@ -37,7 +37,8 @@ def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settin
         antennas: Antennas of the k transmitters; None: isotropic.
 
     Returns:
-        (k, n) gain [dB]; NaN where there is no path.
+        (k, n) gain [dB]; NaN where there is no path, infinite where the tracer found more power
+        than the link's paths can carry, with a second seed, too.
 
     Raises:
         BadInput: Settings for another solver, or a scene that cannot be read.
@@ -99,7 +100,8 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings,
     Returns:
         One row per link: device, x_m, y_m, z_m, gain_db (NaN: not detected), los, and reason:
         empty, or why there is no gain: below the ground, inside a building, within a wavelength
-        (no far field, and Sionna RT drops the direct path at a centimetre), no path, or below
+        (no far field, and Sionna RT drops the direct path at a centimetre), no path, impossible
+        gain (more power than the link's paths can carry, with a second seed, too), or below
         sensitivity.
 
     Raises:
@@ -123,9 +125,9 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings,
         near = np.linalg.norm(points_m - device_m, axis=1) < wavelength_m
         reason = np.select(
             [inside & (points_m[:, 2] < 0), inside, near, np.isnan(gain_db[row]),
-             gain_db[row] < scene.config.gain_limit_db],
+             gain_db[row] == IMPOSSIBLE_DB, gain_db[row] < scene.config.gain_limit_db],
             ["below the ground", "inside a building", "within a wavelength", "no path",
-             "below sensitivity"], default="")
+             "impossible gain", "below sensitivity"], default="")
         tables.append(pd.DataFrame({
             "device": scene.config.devices[device].device,
             "x_m": points_m[:, 0], "y_m": points_m[:, 1], "z_m": points_m[:, 2],

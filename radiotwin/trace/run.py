@@ -1,6 +1,7 @@
 """The truth map: every lattice position, every device, resumable and checked."""
 
 import math
+import warnings
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from radiotwin.trace.lattice_gains import solve_finer, solve_lattice
 from radiotwin.trace.noise import noise_figures
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.sionna_scene import library_versions
+from radiotwin.trace.solver import IMPOSSIBLE_DB
 
 
 def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
@@ -37,7 +39,8 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
 
     Returns:
         The map: gain [dB], NaN where there is no path, the gain is below the receiver's
-        sensitivity, or the position is inside a building; the counts of each are attributes.
+        sensitivity, the position is inside a building, or the tracer found more power than the
+        link's paths can carry; the counts of each are attributes. The last comes with a warning.
 
     Raises:
         BadInput: No device, an unknown one, a scene that cannot be read, or an output that cannot
@@ -68,17 +71,25 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
     frequency_hz = scene.config.radio.frequency_hz
     direct_dbi, peak_dbi = _antenna_gains(scene, index)
 
-    def outdoors(values: np.ndarray) -> np.ndarray:
-        return np.broadcast_to(values, raw_db.shape)[:, ~inside].ravel()
+    impossible = (raw_db == IMPOSSIBLE_DB) & ~inside
+    if impossible.any():
+        warnings.warn(f"{impossible.sum()} of {impossible.size} links carry more power than their "
+                      "paths can, with a second seed, too; they are left out of the map (NaN)",
+                      stacklevel=2)
+    raw_db[raw_db == IMPOSSIBLE_DB] = np.nan
+    checked = ~inside & ~impossible
+
+    def chosen(values: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(values, raw_db.shape)[checked]
 
     figures: dict[str, float | str] = dict(
-        check_gains(outdoors(raw_db), outdoors(los), outdoors(distance_m), frequency_hz,
-                    settings.solver, settings.combining, outdoors(direct_dbi), outdoors(peak_dbi)))
+        check_gains(chosen(raw_db), chosen(los), chosen(distance_m), frequency_hz,
+                    settings.solver, settings.combining, chosen(direct_dbi), chosen(peak_dbi)))
     limit_db = scene.config.gain_limit_db
-    gain_db, counts = _censor(raw_db, inside, limit_db)
+    gain_db, counts = _censor(raw_db, inside, impossible, limit_db)
     rows, columns, finer_db = solve_finer(scene, settings, store, index)
     outside = ~inside[columns]
-    finer_db = np.where(finer_db >= limit_db, finer_db, np.nan)
+    finer_db[(finer_db < limit_db) | (finer_db == IMPOSSIBLE_DB)] = np.nan
     figures |= noise_figures(gain_db[rows, columns][:, outside].ravel(),
                              finer_db[:, outside].ravel())
     attributes = {"source": "raytrace", "frequency_hz": frequency_hz, "gain_limit_db": limit_db,
@@ -151,11 +162,11 @@ def _key(scene: Scene, settings: SolverSettings) -> dict[str, Any]:
             "settings": settings.attributes(), "libraries": library_versions()}
 
 
-def _censor(raw_db: np.ndarray, inside: np.ndarray, limit_db: float
+def _censor(raw_db: np.ndarray, inside: np.ndarray, impossible: np.ndarray, limit_db: float
             ) -> tuple[np.ndarray, dict[str, int]]:
     """Replace undetected gains by NaN, and count the links by reason."""
     within = np.broadcast_to(inside, raw_db.shape)
-    no_path = np.isnan(raw_db) & ~within
+    no_path = np.isnan(raw_db) & ~within & ~impossible
     below = ~within & (raw_db < limit_db)
     gain_db = np.where(within | below, np.nan, raw_db)
     return gain_db, {
@@ -163,4 +174,5 @@ def _censor(raw_db: np.ndarray, inside: np.ndarray, limit_db: float
         "links_without_path": int(no_path.sum()),
         "links_below_sensitivity": int(below.sum()),
         "links_inside_building": int(within.sum()),
+        "links_impossible": int(impossible.sum()),
     }

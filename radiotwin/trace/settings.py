@@ -26,6 +26,7 @@ QUALITIES: dict[str, dict[str, int]] = {
     "high": {"samples_per_src": 500_000, "batch_receivers": 20},
 }
 
+FINER = 10  # factor of rays, for the estimate of the numerical noise
 # Entries of the table in which Sionna RT looks up whether a candidate path is new. Two candidates
 # with one entry are taken for one, and a path is dropped: at Sionna's 10^6 about 8 % of the
 # candidates of 60 receivers, and which ones depends on the other receivers in the call. A prime, as
@@ -106,4 +107,5 @@ class SolverSettings:
         """Return all that decides a gain, as attributes of a NetCDF file (without booleans)."""
         own = {name: int(value) if isinstance(value, bool) else value
                for name, value in asdict(self).items()}
-        return own | {"table_size": TABLE_SIZE, "diffraction_probability": DIFFRACTION_PROBABILITY}
+        return own | {"table_size": TABLE_SIZE, "diffraction_probability": DIFFRACTION_PROBABILITY,
+                      "paths_counted": "once"}

@@ -6,14 +6,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.constants import speed_of_light
 
 from radiotwin.antennas import Antenna
+from radiotwin.trace.distinct import distinct_paths
 from radiotwin.trace.settings import DIFFRACTION_PROBABILITY, TABLE_SIZE, SolverSettings
 from radiotwin.trace.sionna_scene import candidate_search, import_sionna, load_city
 
 # Dr.Jit keeps freed memory for the next call, which needs the same sizes again but for the paths.
 # Freed after every call, 40 % of the time goes into allocating it again; never, it may pile up.
 _CALLS_BETWEEN_FLUSHES = 10
+# A path is no stronger than free space over its own length; this much is left to rounding.
+_BOUND_TOLERANCE_DB = 0.1
+IMPOSSIBLE_DB = np.inf
+"""Gain of a link that stays above what its own paths can carry."""
 
 Antennas = tuple[Antenna | None, Antenna | None]
 
@@ -61,14 +67,29 @@ class PathGains:
         directions in which it leaves and arrives, and stays vertically polarised, as a pattern of
         levels says nothing else.
 
+        A path counts once (`radiotwin.trace.distinct`), and carries no more than free space does
+        over its own length between the peaks of the antennas. A link whose gain exceeds what all
+        its paths can carry is solved again alone, with the next seed.
+
         Args:
             device_m: (3,) position [m].
             points_m: (n, 3) positions [m], n at most `settings.batch_receivers`.
             antennas: Antennas of the device and of the receivers; None: isotropic.
 
         Returns:
-            (n,) gain [dB]; NaN where there is no path.
+            (n,) gain [dB]; NaN where there is no path, `IMPOSSIBLE_DB` where the second solution
+            exceeds its bound, too.
         """
+        seed = self.settings.seed
+        gain_db = self._solve(device_m, points_m, antennas, seed)
+        for row in np.flatnonzero(gain_db == IMPOSSIBLE_DB):
+            alone_m, other_seed = points_m[row:row + 1], (seed + 1) % 2**31
+            gain_db[row] = self._solve(device_m, alone_m, antennas, other_seed)[0]
+        return gain_db
+
+    def _solve(self, device_m: np.ndarray, points_m: np.ndarray, antennas: Antennas, seed: int
+               ) -> np.ndarray:
+        """Solve once; `IMPOSSIBLE_DB` where a gain exceeds its bound."""
         import drjit
 
         settings = self.settings
@@ -81,14 +102,14 @@ class PathGains:
             paths = self._solver(
                 self._city, max_depth=settings.max_depth, samples_per_src=settings.samples_per_src,
                 max_num_paths_per_src=settings.max_num_paths_per_src,
-                refraction=settings.refraction, diffraction=settings.diffraction,
-                seed=settings.seed)
-        power = self._combine(paths, antennas)[: len(points_m)]
+                refraction=settings.refraction, diffraction=settings.diffraction, seed=seed)
+        power, bound = (sums[:len(points_m)] for sums in self._combine(paths, antennas))
         del paths
         self._calls += 1
         if self._calls % _CALLS_BETWEEN_FLUSHES == 0:
             drjit.flush_malloc_cache()
-        return power_to_db(power)
+        possible = power <= bound * 10 ** (_BOUND_TOLERANCE_DB / 10)
+        return np.where(possible, power_to_db(power), IMPOSSIBLE_DB)
 
     def gains(self, device_m: np.ndarray, points_m: np.ndarray, antennas: Antennas = (None, None),
               advance: Callable[[int], None] = lambda n: None) -> np.ndarray:
@@ -101,7 +122,7 @@ class PathGains:
             advance: Called with the number of points after each batch.
 
         Returns:
-            (n,) gain [dB]; NaN where there is no path.
+            (n,) gain [dB] as in `solve`.
         """
         gain_db = np.full(len(points_m), np.nan)
         for part in self.batches(len(points_m)):
@@ -109,24 +130,39 @@ class PathGains:
             advance(part.stop - part.start)
         return gain_db
 
-    def _combine(self, paths: Any, antennas: Antennas) -> np.ndarray:
-        """Return the (batch_receivers,) received over transmitted power."""
-        real, imaginary = (np.array(part, dtype=float).reshape(self.settings.batch_receivers, -1)
-                           for part in paths.a)
-        field = real + 1j * imaginary
-        ends = zip(antennas, (paths.theta_t, paths.theta_r), (paths.phi_t, paths.phi_r))
-        for antenna, zenith, azimuth in ends:
-            if antenna is not None:
-                zenith, azimuth = (np.array(angle, dtype=float).reshape(field.shape)
-                                   for angle in (zenith, azimuth))
-                field *= 10 ** (antenna.gain_dbi(_directions(zenith, azimuth)) / 20)
-        if self.settings.combining == "power":
-            return _exact_sums(np.abs(field) ** 2)
+    def _combine(self, paths: Any, antennas: Antennas) -> tuple[np.ndarray, np.ndarray]:
+        """Return the (batch_receivers,) received over transmitted power, and its highest value."""
+        n = self.settings.batch_receivers
+
+        def by_link(values: Any) -> np.ndarray:
+            return np.array(values, dtype=float).reshape(n, -1)
+
+        field = by_link(paths.a[0]) + 1j * by_link(paths.a[1])
+        leaving, arriving = (_directions(by_link(zenith), by_link(azimuth)) for zenith, azimuth in
+                             ((paths.theta_t, paths.phi_t), (paths.theta_r, paths.phi_r)))
+        counted = self._counted(paths, np.abs(field), np.sum(leaving * arriving, axis=-1))
         # Sionna's coefficients lack the phase of the delay, which is -1 where there is no path
-        delay_s = np.array(paths.tau, dtype=float).reshape(field.shape)
-        phase = -2 * np.pi * float(self._city.frequency[0]) * delay_s
-        field *= np.exp(1j * phase)
-        return _exact_sums(field.real) ** 2 + _exact_sums(field.imag) ** 2
+        delay_s = by_link(paths.tau)
+        field *= counted
+        frequency_hz = float(self._city.frequency[0])
+        limit = counted / (4 * np.pi * frequency_hz * np.where(counted, delay_s, 1.0))
+        for antenna, direction in zip(antennas, (leaving, arriving)):
+            if antenna is not None:
+                field *= 10 ** (antenna.gain_dbi(direction) / 20)
+                limit *= 10 ** (antenna.pattern.peak_dbi / 20)
+        if self.settings.combining == "power":
+            return _exact_sums(np.abs(field) ** 2), _exact_sums(limit**2)
+        field *= np.exp(-2j * np.pi * frequency_hz * delay_s)
+        return (_exact_sums(field.real) ** 2 + _exact_sums(field.imag) ** 2,
+                _exact_sums(limit) ** 2)
+
+    def _counted(self, paths: Any, strength: np.ndarray, cos_turn: np.ndarray) -> np.ndarray:
+        """Return (n, k) whether a path counts; arguments as of `distinct_paths`."""
+        interactions = np.array(paths.interactions)
+        interactions = interactions.reshape(len(interactions), *strength.shape)
+        vertices_m = np.array(paths.vertices).reshape(*interactions.shape, 3)
+        length_m = speed_of_light * np.array(paths.tau, dtype=float).reshape(strength.shape)
+        return distinct_paths(interactions, vertices_m, length_m, strength, cos_turn)
 
 
 def power_to_db(power: np.ndarray) -> np.ndarray:

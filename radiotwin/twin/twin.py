@@ -10,6 +10,7 @@ import numpy as np
 
 import radiotwin
 from radiotwin.channel import ChannelModel
+from radiotwin.channel.path_kriging import PathKriging
 from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.channel.residual_field import ResidualField
 from radiotwin.effects.correlated_shadowing import NAME as SHADOWING
@@ -69,7 +70,7 @@ class Twin:
     @property
     def residual_field(self) -> ResidualField | None:
         """Interpolation of the residual; None where the twin has none."""
-        if isinstance(self.channel, RegressionKriging):
+        if isinstance(self.channel, RegressionKriging | PathKriging):
             return self.channel.field
         if self.fitted is not None and self.fitted.shadowing is not None:
             return self.fitted.shadowing.field

@@ -10,6 +10,8 @@ from safetensors.numpy import save_file
 
 from radiotwin.channel import channel_models, load_channel, save_channel
 from radiotwin.channel.image_paths import ImagePaths
+from radiotwin.channel.map_error import MapError
+from radiotwin.channel.path_kriging import PathKriging
 from radiotwin.errors import BadInput
 from radiotwin.scene.citymap import CityMap
 
@@ -17,11 +19,16 @@ MODELS = channel_models()
 
 @pytest.fixture(scope="module")
 def models(fitted_nn):
-    """One of each kind; of that which follows paths, with a law and a diffuse power of its own."""
+    """One of each kind; of those which follow paths, with laws and a diffuse power of their own."""
     network, data = fitted_nn
-    found = {kind.name: kind().fit(data.links, data.level_db, -120.0, seed=0)
+    house = trimesh.creation.box(bounds=[[200, 300, 0], [240, 360, 20]])
+    links = replace(data.links, frequency_hz=2.4e9, city=CityMap(house.vertices, house.faces))
+    found = {kind.name: kind().fit(links, data.level_db, -120.0, seed=0)
              for kind in MODELS.values() if not kind.follows_paths and kind.name != network.name}
-    return found | {network.name: network,
+    near = PathKriging()
+    near.diffuse, near.kriging, near.weight = (-93.0, 3.5), found["regression_kriging"], np.array([0.3, 0.8])
+    near.field, near.map_error = near.kriging.field, MapError((1.5, 1.0, 2.0), (0.0, 0.0, 1.0))
+    return found | {network.name: network, near.name: near,
                     ImagePaths.name: ImagePaths(found["segmented_log_distance"], (-93.0, 3.5))}
 
 

@@ -7,6 +7,8 @@ import pandas as pd
 import pytest
 import xarray as xr
 
+from radiotwin.compare import published_models
+
 
 @pytest.fixture(scope="module")
 def chain(run, tmp_path_factory):
@@ -47,7 +49,8 @@ def test_the_map_is_one_that_others_can_read(chain):
 def test_the_comparison_has_every_model_against_both_judges(chain):
     record = json.loads((chain / "comparison" / "compare.json").read_text())
     scores = pd.DataFrame(record["scores"])
-    models = {"log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging"}
+    models = {"log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging",
+              *published_models(2.4e9)}
     for against, names in (("held-out flights", models | {"twin"}), ("whole map", models | {"twin", "twin.nc"})):
         part = scores[scores["against"] == against]
         assert set(part["model"]) == names

@@ -5,6 +5,7 @@ import shutil
 import numpy as np
 import pandas as pd
 import pytest
+import xarray as xr
 
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
@@ -22,6 +23,18 @@ def folder(small_scene, tmp_path):
     radio_map = RadioMap.build(["d0", "d1"], lattice, gain_db, gain_db > -70, attributes={"source": "test"})
     radio_map.write(tmp_path / "map.nc")
     return tmp_path
+
+
+def test_paths_out(run, folder):
+    (folder / "points.csv").write_text("x_m,y_m,z_m\n40,40,55\n10,30,30\n")
+    result = run("paths scene --points points.csv --devices d1 --velocity 0,5,0 --bandwidth-hz 1e7 -o out/paths.nc",
+                 cwd=folder)
+    assert result.returncode == 0 and "paths of 2 links" in result.stdout, result.stderr
+    with xr.open_dataset(folder / "out" / "paths.nc") as listed:
+        assert listed.sizes["link"] == 2 and listed["path_count"].sum() == listed.sizes["path"] > 2
+        assert listed.attrs["bandwidth_hz"] == 1e7 and "doppler_hz" in listed
+    result = run("paths scene --points points.csv --velocity 5,north -o bad.nc", cwd=folder)
+    assert result.returncode == 2 and "VX,VY,VZ" in result.stderr and not (folder / "bad.nc").exists()
 
 
 @pytest.mark.parametrize("out", ["out", "city.glb", "city.gltf", "city.obj"])

@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import trimesh
 
 from radiotwin.effects.interference import Interference
+from radiotwin.scene.citymap import CityMap
 
 
 def watts(level_db):
@@ -55,3 +57,33 @@ def test_a_floor_that_is_the_same_everywhere_is_no_emitter(open_ground, loop):
     world = open_ground.fly(22)
     world.gain_db = 10 * np.log10(watts(world.gain_db) + watts(-97.0))
     assert loop(open_ground.measured(world)).names == ["noise_floor_censoring"]
+
+
+@pytest.fixture
+def walled():
+    """A long wall, 60 m high, along the y axis at x = 150 m."""
+    wall = trimesh.creation.box(extents=(4, 600, 60))
+    wall.apply_translation((150, 150, 30))
+    return CityMap(wall.vertices, wall.faces)
+
+
+def test_behind_buildings_an_emitter_is_weaker(make_links, walled):
+    receiver_m = np.array([[50.0, 80, 30], [250.0, 80, 30], [250.0, 80, 400]])  # beside it, behind the wall, above it
+    links = make_links([[0.0, 0, 1.5]], receiver_m, city=walled)
+    params = Interference.Params(place_m=(120.0, 80.0), level_db=-90.0, within_m=(0, 0, 300, 300), hidden_loss_db=17.0)
+    power = Interference().inputs(links, params) / heard(receiver_m, np.array([120.0, 80.0, 1.5]), -90.0)
+    np.testing.assert_allclose(10 * np.log10(power), [0, -17, 0], atol=1e-9)
+
+
+def test_an_emitter_that_a_wall_hides_is_found(make_links, view, walled):
+    rng = np.random.default_rng(0)
+    receiver_m = np.column_stack([rng.uniform(0, 300, (400, 2)), np.full(400, 25.0)])
+    links = make_links([[150.0, -40, 40.0]], receiver_m, city=walled)
+    emitter_m = np.array([60.0, 120.0, 1.5])
+    mean_db = -60 - 22 * np.log10(links.distance_m)
+    power = heard(links.receiver_m, emitter_m, -100.0)
+    power[links.receiver_m[:, 0] > 150] /= 100  # behind the wall
+    links.level_db[:] = 10 * np.log10(watts(mean_db) + power) + rng.normal(0, 1.0, 400)
+    best = Interference().propose(view(links, mean_db, 1.0))[0]
+    assert np.hypot(*(np.array(best.place_m) - emitter_m[:2])) < 30 and best.hidden_loss_db == 20
+    assert len(Interference().variation(best).values) == 4

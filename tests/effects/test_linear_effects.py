@@ -1,9 +1,8 @@
-"""Effects that are linear: offsets, loss per kilometre, and the body's shadow."""
+"""Effects that are linear: offsets, and loss per kilometre."""
 
 import numpy as np
 import pytest
 
-from radiotwin.effects.body_shadowing import BodyShadowing
 from radiotwin.effects.excess_attenuation import ExcessAttenuation
 from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
 from radiotwin.effects.params import Estimate
@@ -46,8 +45,9 @@ def test_a_loss_per_kilometre_is_in_proportion_to_distance(links):
     term = ExcessAttenuation().term(links, ExcessAttenuation.Params(scale_height_m=1e7), None)
     distance_km = np.sqrt(((links.receiver_m - DEVICES_M[links.device]) ** 2).sum(axis=1)) / 1000
     np.testing.assert_allclose(term.columns @ [12.0], -12 * distance_km, rtol=1e-4)
-    assert ExcessAttenuation().implausible(None, np.array([12.0])) is None
-    assert "amplify" in ExcessAttenuation().implausible(None, np.array([-12.0]))
+    unbounded = ExcessAttenuation.Params(scale_height_m=1e7)
+    assert ExcessAttenuation().implausible(unbounded, np.array([12.0])) is None
+    assert "amplify" in ExcessAttenuation().implausible(unbounded, np.array([-12.0]))
 
 
 def test_a_loss_that_decreases_with_height_is_the_integral_along_the_link(links):
@@ -57,20 +57,6 @@ def test_a_loss_that_decreases_with_height_is_the_integral_along_the_link(links)
     density = np.exp(-(start_m[:, 2] + share * (end_m - start_m)[:, 2]) / 30).mean(axis=0)
     expected_db = -12 * np.linalg.norm(end_m - start_m, axis=1) / 1000 * density
     np.testing.assert_allclose(term.columns @ [12.0], expected_db, rtol=1e-4)
-
-
-def test_the_body_shadows_one_side(links):
-    params = BodyShadowing.Params(members=[1])
-    term = BodyShadowing().term(links, params, None)
-    # 4 dB more at 60 degrees right of the nose, 4 dB less on the opposite side.
-    coefficients = 4 * np.array([np.cos(np.pi / 3), np.sin(np.pi / 3)])
-    east, north = (DEVICES_M[links.device] - links.receiver_m)[:, :2].T
-    bearing = np.arctan2(east, north) - np.radians(links.heading_deg)
-    expected_db = np.where(links.receiver == 1, 4 * np.cos(bearing - np.pi / 3), 0.0)
-    np.testing.assert_allclose(term.columns @ coefficients, expected_db, atol=1e-9)
-    found = BodyShadowing().parameters(links, params, Estimate(coefficients, 0.01 * np.eye(2), np.zeros(0)))
-    assert found["front_to_back_db[r1]"].value == pytest.approx(8)
-    assert found["clearest_side_deg[r1]"].value == pytest.approx(60)
 
 
 def test_no_offset_is_proposed_where_one_member_only_has_enough_links(links, view):

@@ -169,7 +169,8 @@ def _write_effects(folder: Path) -> None:
     from radiotwin.twin import Twin
 
     source = Path(__file__).parents[1] / "twin" / "version_1"
-    parts = json.loads((source / "effects.json").read_text())
+    parts = [part for part in json.loads((source / "effects.json").read_text())
+             if part["name"] != "body_shadowing"]  # that of 0.1 had other parameters, and is refused
     for name, over in (("corrected", "links"), ("raytrace", "map")):
         old = folder / f"old_{name}"
         shutil.copytree(source / name, old)

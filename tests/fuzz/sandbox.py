@@ -48,10 +48,11 @@ def run_watched(command: str, case: Path, listener: socket.socket) -> Outcome:
     for name in ("home", "tmp"):
         (case / name).mkdir(exist_ok=True)
     started = time.monotonic()
+    inherited = _resident_bytes(os.getpid())  # a child begins with what this process holds
     pid = os.fork()
     if pid == 0:
         _child(command, case)
-    status, usage, killed = _wait(pid, started)
+    status, usage, killed = _wait(pid, started, inherited)
     wall_s = time.monotonic() - started
     output = (case / "output.txt").read_text(errors="replace")
     breaches = [killed] if killed else []
@@ -62,7 +63,7 @@ def run_watched(command: str, case: Path, listener: socket.socket) -> Outcome:
     with contextlib.suppress(FileNotFoundError):
         breaches += sorted(set((case / _BREACHES_FILE).read_text(errors="replace").splitlines()))
     breaches += _leaks(case, listener)
-    return Outcome(status, wall_s, usage.ru_maxrss * 1024, output, tuple(breaches))
+    return Outcome(status, wall_s, max(usage.ru_maxrss * 1024 - inherited, 0), output, tuple(breaches))
 
 
 def arguments_of(command: str) -> list[str]:
@@ -88,15 +89,18 @@ def _leaks(case: Path, listener: socket.socket) -> list[str]:
     return sorted(set(found))
 
 
-def _wait(pid: int, started: float) -> tuple[int, resource.struct_rusage, str]:
-    page, killed = os.sysconf("SC_PAGE_SIZE"), ""
+def _resident_bytes(pid: int) -> int:
+    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def _wait(pid: int, started: float, inherited: int) -> tuple[int, resource.struct_rusage, str]:
+    killed = ""
     while True:
         done, status, usage = os.wait4(pid, os.WNOHANG)
         if done:
             return os.waitstatus_to_exitcode(status), usage, killed
         with contextlib.suppress(OSError, IndexError, ValueError):
-            resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * page
-            if resident > MAX_PEAK_BYTES:
+            if _resident_bytes(pid) - inherited > MAX_PEAK_BYTES:
                 killed = killed or f"memory above {MAX_PEAK_BYTES // 2**20} MiB"
             if _cpu_s(pid) > MAX_CPU_S:
                 killed = killed or f"longer than {MAX_CPU_S} s"

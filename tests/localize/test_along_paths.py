@@ -7,7 +7,8 @@ from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.links import prepare_links
 from radiotwin.localize import along_paths
 from radiotwin.measurements import Measurements
-from radiotwin.twin.fit import fit_links, fit_paths, relocation_from
+from radiotwin.twin.fit_links import fit_links
+from radiotwin.twin.fit_paths import fit_paths, relocation_from
 
 
 def found(twin, name):

@@ -14,6 +14,26 @@ def _turn(points_m, angle_rad):
 
 
 @pytest.fixture(scope="session")
+def line_of_slab():
+    """Reflection (TE, TM) of a slab as a transmission line that ends in free space.
+
+    Collin, "Field Theory of Guided Waves", 2nd ed., section 3.4: wave impedances of the two polarisations, and the
+    input impedance of a line. The constants are those of ITU-R P.2040's table.
+    """
+    def build(sine, real=5.24, conductivity_s_m=0.0462 * 2.4**0.7822, thickness_m=0.1, frequency_hz=2.4e9):
+        angular = 2 * np.pi * frequency_hz
+        permittivity = real - 1j * conductivity_s_m / (angular * 8.8541878128e-12)
+        root = np.sqrt(permittivity - 1 + sine**2)
+        turn = np.tan(angular / 299_792_458.0 * thickness_m * root)
+        coefficients = []
+        for outside, inside in ((1 / sine, 1 / root), (sine, root / permittivity)):  # over that of vacuum
+            line = inside * (outside + 1j * inside * turn) / (inside + 1j * outside * turn)
+            coefficients.append((line - outside) / (line + outside))
+        return coefficients[0], -coefficients[1]  # TM: of the magnetic field
+    return build
+
+
+@pytest.fixture(scope="session")
 def turn():
     """Rotates (n, 3) points about the vertical by an angle [rad]."""
     return _turn

@@ -5,6 +5,7 @@ import pytest
 
 from radiotwin.paths import extract_edges
 from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.materials import itu_material
 
 
 def lengths_m(edges):
@@ -45,3 +46,11 @@ def test_the_angle_of_a_gable(prism):
     eaves = np.isclose(edges.start_m[:, 2], 6) & np.isclose(edges.end_m[:, 2], 6)
     assert np.allclose(edges.exterior_rad[ridge], np.radians(270)) and ridge.sum() == 1
     assert np.allclose(edges.exterior_rad[eaves], np.radians(360 - 135)) and eaves.sum() == 2
+
+
+def test_faces_of_two_materials_form_no_edge(city_of):
+    """As in Sionna RT: the roof's four edges are gone, the corners of the walls stay."""
+    whole = city_of((0, 0, 10, 20, 30))
+    roof = (whole.vertices[whole.faces][:, :, 2] == 30).all(axis=1)
+    city = CityMap(whole.vertices, whole.faces, [itu_material("brick"), itu_material("metal")], roof.astype(int))
+    assert lengths_m(extract_edges(city)).tolist() == [30, 30, 30, 30]

@@ -8,6 +8,7 @@ from radiotwin.errors import BadInput
 from radiotwin.paths import extract_edges, extract_facets
 from radiotwin.paths.surfaces import pack, within
 from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.materials import itu_material
 
 
 def sliced_wall(height_m=10.0):
@@ -39,6 +40,16 @@ def test_a_box_has_four_walls_and_a_roof(city_of, angle_rad):
 def test_slices_are_merged_across_t_junctions():
     facets = extract_facets(sliced_wall())
     assert len(facets) == 5 and facets.full.all()
+
+
+def test_surfaces_of_two_materials_are_two_facets(box_mesh):
+    mesh = box_mesh(0, 0, 10, 20, 30)
+    metal_halves = np.zeros(len(mesh.faces), dtype=int)
+    metal_halves[::2] = 1
+    city = CityMap(mesh.vertices, mesh.faces, [itu_material("brick"), itu_material("metal")], metal_halves)
+    facets = extract_facets(city)
+    assert len(facets) > 5
+    assert (facets.material[facets.of_face[facets.of_face >= 0]] == city.material[facets.of_face >= 0]).all()
 
 
 def test_faces_of_the_ground_belong_to_no_facet(city_of):

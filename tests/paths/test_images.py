@@ -4,11 +4,14 @@ import numpy as np
 import pytest
 
 from radiotwin.paths.candidates import CandidateSearch
-from radiotwin.paths.coefficients import concrete_permittivity, fresnel
+from radiotwin.paths.coefficients import slabs_of
 from radiotwin.paths.fields import VERTICAL, path_gains
 from radiotwin.paths.images import Candidates, PathBuffer, find_paths
+from radiotwin.paths.wedges import LUEBBERS
+from radiotwin.scene.citymap import CONCRETE
 
 WAVE_NUMBER = 2 * np.pi * 2.4e9 / 299_792_458.0
+SLABS = slabs_of([CONCRETE, CONCRETE], 2.4e9)
 
 
 @pytest.fixture(scope="module")
@@ -25,19 +28,19 @@ def solve(search, before, edge, after, device_m, receiver_m):
     buffer = PathBuffer.allocate(5)
     found, _ = find_paths(search.surfaces, candidates, np.array(device_m), np.array([receiver_m]), 0, buffer)
     gain = np.empty(found)
-    path_gains(search.surfaces, candidates, WAVE_NUMBER, concrete_permittivity(2.4e9), VERTICAL, buffer,
+    path_gains(search.surfaces, candidates, WAVE_NUMBER, SLABS, VERTICAL, LUEBBERS, buffer,
                np.arange(found), gain)
     return [buffer.points_m[i, :buffer.count[i]] for i in range(found)], gain
 
 
-def test_two_walls_of_a_corner(inner_corner):
+def test_two_walls_of_a_corner(inner_corner, line_of_slab):
     """In the plane of both walls' normals a vertical field lies across both planes of incidence."""
     search, wall_x, wall_y = inner_corner
     device_m, receiver_m = [20.0, 4.0, 5.0], [3.0, 30.0, 5.0]
     paths, gain = solve(search, [wall_y, wall_x], -1, [-1], device_m, receiver_m)
     offset_m = np.array([23.0, 34.0])
     length_m = np.hypot(*offset_m)
-    te_x, te_y = (fresnel(along / length_m, concrete_permittivity(2.4e9))[0] for along in offset_m)
+    te_x, te_y = (line_of_slab(along / length_m)[0] for along in offset_m)
     assert len(paths) == 1
     assert np.linalg.norm(np.diff(paths[0], axis=0), axis=1).sum() == pytest.approx(length_m)
     assert np.isclose(paths[0][1, 1], 0) and np.isclose(paths[0][2, 0], 0)

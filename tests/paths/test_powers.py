@@ -7,9 +7,9 @@ from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.paths import path_powers
-from radiotwin.paths.coefficients import concrete_permittivity, fresnel
 from radiotwin.paths.powers import COMPONENTS
 from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.materials import itu_material
 
 FREQUENCY_HZ = 2.4e9
 WAVELENGTH_M = speed_of_light / FREQUENCY_HZ
@@ -25,19 +25,15 @@ def friis(length_m):
     return (WAVELENGTH_M / (4 * np.pi * length_m)) ** 2
 
 
-def averaged(sine):
-    return np.mean(np.abs(fresnel(sine, concrete_permittivity(FREQUENCY_HZ))) ** 2)
-
-
 def stacked(powers):
     return np.array([getattr(powers, name) for name in COMPONENTS])
 
 
-def test_one_wall(city_of):
+def test_one_wall(city_of, line_of_slab):
     """A wall 10 m away from both ends, 20 m apart: the ray hits it at 45 degrees."""
     got = one_link(city_of((10, -200, 12, 200, 50)), [0, 0, 20], [0, 20, 20])
     assert got["direct"] == pytest.approx(friis(20))
-    assert got["reflected_1"] == pytest.approx(friis(np.hypot(20, 20)) * averaged(np.sqrt(0.5)), rel=1e-9)
+    assert got["reflected_1"] == pytest.approx(friis(np.hypot(20, 20)) * np.mean(np.abs(line_of_slab(np.sqrt(0.5))) ** 2), rel=1e-9)
 
 
 def test_directions_of_departure_and_arrival(city_of):
@@ -57,14 +53,30 @@ def test_directions_of_departure_and_arrival(city_of):
         np.testing.assert_allclose(ground[1:], [north * (powers.direct[0] + down[0]), -down[1]], rtol=1e-4)
 
 
-def test_only_the_ground():
+def test_only_the_ground(line_of_slab):
     plane = CityMap([[-500, -500, 0], [500, -500, 0], [500, 500, 0], [-500, 500, 0]], [[0, 1, 2], [0, 2, 3]])
     for polarisation in ("average", "vertical"):
         got = one_link(plane, [0, 0, 2], [30, 0, 38], polarisation=polarisation)
-        share = averaged(0.8) if polarisation == "average" else \
-            abs(fresnel(0.8, concrete_permittivity(FREQUENCY_HZ))[1]) ** 2
+        of_power = np.abs(line_of_slab(0.8)) ** 2
+        share = of_power.mean() if polarisation == "average" else of_power[1]
         assert got["ground"] == pytest.approx(friis(50) * share, rel=1e-9)
         assert sum(got.values()) == got["ground"] + got["direct"]
+
+
+def test_each_wall_and_the_ground_reflect_with_their_own_material(box_mesh, line_of_slab):
+    """A thin pane of glass and a wall of metal, 10 m to the east and to the west, over asphalt."""
+    pane, metal = box_mesh(10, -200, 12, 200, 50), box_mesh(-12, -200, -10, 200, 50)
+    ground = trimesh.Trimesh([[-500, -500, 0], [500, -500, 0], [500, 500, 0], [-500, 500, 0]], [[0, 1, 2], [0, 2, 3]])
+    mesh = trimesh.util.concatenate([pane, metal, ground])
+    materials = [itu_material("glass", thickness_m=0.03), itu_material("metal"),
+                 itu_material("asphalt_concrete", scattering_coefficient=0.6)]
+    city = CityMap(mesh.vertices, mesh.faces, materials, np.repeat([0, 1, 2], [12, 12, 2]))
+    got = one_link(city, [0, 0, 20], [0, 20, 20], depth=1)
+    glass = line_of_slab(np.sqrt(0.5), 6.31, 0.0036 * 2.4**1.3394, 0.03)
+    assert got["reflected_1"] == pytest.approx(
+        friis(np.hypot(20, 20)) * (np.mean(np.abs(glass) ** 2) + 1), rel=1e-3)
+    asphalt = line_of_slab(2 / np.sqrt(5), 4.83, 0.0108 * 2.4**1.3969)
+    assert got["ground"] == pytest.approx(0.64 * friis(np.hypot(20, 40)) * np.mean(np.abs(asphalt) ** 2), rel=1e-9)
 
 
 def test_a_blocked_reflection_and_a_blocked_ground(city_of):
@@ -112,7 +124,7 @@ def test_a_turned_city(town, turn, links):
     device_m, receiver_m, device = links
     there = stacked(path_powers(town(), device_m, receiver_m, device, FREQUENCY_HZ))
     turned = stacked(path_powers(town(0.5), turn(device_m, 0.5), turn(receiver_m, 0.5), device, FREQUENCY_HZ))
-    assert (there.sum(axis=1) > 0).all()
+    assert (there.sum(axis=1) > 0).sum() == len(COMPONENTS) - 1  # there is no link that only two edges reach
     assert np.allclose(10 * np.log10(there.sum(axis=0)), 10 * np.log10(turned.sum(axis=0)), atol=0.3)
     assert np.median(np.abs(there.sum(axis=0) / turned.sum(axis=0) - 1)) < 1e-6
 
@@ -121,9 +133,9 @@ def test_a_turned_city(town, turn, links):
 def test_powers_are_reciprocal(town, links, polarisation):
     """Two interactions at most: longer paths may have more reflections before an edge than after it."""
     device_m, receiver_m, device = links
-    there = path_powers(town(0.3), device_m, receiver_m, device, FREQUENCY_HZ, polarisation, depth=2)
+    there = path_powers(town(0.3), device_m, receiver_m, device, FREQUENCY_HZ, polarisation, 2, "luebbers")
     few = np.arange(8)
-    back = path_powers(town(0.3), receiver_m[few], device_m[device[few]], few, FREQUENCY_HZ, polarisation, depth=2)
+    back = path_powers(town(0.3), receiver_m[few], device_m[device[few]], few, FREQUENCY_HZ, polarisation, 2, "luebbers")
     assert np.allclose(stacked(there)[:, few], stacked(back), rtol=1e-6, atol=1e-16)
     assert np.allclose(there.departures[few], back.arrivals, rtol=1e-6, atol=1e-16)
 
@@ -165,7 +177,7 @@ def test_more_interactions_only_add(town, links):
 @pytest.mark.parametrize("change, message", [
     ({"device_m": np.zeros((1, 2))}, "device_m"), ({"receiver_m": np.full((2, 3), np.nan)}, "receiver_m"),
     ({"device": np.array([0])}, "device"), ({"device": np.array([0, 1])}, "rows"),
-    ({"frequency_hz": 0.0}, "frequency"), ({"polarisation": "odd"}, "average"), ({"depth": 7}, "depth"),
+    ({"frequency_hz": 0.0}, "frequency"), ({"polarisation": "odd"}, "average"), ({"depth": 7}, "depth"), ({"wedge": "odd"}, "luebbers"),
 ])
 def test_bad_input(city_of, change, message):
     good = {"device_m": np.ones((1, 3)), "receiver_m": np.full((2, 3), 40.0), "device": np.array([0, 0]),

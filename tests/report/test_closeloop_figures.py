@@ -113,7 +113,7 @@ def test_figures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_p
 
 @pytest.mark.parametrize("effect, params", [
     (DeviceGainOffset, {"members": [0, 1, 2], "offsets_sd_db": 4.0}), (ExcessAttenuation, {"scale_height_m": 100.0}),
-    (BodyShadowing, {"members": [0, 1]}),
+    (BodyShadowing, {"receivers": {"0": {"depth_db": 8.0, "azimuth_deg": 60.0}, "1": {"depth_db": 3.0}}}),
     (ReceiverDrift, {"receivers": {"0": ["warm_up_each_flight", 8.0], "1": ["step", 150.0]}}),
     (DeviceDrift, {"devices": {"1": ["step", 150.0]}, "span_s": [0.0, 300.0]}),
     (ReceiverClockOffset, {"receiver": 0, "offset_s": 3.0, "speed_m_s": 10.0}),

@@ -32,6 +32,9 @@ def folder(tmp_path):
 def test_the_3d_map_reads_it(folder):
     city = CityMap.from_xml(folder / "city.xml")
     assert city.height_at([0, 30, -30], [0, 0, 0]).tolist() == pytest.approx([40, 10, 0])
+    of_shape = [city.materials[row] for row in city.material[[0, 2, -1]]]
+    assert [(each.itu, each.thickness_m) for each in of_shape[:2]] == [("wet_ground", 0.1), ("concrete", 0.3)]
+    assert of_shape[2].relative_permittivity is not None and city.ground_material.itu == "wet_ground"
 
 
 def test_equal_cities_give_equal_bytes(folder, tmp_path):

@@ -97,6 +97,26 @@ def test_a_map_of_another_scene_is_refused(small_scene, truth):
         survey(small_scene, stale)
 
 
+@pytest.mark.parametrize(("combining", "above_db", "passes"), [
+    ("power", 11.9, True), ("power", 12.5, False), ("coherent", 23.9, True), ("coherent", 24.5, False)])
+def test_a_traced_map_with_an_impossible_link_is_refused(small_scene, truth, combining, above_db, passes):
+    """One LoS link so far above Friis' law (Jakes 1974, eq. 1.1); a statistical truth may be anything."""
+    dataset = truth.dataset.drop_vars("sigma_db").copy(deep=True)
+    device, at = 2, np.unravel_index(np.flatnonzero(truth.los[2])[7], truth.los[2].shape)
+    position_m = small_scene.lattice.positions_m.reshape(*truth.los[2].shape, 3)[at]
+    waves = np.linalg.norm(position_m - small_scene.device_m[device]) * 2.4e9 / 299_792_458
+    dataset["gain_db"].values[(device, *at)] = -20 * np.log10(4 * np.pi * waves) + above_db
+    statistical = dataclasses.replace(truth, dataset=dataset)
+    survey(small_scene, statistical)
+    dataset.attrs |= {"source": "raytrace", "solver": "paths", "combining": combining}
+    traced = dataclasses.replace(truth, dataset=dataset)
+    if passes:
+        survey(small_scene, traced)
+    else:
+        with pytest.raises(BadInput, match=rf"1 links .* of d2 lie .* \+{above_db} dB.*trace` again"):
+            survey(small_scene, traced)
+
+
 def test_a_battery_that_does_not_reach_home_is_refused(small_scene, truth):
     uav = small_scene.config.uavs[0].model_copy(update={"battery": 3.0, "terminal_x_m": 280.0, "terminal_y_m": 280.0})
     scene = Scene(small_scene.folder, small_scene.config.model_copy(update={"uavs": [uav]}))

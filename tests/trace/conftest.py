@@ -1,11 +1,13 @@
 """A scene that can be traced without LLVM: a law in place of Sionna RT."""
 
 import shutil
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from radiotwin.scene import Scene
+from radiotwin.trace.solver import IMPOSSIBLE_DB
 
 
 @pytest.fixture
@@ -23,6 +25,7 @@ def law(monkeypatch, small_scene):
     class Law:
         calls = 0
         offset_db = 0.0
+        impossible_m: ClassVar[list] = []  # receivers of links that stay above what their paths carry
 
         def __init__(self, xml_path, frequency_hz, settings):
             self.step = settings.batch_receivers
@@ -36,7 +39,8 @@ def law(monkeypatch, small_scene):
             distance_m = np.linalg.norm(points_m - device_m, axis=1)
             los = small_scene.city.line_of_sight(device_m[None], points_m)
             gain_db = 20 * np.log10(self.wavelength_m / (4 * np.pi * distance_m)) - 25 * ~los + Law.offset_db
-            return np.where(~los & (distance_m > 250), np.nan, gain_db)
+            gain_db = np.where(~los & (distance_m > 250), np.nan, gain_db)
+            return np.where([point_m.tolist() in Law.impossible_m for point_m in points_m], IMPOSSIBLE_DB, gain_db)
 
         def gains(self, device_m, points_m, antennas=(None, None), advance=lambda n: None):
             return np.concatenate([self.solve(device_m, points_m[part], antennas)

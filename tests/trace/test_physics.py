@@ -1,5 +1,7 @@
 """The tracer against closed forms that are written here, from the books, and share no code with it."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -12,6 +14,7 @@ from radiotwin.trace.solver import PathGains
 
 pytestmark = pytest.mark.llvm
 
+ROOT = Path(__file__).parents[2]
 FREQUENCY_HZ = 2.4e9
 WAVELENGTH_M = 299_792_458.0 / FREQUENCY_HZ
 SETTINGS = SolverSettings(samples_per_src=20_000, batch_receivers=16, max_num_paths_per_src=20_000)
@@ -82,6 +85,40 @@ def test_coherent_sum_over_flat_ground(tmp_path, flat_points_m):
     closed_db = to_db(abs(direct + reflected) ** 2)
     assert np.ptp(closed_db - to_db(abs(direct) ** 2)) > 10  # the points do fade
     assert solved_db == pytest.approx(closed_db, abs=0.1)
+
+
+def test_a_street_between_metal_walls_may_bring_nine_decibels(tmp_path):
+    """More than 6 dB above free space is no error: nine images at nearly one distance (Balanis 2012, sec. 11.2).
+
+    Rationale: vertical polarisation along vertical walls of a good conductor is reflected without loss, so that the
+    power is that of the device and of its images of up to four reflections. Expected: their sum, and no link flagged.
+    """
+    width_m, device_y_m = 4.0, 1.3
+    corners = [(x, y, z) for y in (0.0, width_m) for x, z in ((-2000, -2000), (2000, -2000), (2000, 2000), (-2000, 2000))]
+    walls = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3), (4, 6, 5), (4, 7, 6)], process=False)
+    settings = SolverSettings(samples_per_src=100_000, batch_receivers=8, max_num_paths_per_src=20_000, diffraction=False)
+    points_m = np.array([(x_m, y_m, 1.0) for x_m in (15.0, 30.0, 60.0, 90.0) for y_m in (0.7, 2.9)])
+    solved_db = solver(tmp_path, walls, Material("metal", itu="metal"), settings).solve(
+        np.array([0.0, device_y_m, 0.0]), points_m)
+    images_m = [sign * device_y_m + 2 * m * width_m for sign, ms in ((1, (-2, -1, 0, 1, 2)), (-1, (-1, 0, 1, 2)))
+                for m in ms]  # 0, 2 and 4 reflections; 1 and 3
+    squares_m2 = points_m[:, :1] ** 2 + (points_m[:, 1:2] - images_m) ** 2 + 1.0
+    direct_db = to_db((WAVELENGTH_M / (4 * np.pi * np.linalg.norm(points_m - [0, device_y_m, 0], axis=1))) ** 2)
+    closed_db = to_db(np.sum((WAVELENGTH_M / (4 * np.pi)) ** 2 / squares_m2, axis=1))
+    assert solved_db == pytest.approx(closed_db, abs=0.1)
+    assert (closed_db - direct_db)[-2:].min() > 9
+
+
+def test_a_direct_path_counts_once_where_sionna_returns_it_many_times():
+    """Seen: of 20 receivers at this device of scenes/rbm, the first had 28 direct paths, and 14 dB too much."""
+    device_m = np.array([147.9, 279.9, 1.5])
+    generator = np.random.default_rng(0)
+    points_m = device_m + np.column_stack([generator.normal(0, 60, (20, 2)), generator.uniform(0, 40, 20)])
+    points_m[0] = device_m + [3, 2, 8]
+    settings = SolverSettings(samples_per_src=30_000, batch_receivers=20)
+    solved_db = PathGains(ROOT / "scenes" / "rbm" / "city.xml", FREQUENCY_HZ, settings).solve(device_m, points_m)[0]
+    friis_db = to_db((WAVELENGTH_M / (4 * np.pi * np.sqrt(3**2 + 2**2 + 8**2))) ** 2)
+    assert friis_db < solved_db < friis_db + 1
 
 
 EDGE_M = 30.0

@@ -63,6 +63,14 @@ def test_each_link_has_a_gain_or_a_reason(small_scene, law, tmp_path):
     assert (read["reason"] == table["reason"]).all()
 
 
+def test_an_impossible_gain_has_its_reason(small_scene, law):
+    points_m = small_scene.lattice.positions_m[:6]
+    law.impossible_m = points_m[[1, 4]].tolist()
+    table = trace_points(small_scene, points_m, SETTINGS, devices=["d0"])
+    assert table["reason"].tolist() == ["", "impossible gain", "", "", "impossible gain", ""]
+    assert (table["gain_db"].isna() == (table["reason"] != "")).all()
+
+
 def test_weak_links_are_below_sensitivity(small_scene, law):
     law.offset_db = -30.0
     table = trace_points(small_scene, small_scene.lattice.positions_m, SETTINGS, devices=["d0"])
@@ -116,6 +124,8 @@ def test_links_have_a_budget(small_scene, law, monkeypatch):
     with pytest.raises(BadInput, match="points times devices: 6 rows; at most 5"):
         trace_points(small_scene, np.ones((3, 3)), SETTINGS, devices=["d0", "d1"])
     assert law.calls == 0
+
+
 def test_killed_gains_go_on_after_the_last_batch(small_scene, law, tmp_path, monkeypatch):
     monkeypatch.setattr(pieces, "MIN_SECONDS", 0.0)
     points_m = small_scene.lattice.positions_m[:30]

@@ -151,3 +151,25 @@ def test_a_finished_map_is_known_without_its_cache(own_scene, law, tmp_path):
     assert law.calls == calls and again.gain_db.tobytes() == first.gain_db.tobytes()
     trace_map(own_scene, SETTINGS, tmp_path / "map.nc", ["d1"])
     assert law.calls > calls
+
+
+def test_an_impossible_link_is_left_out_counted_and_told(own_scene, law, tmp_path):
+    trace_map(own_scene, SETTINGS, tmp_path / "whole.nc")
+    whole = RadioMap.read(tmp_path / "whole.nc")
+    shutil.rmtree(own_scene.folder / "cache")
+    index = np.flatnonzero(np.isfinite(whole.gain_db.reshape(DEVICES, -1)).all(axis=0))[:3]
+    law.impossible_m = own_scene.lattice.positions_m[index].tolist()
+    with pytest.warns(UserWarning, match=f"{3 * DEVICES} of {DEVICES * 512} links carry more power than their paths"):
+        trace_map(own_scene, SETTINGS, tmp_path / "map.nc")
+    read = RadioMap.read(tmp_path / "map.nc")
+    assert read.dataset.attrs["links_impossible"] == 3 * DEVICES and whole.dataset.attrs["links_impossible"] == 0
+    counts = [f"links_{name}" for name in ("detected", "without_path", "below_sensitivity", "inside_building")]
+    assert [read.dataset.attrs[name] - whole.dataset.attrs[name] for name in counts] == [-3 * DEVICES, 0, 0, 0]
+    expected_db = whole.gain_db.copy().reshape(DEVICES, -1)
+    expected_db[:, index] = np.nan
+    assert np.array_equal(read.gain_db.reshape(DEVICES, -1), expected_db, equal_nan=True)
+    assert np.isfinite(read.dataset.attrs["noise_floor_db"])
+    calls = law.calls
+    with pytest.warns(UserWarning, match="carry more power"):
+        trace_map(own_scene, SETTINGS, tmp_path / "again.nc")
+    assert law.calls == calls and (tmp_path / "again.nc").read_bytes() == (tmp_path / "map.nc").read_bytes()

@@ -15,7 +15,8 @@ from radiotwin.twin import Twin
 
 VERSION_1 = Path(__file__).parent / "version_1"
 NO_MAP = SimpleNamespace(config=SimpleNamespace(radio=SimpleNamespace(frequency_hz=2.4e9)), city=None)
-EFFECTS = [each for each in json.loads((VERSION_1 / "effects.json").read_text(encoding="utf-8")) if each["over"] == "links"]
+EFFECTS = [each for each in json.loads((VERSION_1 / "effects.json").read_text(encoding="utf-8"))
+           if each["over"] == "links" and each["name"] != "body_shadowing"]  # which has other parameters since
 DEEP = json.loads("[" * 200 + "]" * 200)
 WRONG = [None, "text", "1", [], [1], {}, {"a": 1}, True, -1, 0, 0.5, 1e308, -1e308, float("nan"), 2**70, 10**400, DEEP]
 

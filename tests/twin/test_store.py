@@ -2,20 +2,27 @@
 
 import json
 import shutil
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from radiotwin.channel import followed_paths
 from radiotwin.closeloop.corrected_twin import corrected_twin
 from radiotwin.closeloop.run import close_loop
 from radiotwin.errors import BadInput
 from radiotwin.links import prepare_links
 from radiotwin.measurements import read_measurements
+from radiotwin.paths import path_powers
+from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.materials import Material
 from radiotwin.twin import Twin, check_twin_target, fit_twin
 
 VERSION_1 = Path(__file__).parent / "version_1"  # made with radiotwin 0.1, see its README.md
+ATOL_DB = 1e-3  # paths are found in another order, and their field is computed in another
 NO_MAP = SimpleNamespace(config=SimpleNamespace(radio=SimpleNamespace(frequency_hz=2.4e9)), city=None)
 
 
@@ -66,14 +73,33 @@ def test_a_corrected_twin_of_version_0_1_predicts_the_same():
     model, result = twin.fitted.on_links(links)
     reading = model.regression().predict(result)
     np.testing.assert_allclose(reading.mean_db, before["read_db"], atol=1e-6, rtol=0)
-    np.testing.assert_allclose(reading.scale_db, before["read_scale_db"], atol=1e-6, rtol=0)
+    np.testing.assert_allclose(reading.scale_db, before["read_scale_db"], atol=ATOL_DB, rtol=0)
+
+
+@pytest.fixture
+def old_scene(small_scene, monkeypatch):
+    """The scene of half-spaces of concrete, which version 0.1 took all surfaces for: a slab too thick to look through."""
+    thick = Material("concrete", itu="concrete", thickness_m=100.0)
+    monkeypatch.setattr("radiotwin.scene.citymap.CONCRETE", thick)
+    monkeypatch.setattr("radiotwin.effects.missing_obstacle.CONCRETE", thick)
+    monkeypatch.setattr("radiotwin.paths.powers.path_powers", partial(path_powers, wedge="luebbers"))
+    scene = replace(small_scene)
+    scene.__dict__["city"] = CityMap(small_scene.city.vertices, small_scene.city.faces, [thick])
+    return scene
+
+
+@pytest.fixture(autouse=True)
+def whole_metres(monkeypatch):
+    """0.1 rounded estimated positions to a metre before it followed paths, not to half a metre."""
+    monkeypatch.setattr(followed_paths, "GRID_M", 1.0)
 
 
 EFFECTS = json.loads((VERSION_1 / "effects.json").read_text(encoding="utf-8"))
+CHANGED = "body_shadowing"  # has other parameters since, which those of 0.1 cannot be turned into
 
 
 @pytest.mark.parametrize("number", range(len(EFFECTS)), ids=[f"{each['name']}-{i}" for i, each in enumerate(EFFECTS)])
-def test_an_effect_of_a_twin_of_version_0_1_does_the_same(number, small_scene, tmp_path):
+def test_an_effect_of_a_twin_of_version_0_1_does_the_same(number, old_scene, tmp_path):
     """One effect of each kind in place of those that were found; with a map some upon a law, others upon paths."""
     part, before = EFFECTS[number], np.load(VERSION_1 / "effects.npz")
     over_map = part["over"] == "map"
@@ -85,27 +111,32 @@ def test_an_effect_of_a_twin_of_version_0_1_does_the_same(number, small_scene, t
     if over_map and not part["setting"].get("exact"):
         record["effects"] |= {"base": "twin", "coefficients": [1.0, 0.0, -1.0, 0.0]}
     path.write_text(json.dumps(record), encoding="utf-8")
+    if part["name"] == CHANGED:
+        with pytest.raises(BadInput, match="another version of radiotwin.*run `radiotwin close-loop` again"):
+            Twin.load(tmp_path / "twin")
+        return
     twin = Twin.load(tmp_path / "twin")
     if over_map:
         asked = np.load(VERSION_1 / "raytrace.npz")
-        found = twin.predict(twin.links(asked["receiver_m"][::2], asked["device"][::2], small_scene))
+        found = twin.predict(twin.links(asked["receiver_m"][::2], asked["device"][::2], old_scene))
         values = [found.mean_db, found.sd_db]
     else:
         links = prepare_links(read_measurements(VERSION_1 / "links" / "measurements.csv"), None)
         model, result = twin.fitted.on_links(links)
         reading = model.regression().predict(result)
         values = [reading.mean_db, reading.scale_db, model.regression().nll(result)]
-    np.testing.assert_allclose(values, before[f"{part['over']}_{number}"], atol=1e-6, rtol=0)
+    limit_db = 0.1 if part["name"] == "diffraction" else ATOL_DB  # 0.1 did not follow paths over two edges
+    np.testing.assert_allclose(values, before[f"{part['over']}_{number}"], atol=limit_db, rtol=0)
 
 
-def test_a_twin_of_version_0_1_that_follows_paths_predicts_the_same(small_scene):
+def test_a_twin_of_version_0_1_that_follows_paths_predicts_the_same(old_scene):
     twin, before = Twin.load(VERSION_1 / "raytrace"), np.load(VERSION_1 / "raytrace.npz")
     assert twin.channel.name == "image_paths" and not twin.is_corrected
-    links = twin.links(before["receiver_m"], before["device"], small_scene)
+    links = twin.links(before["receiver_m"], before["device"], old_scene)
     found = twin.predict(links)
     np.testing.assert_array_equal(links.los, before["los"])
-    np.testing.assert_allclose(found.mean_db, before["mean_db"], atol=1e-6, rtol=0)
-    np.testing.assert_allclose(found.sd_db, before["sd_db"], atol=1e-6, rtol=0)
+    np.testing.assert_allclose(found.mean_db, before["mean_db"], atol=ATOL_DB, rtol=0)
+    np.testing.assert_allclose(found.sd_db, before["sd_db"], atol=ATOL_DB, rtol=0)
 
 
 def test_a_twin_of_version_0_1_is_saved_as_one_of_this_version(tmp_path):

@@ -1,0 +1,192 @@
+"""The base of published laws: predictions of a recommendation as they stand, fitted to nothing.
+
+They are priors, where no device of known position was measured, and baselines elsewhere. A link
+has two branches, with line of sight and without. A 3D map decides which one holds; without a map
+they are mixed by the law's probability of line of sight.
+
+Recommendations are written for a fixed station and a terminal. Here either end may be the higher
+one, and paths are reciprocal: the laws know a higher and a lower end, heights above z = 0.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, ClassVar, NamedTuple, Self
+
+import numpy as np
+from typing_extensions import override
+
+from radiotwin.channel.base import ChannelModel
+from radiotwin.channel.stored import MAX_DB, require_names, require_number
+from radiotwin.errors import BadInput
+from radiotwin.links import LinkGeometry
+from radiotwin.scene.citymap import CityMap
+
+MAX_FACTOR = 2.0  # beyond its range of frequencies to which a law is extrapolated, with a warning
+MIN_ROOF_M = 2.5  # of what counts as a building
+GRID = 128  # points to each side of the map, at which its roofs are looked up
+MAX_ROOF_M = 1e4  # of a stored roof
+
+
+class Validity(NamedTuple):
+    """What a law was published for, each as (least, greatest).
+
+    Attributes:
+        frequency_hz: of the radio [Hz].
+        distance_m: between the ends [m].
+        high_m, low_m: height of the higher and of the lower end [m].
+    """
+
+    frequency_hz: tuple[float, float]
+    distance_m: tuple[float, float]
+    high_m: tuple[float, float] = (0.0, np.inf)
+    low_m: tuple[float, float] = (0.0, np.inf)
+
+
+class Branch(NamedTuple):
+    """Median loss (n,) [dB] of links of one class, and the standard deviation of shadowing."""
+
+    loss_db: np.ndarray
+    sd_db: np.ndarray | float
+
+
+class PublishedLaw(ChannelModel):
+    """A law of a recommendation; the gain is minus its median loss.
+
+    Attributes:
+        source: recommendation, and the section or table used.
+        validity: what it was published for.
+        needs_map: whether it has no probability of line of sight, so that a map must decide.
+        frequency_hz: of the radio [Hz].
+        with_map: whether `los` of links decides the branch.
+        roof_m: mean height of the map's roofs [m]; 0 without a map.
+        power_dbm: transmit power, where levels are received powers [dBm]; 0 for gains.
+    """
+
+    uses_map = True
+    needs_map: ClassVar[bool] = False
+    source: ClassVar[str]
+    validity: ClassVar[Validity]
+
+    def __init__(self, frequency_hz: float = np.nan, with_map: bool = False, roof_m: float = 0.0,
+                 power_dbm: float = 0.0) -> None:
+        self.frequency_hz, self.with_map = frequency_hz, with_map
+        self.roof_m, self.power_dbm = roof_m, power_dbm
+
+    @abstractmethod
+    def branch(self, links: LinkGeometry, los: bool) -> Branch:
+        """Return loss and shadowing of n links, if all have line of sight, or if none has."""
+
+    def los_probability(self, links: LinkGeometry) -> np.ndarray:
+        """Return the probability (n,) of line of sight; needed unless `needs_map`."""
+        raise NotImplementedError(f"{self.name} has no probability of line of sight")
+
+    @override
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+            seed: int = 0) -> Self:
+        """Take frequency and map from links; nothing is fitted, and there may be no link at all.
+
+        Raises:
+            BadInput: the frequency is unknown or far outside the law's range, or a law that needs
+                a map with buildings has none.
+        """
+        low_hz, high_hz = self.validity.frequency_hz
+        if not low_hz / MAX_FACTOR <= links.frequency_hz <= high_hz * MAX_FACTOR:
+            given = ("is not known; give frequency_hz" if np.isnan(links.frequency_hz)
+                     else f"is {links.frequency_hz / 1e9:g} GHz; take another model")
+            raise BadInput(f"the radio's frequency {given}: {self.name} ({self.source}) holds from "
+                           f"{low_hz / 1e9:g} to {high_hz / 1e9:g} GHz, and is used from half to "
+                           "twice that")
+        self.frequency_hz, self.with_map = links.frequency_hz, links.city is not None
+        if self.needs_map:
+            if links.city is None:
+                raise BadInput(f"{self.name} needs a 3D map, which says which links have line of "
+                               "sight and how high roofs are; give a scene, or take tr36777_uma or "
+                               "al_hourani_urban, which have a probability of line of sight")
+            self.roof_m = mean_roof_m(links.city)
+            if self.roof_m == 0.0:
+                raise BadInput(f"{self.name} is a law of cities, and the 3D map has no building "
+                               f"above {MIN_ROOF_M:g} m; take another model")
+        return self
+
+    @override
+    def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and standard deviation [dB], see the base class.
+
+        Those of a mixture of both branches: its variance is the mean of theirs, plus that of the
+        two medians.
+        """
+        los, nlos = self.branch(links, True), self.branch(links, False)
+        share = links.los.astype(float) if self.with_map else self.los_probability(links)
+        loss_db = share * los.loss_db + (1 - share) * nlos.loss_db
+        variance = (share * np.square(los.sd_db) + (1 - share) * np.square(nlos.sd_db)
+                    + share * (1 - share) * (los.loss_db - nlos.loss_db) ** 2)
+        return self.power_dbm - loss_db, np.sqrt(variance)
+
+    def outside(self, links: LinkGeometry) -> list[str]:
+        """Return a sentence on each quantity that lies outside the law's validity."""
+        high_m, low_m = ends_m(links)
+        found = []
+        for what, value, (least, most), unit in (
+                ("frequency", np.atleast_1d(self.frequency_hz / 1e9),
+                 np.array(self.validity.frequency_hz) / 1e9, "GHz"),
+                ("distance", links.distance_m, self.validity.distance_m, "m"),
+                ("height of the higher end", high_m, self.validity.high_m, "m"),
+                ("height of the lower end", low_m, self.validity.low_m, "m")):
+            odd = (value < least) | (value > most)
+            if odd.any():
+                ends = sorted({f"{value[odd].min():.3g}", f"{value[odd].max():.3g}"}, key=float)
+                share = "" if what == "frequency" else f" in {odd.mean():.0%} of the links"
+                found.append(f"{self.name} is used outside what {self.source} was published for: "
+                             f"the {what} is {' to '.join(ends)} {unit}{share}, published is "
+                             f"{least:g} to {most:g} {unit}")
+        return found
+
+    @override
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        return {}, {"frequency_hz": float(self.frequency_hz), "with_map": bool(self.with_map),
+                    "roof_m": float(self.roof_m), "power_dbm": float(self.power_dbm)}
+
+    @classmethod
+    @override
+    def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any]) -> Self:
+        require_names("arrays", arrays, [])
+        require_names("settings", settings, ["frequency_hz", "with_map", "roof_m", "power_dbm"])
+        if not isinstance(settings["with_map"], bool):
+            raise ValueError("with_map is neither true nor false")
+        if cls.needs_map and not settings["with_map"]:
+            raise ValueError(f"{cls.name} needs a map")
+        low_hz, high_hz = cls.validity.frequency_hz
+        frequency_hz = require_number(settings, "frequency_hz", low_hz / MAX_FACTOR,
+                                      high_hz * MAX_FACTOR)
+        roof_m = require_number(settings, "roof_m", MIN_ROOF_M if cls.needs_map else 0.0,
+                                MAX_ROOF_M)
+        return cls(frequency_hz, settings["with_map"], roof_m,
+                   require_number(settings, "power_dbm", -MAX_DB, MAX_DB))
+
+
+def ends_m(links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+    """Return the heights (n,) of the higher and of the lower end of links [m]."""
+    heights_m = links.device_m[:, 2], links.receiver_m[:, 2]
+    return np.maximum(*heights_m), np.minimum(*heights_m)
+
+
+def ground_m(links: LinkGeometry) -> np.ndarray:
+    """Return the horizontal distance (n,) between the ends [m]."""
+    offset_m = links.receiver_m[:, :2] - links.device_m[:, :2]
+    return np.hypot(offset_m[:, 0], offset_m[:, 1])
+
+
+def free_space_db(distance_m: np.ndarray, frequency_hz: float) -> np.ndarray:
+    """Return the basic transmission loss of free space [dB] (ITU-R P.525-4, Eq. 4)."""
+    return 32.45 + 20 * np.log10(frequency_hz / 1e6) + 20 * np.log10(distance_m / 1e3)
+
+
+def mean_roof_m(city: CityMap) -> float:
+    """Return the mean height of a map's roofs over the area they cover [m]; 0 without any."""
+    low_m, high_m = city.vertices[:, :2].min(axis=0), city.vertices[:, :2].max(axis=0)
+    share = (np.arange(GRID) + 0.5) / GRID
+    x_m, y_m = (low + share * (high - low) for low, high in zip(low_m, high_m, strict=True))
+    height_m = city.height_at(*np.meshgrid(x_m, y_m))
+    roofs_m = height_m[height_m > MIN_ROOF_M]
+    return float(roofs_m.mean()) if len(roofs_m) else 0.0

@@ -1,0 +1,210 @@
+"""Fitting a twin to links: the channel from the anchors' links, then the unknown devices."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import asdict, replace
+from typing import Any
+
+import numpy as np
+
+import radiotwin
+from radiotwin.channel import ChannelModel, check_fit_data, fit_once
+from radiotwin.channel.base import MIN_DETECTED
+from radiotwin.channel.published import PublishedLaw
+from radiotwin.errors import BadInput
+from radiotwin.links import LinkData, LinkGeometry, link_geometry
+from radiotwin.localize import (
+    DeviceEstimate,
+    LocalizeSettings,
+    TwinDevice,
+    localize,
+    read_device,
+)
+from radiotwin.measurements import MAX_APART_M
+from radiotwin.pieces import kept
+from radiotwin.scene import Scene
+from radiotwin.twin.twin import Twin
+
+MAX_BLANK, LIMIT_GAP_DB = 0.02, 10.0  # beyond both, blanks and the limit of detection disagree
+
+
+def fit_links(links: LinkData, scene: Scene, channel: type[ChannelModel], seed: int,
+              start: Twin | None = None, settings: LocalizeSettings | None = None) -> Twin:
+    """Learn a channel from the anchors' links, then locate the unknown devices with it.
+
+    Args:
+        links: n links.
+        scene: its map and extent.
+        channel: class of the channel model.
+        seed: as of `fit_twin`.
+        start: as of `fit_twin`.
+        settings: of the search.
+
+    Raises:
+        BadInput: as of `fit_twin`.
+    """
+    _check_positions(links, scene)
+    _check_limit(links)
+    is_anchor = np.isin(np.arange(len(links.device_m)), sorted(links.anchors))
+    anchors_m = np.where(is_anchor[:, None], links.device_m, np.nan)
+    if issubclass(channel, PublishedLaw):
+        fitted: ChannelModel = _published(links, anchors_m, scene, channel)
+    else:
+        fitted = _fit_channel(links, anchors_m, channel, seed)
+    devices: list[Any] = [TwinDevice.anchor(name, *position_m) if anchor else None
+                          for name, position_m, anchor in
+                          zip(links.device_names, links.device_m, is_anchor, strict=True)]
+    unknown = np.flatnonzero(~is_anchor)
+    if len(unknown):
+        found = _locate(links, scene, fitted.trend, unknown, seed, start, settings)
+        for index, each in zip(unknown, found, strict=True):
+            devices[index] = each
+    if fitted.trend is not fitted:
+        fitted = _fit_channel(links, reliable_m(devices), channel, seed)
+    if isinstance(fitted, PublishedLaw):
+        for note in fitted.outside(_known_links(links, reliable_m(devices))[0]):
+            warnings.warn(note, stacklevel=3)
+    return Twin(fitted, devices, level_of(links), links.limit_db, provenance(links, scene))
+
+
+def fit_known(links: LinkData, channel: type[ChannelModel], seed: int) -> Twin:
+    """Learn a channel from links whose devices all have declared positions; no scene is needed.
+
+    Raises:
+        BadInput: links that no channel can be learnt from.
+    """
+    geometry = links.geometry
+    check_fit_data(geometry, links.level_db,
+                   needs_los=channel.uses_map and links.city is not None)
+    fitted = fit_once(channel, geometry, links.level_db, links.limit_db, seed)
+    devices = [TwinDevice.anchor(name, *position_m)
+               for name, position_m in zip(links.device_names, links.device_m, strict=True)]
+    return Twin(fitted, devices, level_of(links), links.limit_db, provenance(links, None))
+
+
+def reliable_m(devices: list[TwinDevice], max_radius_m: float = np.inf) -> np.ndarray:
+    """Return positions (k, 3) [m] that may be relied on, and NaN for the others.
+
+    Args:
+        devices: k devices.
+        max_radius_m: of the circle that holds nine in ten of the guesses [m].
+    """
+    located = np.array([each.located and each.credible_radius_m <= max_radius_m
+                        for each in devices])
+    positions_m = [(each.x_m, each.y_m, each.z_m) for each in devices]
+    return np.where(located[:, None], positions_m, np.nan)
+
+
+def _fit_channel(links: LinkData, device_m: np.ndarray, channel: type[ChannelModel],
+                 seed: int) -> ChannelModel:
+    """Fit to the links of all devices whose position in `device_m` (k, 3) is known."""
+    if not links.anchors:
+        raise BadInput("no anchor: every device has the role unknown, and a channel is learned "
+                       "from devices whose positions are known; give at least one device x_m, y_m "
+                       "and the role anchor in devices.csv, or take a published law, such as "
+                       "tr36777_uma, which is not learned")
+    geometry, level_db = _known_links(links, device_m)
+    if not len(geometry):
+        raise BadInput("no link to an anchor: none of the devices with role anchor was measured; "
+                       "fly nearer to them")
+    check_fit_data(geometry, level_db, needs_los=channel.uses_map)
+    return fit_once(channel, geometry, level_db, links.limit_db, seed)
+
+
+def _known_links(links: LinkData, device_m: np.ndarray) -> tuple[LinkGeometry, np.ndarray]:
+    """Return the m links of devices with a position in `device_m` (k, 3), and their levels."""
+    known = np.isfinite(device_m[:, :2]).all(axis=1)[links.device]
+    geometry = link_geometry(device_m, links.receiver_m[known], links.device[known], links.city)
+    return replace(geometry, frequency_hz=links.frequency_hz), links.level_db[known]
+
+
+def _published(links: LinkData, device_m: np.ndarray, scene: Scene,
+               law: type[PublishedLaw]) -> PublishedLaw:
+    """Return a law as it was published; warn of the transmit power, where levels are powers.
+
+    That is the median over detected links of anchors of what it must be, or the declared one.
+    """
+    geometry, level_db = _known_links(links, device_m)
+    fitted = law().fit(geometry, level_db, links.limit_db)
+    if links.is_gain:
+        return fitted
+    surplus_db = level_db - fitted.predict(geometry)[0]
+    if np.isfinite(surplus_db).sum() >= MIN_DETECTED:
+        fitted.power_dbm, how = float(np.nanmedian(surplus_db)), "fitted to the anchors' links"
+    else:
+        fitted.power_dbm, how = scene.config.radio.tx_power_dbm, "the scene's tx_power_dbm"
+    warnings.warn(f"levels are received powers, and {law.name} predicts gains: the transmit power "
+                  f"is taken for {fitted.power_dbm:.1f} dBm ({how})", stacklevel=4)
+    return fitted
+
+
+def _locate(links: LinkData, scene: Scene, channel: ChannelModel, unknown: np.ndarray, seed: int,
+            start: Twin | None, settings: LocalizeSettings | None) -> list[TwinDevice]:
+    start_m = None
+    if start is not None:
+        before = {device.device: (device.x_m, device.y_m) for device in start.devices}
+        start_m = np.array([before.get(links.device_names[i], (np.nan, np.nan)) for i in unknown])
+    rows = np.isin(links.device, unknown)
+    measured = links.receiver_m[rows], links.device[rows], links.level_db[rows], channel
+    options: dict[str, Any] = {
+        "devices": unknown, "bounds": scene.config.extent.bounds, "city": scene.city,
+        "z_m": links.device_m[unknown, 2], "limit_db": links.limit_db, "seed": seed,
+        "start_m": start_m, "settings": settings}
+    names = [links.device_names[index] for index in unknown]
+    return kept("positions", (*measured, options, names),
+                lambda: [_device(name, each) for name, each in
+                         zip(names, localize(*measured, **options), strict=True)],
+                lambda found: ({}, [asdict(each) for each in found]),
+                lambda _, content: [read_device(each) for each in content])
+
+
+def _device(name: str, found: DeviceEstimate) -> TwinDevice:
+    return TwinDevice(name, found.x_m, found.y_m, found.z_m, "unknown", bool(found.located),
+                      float(found.credible_radius_m), found.second_mode)
+
+
+def _check_positions(links: LinkData, scene: Scene) -> None:
+    """Raise BadInput for anchors inside buildings or far away, warn about receivers likewise."""
+    anchors = np.array(sorted(links.anchors), dtype=int)
+    anchors = anchors[np.isfinite(links.device_m[anchors]).all(axis=1)]
+    apart_m = np.abs(links.device_m[anchors, :2] - np.median(links.receiver_m[:, :2], axis=0))
+    for index in anchors[(apart_m > MAX_APART_M).any(axis=1)]:
+        raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} is more "
+                       f"than {MAX_APART_M / 1000:g} km from the middle of the receivers; both "
+                       "need one frame, in metres")
+    for index in anchors[scene.city.inside(links.device_m[anchors])]:
+        x_m, y_m, z_m = links.device_m[index]
+        raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} at "
+                       f"({x_m:g}, {y_m:g}, {z_m:g}) m is inside a building of the scene; correct "
+                       "its position, or the scene's frame")
+    receiver_m, corners_m = links.receiver_m[:, :2], scene.city.vertices[:, :2]
+    outside = (receiver_m < corners_m.min(axis=0)) | (receiver_m > corners_m.max(axis=0))
+    for odd, where in ((scene.city.inside(links.receiver_m), "inside buildings"),
+                       (outside.any(axis=1), "outside the 3D map")):
+        if odd.any():
+            warnings.warn(f"{odd.sum()} of {len(odd)} receiver positions lie {where}: do "
+                          "measurements and scene share one frame and unit?", stacklevel=4)
+
+
+def _check_limit(links: LinkData) -> None:
+    """Warn where blanks should lie below a limit that no measured level comes near."""
+    level_db, limit_db = links.level_db, links.limit_db
+    blank = np.isnan(level_db)
+    if limit_db is not None and blank.mean() > MAX_BLANK and not blank.all() \
+            and np.nanmin(level_db) > limit_db + LIMIT_GAP_DB:
+        warnings.warn(f"{blank.sum()} levels are blank and taken for levels below the scene's "
+                      f"limit of detection, {limit_db:.0f} dB, but the weakest measured one is "
+                      f"{np.nanmin(level_db):.0f} dB: check sensitivity_dbm and tx_power_dbm in "
+                      "scene.toml", stacklevel=4)
+
+
+def level_of(links: LinkData) -> str:
+    """Return the name of what links hold, as of `Twin.level`."""
+    return "gain_db" if links.is_gain else "rssi_dbm"
+
+
+def provenance(links: LinkData, scene: Scene | None) -> dict[str, Any]:
+    """Return what a twin says of what it was made of."""
+    own = {} if scene is None else {"scene": scene.config.name, "scene_hash": scene.content_hash()}
+    return own | {"links": len(links), "radiotwin_version": radiotwin.__version__}

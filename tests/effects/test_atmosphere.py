@@ -1,0 +1,74 @@
+"""The most that air, rain and woodland can take: the table against published values and the package `itur`, and the
+bound of `excess_attenuation`."""
+
+import numpy as np
+import pytest
+
+from radiotwin.effects.atmosphere import TABLE, max_gas_db_km, max_rain_db_km
+from radiotwin.effects.excess_attenuation import ExcessAttenuation, max_at_ground_db_km
+from radiotwin.effects.vegetation import max_loss_db, specific_db_m
+
+
+@pytest.mark.parametrize("ghz, k, alpha", [  # ITU-R P.838-3, Table 5, horizontal polarisation
+    (1, 0.0000259, 0.9691), (2, 0.0000847, 1.0664), (4, 0.0001071, 1.6009), (6, 0.0007056, 1.5900),
+    (10, 0.01217, 1.2571), (20, 0.09164, 1.0568), (30, 0.2403, 0.9485), (60, 0.8606, 0.7656), (100, 1.3671, 0.6815)])
+def test_rain_is_that_of_the_recommendation(ghz, k, alpha):
+    assert max_rain_db_km(ghz * 1e9) == pytest.approx(k * 150**alpha, rel=0.01)
+
+
+def test_gas_has_the_peaks_of_the_recommendation():
+    """ITU-R P.676-12, Fig. 1: about 15 dB/km of oxygen near 60 GHz, a window of less than 0.5 dB/km near 30 GHz."""
+    assert max_gas_db_km(60e9) == pytest.approx(15, abs=0.5)
+    assert max_gas_db_km(30e9) < 0.5 and max_gas_db_km(2.4e9) < 0.01
+    assert max_gas_db_km(22.235e9) > 2 * max_gas_db_km(18e9)
+
+
+def test_the_table_is_that_of_itur():
+    """Straight lines between the rows included; where a line of the spectrum is curved, the table has more."""
+    pytest.importorskip("itur")
+    from itur.models import itu676, itu838
+    for ghz in (*TABLE[:, 0], *np.geomspace(1, 450, 150)):
+        air_db = [(itu676.gamma0_exact(ghz, 1013.25, rho, t) + itu676.gammaw_exact(ghz, 1013.25, rho, t)).value
+                  for rho, t in ((7.5, 288.15), (30.0, 308.15))]
+        assert 0.93 * max(air_db) <= max_gas_db_km(ghz * 1e9) <= 1.45 * max(air_db), ghz
+        rain_db = itu838.rain_specific_attenuation(150, ghz, 0, 0).value
+        assert max_rain_db_km(ghz * 1e9) == pytest.approx(rain_db, rel=0.09), ghz
+
+
+@pytest.mark.parametrize("mhz, specific, greatest_db", [  # ITU-R P.833-10, Sec. 2.1, St. Petersburg
+    (105.9, 0.04, 9.4), (466.475, 0.12, 18.0), (949.0, 0.17, 26.5), (1852.2, 0.30, 29.0), (2117.5, 0.34, 34.1)])
+def test_woodland_is_that_of_the_recommendation(mhz, specific, greatest_db):
+    """The values that were measured; the recommendation's own A_1 f^alpha differs from them by up to 11 %."""
+    assert specific_db_m(mhz * 1e6) == pytest.approx(specific, rel=0.13)
+    assert max_loss_db(mhz * 1e6) == pytest.approx(greatest_db, rel=0.12)
+
+
+def test_the_bound_is_the_sum_of_what_there_is():
+    """High up there are no trees: 14.78 + 39.89 dB/km of air and rain at 60 GHz. Within one scale height of 30 m there
+    is 1 - 1/e of a profile."""
+    assert max_at_ground_db_km(60e9, 1e6) == pytest.approx(54.67, abs=0.01)
+    trees_db_km = 2000 * 0.04 * (2400 / 105.9) ** (np.log(0.34 / 0.04) / np.log(2117.5 / 105.9))
+    assert max_at_ground_db_km(2.4e9, 30.0) == pytest.approx(trees_db_km * 0.632 + 0.0074 + 0.033, rel=0.01)
+
+
+@pytest.mark.parametrize("frequency_hz, scale_height_m, db_km, refused", [
+    (2.4e9, 5000.0, 12.0, True),   # of the whole air at 2.4 GHz: no rain does that
+    (2.4e9, 5000.0, 0.03, False),
+    (2.4e9, 35.0, 45.0, False),  # of trees
+    (2.4e9, 35.0, 900.0, True),
+    (60e9, 5000.0, 15.0, False),  # oxygen
+    (60e9, 5000.0, 60.0, True),
+    (None, 5000.0, 30.0, False)])
+def test_more_than_there_is_to_absorb_is_refused(frequency_hz, scale_height_m, db_km, refused):
+    params = ExcessAttenuation.Params(scale_height_m=scale_height_m, frequency_hz=frequency_hz)
+    reason = ExcessAttenuation().implausible(params, np.array([db_km]))
+    assert (reason is not None) == refused
+    assert not refused or "P.676, P.838, P.833" in reason
+
+
+def test_the_frequency_is_that_of_the_links(make_links, view):
+    links = make_links([[0.0, 0, 1.5]], [[100.0, 0, 60], [0, 200, 90]])
+    proposed = ExcessAttenuation().propose(view(links, np.zeros(2), 1.0))
+    assert all(each.frequency_hz == 2.4e9 for each in proposed)
+    unknown = make_links([[0.0, 0, 1.5]], [[100.0, 0, 60]], frequency_hz=np.nan)
+    assert ExcessAttenuation().propose(view(unknown, np.zeros(1), 1.0))[0].frequency_hz is None

@@ -1,0 +1,78 @@
+"""The body's shadow: never a gain, in azimuth and elevation, and found where it was put."""
+
+import numpy as np
+import pytest
+
+from radiotwin.effects.body_shadowing import Body, BodyShadowing
+from radiotwin.effects.params import Estimate
+
+
+@pytest.fixture
+def links(make_links):
+    """Two receivers that turn on the spot at 40 m, above devices all around: all azimuths, many elevations."""
+    rng = np.random.default_rng(0)
+    device_m = np.column_stack([rng.uniform(-150, 150, (40, 2)), np.full(40, 1.5)])
+    return make_links(device_m, np.tile([0.0, 0.0, 40.0], (60, 1)), receiver=np.repeat(np.arange(60) % 2, 40),
+                      heading_deg=np.repeat(rng.uniform(0, 360, 60), 40))
+
+
+def angle_deg(links, azimuth_deg, elevation_deg):
+    """Angle between a link's arrival and a direction of a level body, by the spherical law of cosines."""
+    east, north, up = (links.device_m[links.device] - links.receiver_m).T
+    arrival = np.arctan2(up, np.hypot(east, north))
+    apart = np.arctan2(east, north) - np.radians(links.heading_deg + azimuth_deg)
+    cosine = np.sin(arrival) * np.sin(np.radians(elevation_deg)) \
+        + np.cos(arrival) * np.cos(np.radians(elevation_deg)) * np.cos(apart)
+    return np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+
+
+@pytest.mark.parametrize("azimuth_deg, elevation_deg", [(60.0, 0.0), (200.0, 30.0), (0.0, 90.0)])
+def test_it_takes_its_depth_in_its_middle_nothing_opposite_and_half_across(links, azimuth_deg, elevation_deg):
+    body = Body(depth_db=8.0, azimuth_deg=azimuth_deg, elevation_deg=elevation_deg)
+    gain_db = BodyShadowing().gain_db(links, BodyShadowing.Params(receivers={1: body}))
+    off_deg, mine = angle_deg(links, azimuth_deg, elevation_deg), links.receiver == 1
+    expected_db = np.interp(np.cos(np.radians(off_deg)), [-1, 0, 1], [0, -4, -8])
+    np.testing.assert_allclose(gain_db, np.where(mine, expected_db, 0.0), atol=1e-9)
+    assert gain_db.max() <= 0
+
+
+def test_no_direction_gains():
+    arrival = np.random.default_rng(1).normal(size=(10_000, 3))
+    arrival /= np.linalg.norm(arrival, axis=1, keepdims=True)
+    loss_db = Body(depth_db=12.0, azimuth_deg=40.0, elevation_deg=-20.0).loss_db(arrival)
+    assert 0 <= loss_db.min() < 0.01 and 11.99 < loss_db.max() <= 12
+
+
+def test_it_is_proposed_where_it_is(links, view):
+    """A pod below the deck to the right of one receiver; the other has none."""
+    off_deg = angle_deg(links, 60.0, -40.0)
+    rng, mean_db = np.random.default_rng(2), np.full(len(links), -80.0)
+    loss_db = np.where(links.receiver == 1, 10 * (1 + np.cos(np.radians(off_deg))) / 2, 0.0)
+    links.level_db[:] = mean_db - loss_db + rng.normal(0, 2.0, len(links))
+    (params,) = BodyShadowing().propose(view(links, mean_db, 2.0))
+    body = params.receivers[1]
+    assert body.depth_db == pytest.approx(10, abs=2.5)  # less, by the prior: where the search begins
+    assert body.azimuth_deg == pytest.approx(60, abs=8) and body.elevation_deg == pytest.approx(-40, abs=12)
+    assert 0 not in params.receivers or params.receivers[0].depth_db < 1
+
+
+def test_what_was_found_is_reported_for_each_receiver(links):
+    params = BodyShadowing.Params(receivers={1: Body(depth_db=8.0, azimuth_deg=420.0, elevation_deg=5.0)})
+    variation = BodyShadowing().variation(params)
+    assert variation.params(variation.values) == params and len(variation.members) == 1
+    found = BodyShadowing().parameters(links, params, Estimate(np.zeros(0), np.zeros((0, 0)), np.ones((2, 3))))
+    assert {name: parameter.value for name, parameter in found.items()} == {
+        "body_depth_db[r1]": 8, "body_azimuth_deg[r1]": 60, "body_elevation_deg[r1]": 5}
+
+
+def test_a_body_is_found_in_a_flight(open_ground, loop):
+    """One receiver of two loses 9 dB behind, 0 in front; the other is clear."""
+    world = open_ground.fly(31)
+    bearing = np.arctan2(*(world.device_m[world.device] - world.receiver_m)[:, :2].T)
+    flat = np.hypot(*world.offset_m[:, :2].T) / world.distance_m
+    behind = np.cos(bearing - np.radians(world.heading_deg) - np.pi) * flat
+    world.gain_db = world.gain_db - np.where(world.receiver == 1, 4.5 * (1 + behind), 0.0)
+    found = loop(open_ground.measured(world))
+    assert found.names[0] == "body_shadowing"
+    assert found.first["body_depth_db[r1]"].value == pytest.approx(9, abs=1.5)
+    assert abs(found.first["body_azimuth_deg[r1]"].value - 180) < 12

@@ -1,0 +1,61 @@
+"""Loss on the way into buildings: the published distribution, and links with one end inside."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from radiotwin.effects.building_entry import BuildingEntry, entry_loss_db
+from radiotwin.scene.citymap import CityMap
+
+
+@pytest.mark.parametrize("ghz, elevation_deg, building, values", [
+    # Reference values of ITU-R Study Group 3 (workbook 'Clutter and BEL', as in github.com/eeveetza/p2109,
+    # validate_p2109.m) at 10 %, nearly the median (50.11872 %), and 93.32543 %
+    (28, 0, "traditional", (6.891, 20.218, 38.785)), (28, 0, "thermally_efficient", (19.484, 41.732, 70.117)),
+    (2, 45, "traditional", (11.251, 23.556, 38.710)), (2, 45, "thermally_efficient", (20.566, 37.995, 59.617))])
+def test_the_loss_has_the_reference_values(ghz, elevation_deg, building, values):
+    found = [entry_loss_db(ghz * 1e9, elevation_deg, building, percent / 100)
+             for percent in (10.0, 50.11872, 93.32543)]
+    assert found == pytest.approx(values, abs=0.01)
+
+
+def test_the_elevation_counts_to_either_side():
+    up, down = (entry_loss_db(2.4e9, sign * 60.0, "traditional") for sign in (1, -1))
+    assert up == down > entry_loss_db(2.4e9, 0.0, "traditional") + 10
+
+
+@pytest.fixture
+def indoors(make_links):
+    """A device in the street; 40 receivers inside a block, 40 outside it."""
+    box = trimesh.creation.box(extents=(60, 60, 30))
+    box.apply_translation((100, 0, 15))
+    rng = np.random.default_rng(0)
+    inside_m = np.column_stack([rng.uniform(75, 125, 40), rng.uniform(-25, 25, 40), rng.uniform(2, 28, 40)])
+    outside_m = np.column_stack([rng.uniform(-50, 50, (40, 2)), np.full(40, 40.0)])
+    return make_links([[0.0, 0, 1.5]], np.vstack([inside_m, outside_m]), city=CityMap(box.vertices, box.faces))
+
+
+def test_only_links_that_enter_lose(indoors, view):
+    effect = BuildingEntry()
+    assert effect.unavailable(indoors) is None
+    traditional, efficient = effect.propose(view(indoors, np.zeros(80), 1.0))
+    term = effect.term(indoors, traditional, None)
+    expected_db = entry_loss_db(2.4e9, indoors.elevation_deg, "traditional")
+    np.testing.assert_allclose(term.offset_db, np.where(np.arange(80) < 40, -expected_db, 0.0))
+    np.testing.assert_array_equal(term.columns[:, 0], np.where(np.arange(80) < 40, -1.0, 0.0))
+    assert 8 < term.prior_sd_db[0] < 12  # sigma_1 of traditional buildings is 9.6 + 2 log f
+    assert (effect.term(indoors, efficient, None).offset_db[:40] < term.offset_db[:40] - 10).all()
+
+
+def test_it_needs_a_map_a_frequency_and_links_indoors(indoors, make_links):
+    assert "no 3D map" in BuildingEntry().unavailable(make_links([[0.0, 0, 1.5]], np.ones((60, 3))))
+    assert "frequency" in BuildingEntry().unavailable(make_links([[0.0, 0, 1.5]], np.ones((60, 3)), city=indoors.city,
+                                                                 frequency_hz=np.nan))
+    assert "0 links" in BuildingEntry().unavailable(indoors.select(np.arange(80) >= 40))
+
+
+@pytest.mark.parametrize("more_db, message", [(0.0, None), (-30.0, "amplify"), (60.0, "99 %")])
+def test_what_no_building_does_is_implausible(more_db, message):
+    params = BuildingEntry.Params(building="traditional", frequency_hz=2.4e9)
+    reason = BuildingEntry().implausible(params, np.array([more_db]))
+    assert reason is None if message is None else message in reason
