@@ -298,9 +298,11 @@ def maps_figures(rows: pd.DataFrame) -> dict[str, Figure]:
                           color=COLOURS[index], label=label)
     panels[0].set(ylabel="RMSE over held-out links [dB]")
     panels[1].set(ylabel="devices within their 90 % radius", ylim=(0, 1.02))
-    panels[1].axhspan(0.8, 0.97, color="black", alpha=0.1, linewidth=0, label="80 to 97 %")
+    panels[1].axhspan(0.8, 0.97, color="black", alpha=0.1, linewidth=0, zorder=0,
+                      label="80 to 97 %")
     for axes in panels:
-        axes.set_xticks(range(len(lines)), [fill(title, 16) for title, _ in lines])
+        axes.set_xticks(range(len(lines)), [fill(title, 13) for title, _ in lines],
+                        fontsize="small")
         axes.grid(alpha=0.3, axis="y")
     return {"maps": tables.with_legend(figure, panels, 5)}
 

@@ -115,7 +115,7 @@ def flat(value):
     ("--scene nowhere", ["nowhere", "radiotwin build-scene"]),
     ("--episodes 0", ["--episodes 0", "≥ 1"]),
     ("--compare perhaps", ["--compare perhaps", "true|false"]),
-    ("--twin magic", ["--twin magic", "nn|log-distance|kriging|raytrace|truth"]),
+    ("--twin magic", ["--twin magic", "nn|log-distance|kriging|raytrace|path-kriging|truth"]),
     ("--algorithm magic", ["--algorithm magic", "fedqmix|qmix|iql|greedy|planner|random"]),
     ("--fly-again true", ["No such option: --fly-again"]),
     ("--batch 64 --replay 32", ["replay 32", "64"]),
