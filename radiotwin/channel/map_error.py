@@ -54,7 +54,7 @@ class MapError:
 
     @property
     def warning(self) -> str:
-        """What a user is told of a map that is worse than usual; empty where it is not."""
+        """Message about a map that is worse than usual; empty where it is not."""
         east_m, north_m, radius_m = self.shift_m
         reflected_db, diffracted_db = self.offsets_db
         parts = [f"it lies {east_m:+.1f} m east and {north_m:+.1f} m north of where it should "

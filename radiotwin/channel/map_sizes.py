@@ -8,12 +8,12 @@ is that of its class plus what errors of the map would do to it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from radiotwin.channel.class_fit import LinkFit, links_as_one
-from radiotwin.channel.path_levels import Offsets, over, paths_db
+from radiotwin.channel.path_levels import Offsets, paths_db
 from radiotwin.links import LinkGeometry
 from radiotwin.progress import progress
 from radiotwin.scene.perturbation import perturbed_map
@@ -100,7 +100,8 @@ class _Spread:
             with progress("following paths over wrong maps", total=MEMBERS) as advance:
                 for member in range(MEMBERS):
                     wrong = perturbed_map(city, *size, self._seed + member)
-                    changes.append(paths_db(over(self.links, wrong), *self._power) - self.base_db)
+                    there = replace(self.links, city=wrong)  # line of sight stays the map's
+                    changes.append(paths_db(there, *self._power) - self.base_db)
                     advance(1)
             self._known[size] = np.mean(np.square(changes), axis=0)
         return self._known[size]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -11,7 +12,7 @@ from radiotwin.channel.base import ChannelModel, drop_uninformative
 from radiotwin.channel.class_fit import DOF, fit_class, scale_db
 from radiotwin.channel.image_paths import DIFFUSE_DEFAULT, stored_diffuse
 from radiotwin.channel.map_error import Found, MapError, estimate_map_error
-from radiotwin.channel.path_levels import over, paths_db
+from radiotwin.channel.path_levels import paths_db
 from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.channel.residual_field import ResidualField
 from radiotwin.channel.stored import (
@@ -119,7 +120,8 @@ class PathKriging(ChannelModel):
             for member in range(MEMBERS):
                 wrong = perturbed_map(links.city, self.map_error.wall_m[0],
                                       self.map_error.height_m[0], self.seed + member)
-                levels_db.append(paths_db(over(links, wrong), *power))
+                # Line of sight stays that of the given map, whose class the links belong to.
+                levels_db.append(paths_db(replace(links, city=wrong), *power))
         unbiased = len(levels_db) / max(len(levels_db) - 1, 1)
         return np.mean(levels_db, axis=0), unbiased * np.var(levels_db, axis=0)
 

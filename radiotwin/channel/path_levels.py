@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -29,13 +28,7 @@ def paths_db(links: LinkGeometry, diffuse: tuple[float, float], offsets_db: Offs
         diffuse: power beside the paths, see `ImagePaths`.
         offsets_db: see `Offsets`.
     """
-    factor = 10 ** (np.array([0.0, *offsets_db]) / 10)
-    return with_diffuse_db(interaction_gains(links) @ factor, links.distance_m, *diffuse)
-
-
-def over(links: LinkGeometry, city: Any) -> LinkGeometry:
-    """Return links over another map, with the line of sight that they have over their own."""
-    return replace(links, city=city)
+    return _level_db(interaction_gains(links), links.distance_m, diffuse, offsets_db)
 
 
 def moved(links: LinkGeometry, east_m: float, north_m: float) -> LinkGeometry:
@@ -60,20 +53,25 @@ def fit_offsets(links: LinkGeometry, level_db: np.ndarray, limit_db: float | Non
         diffuse: power beside the paths, see `ImagePaths`.
     """
     fit, gains = LinkFit(level_db, limit_db), interaction_gains(links)
-
-    def level(offsets_db: np.ndarray) -> np.ndarray:
-        factor = 10 ** (np.array([0.0, *offsets_db]) / 10)
-        return with_diffuse_db(gains @ factor, links.distance_m, *diffuse)
-
-    as_one = links_as_one(links, fit.fit(links.los, level(np.zeros(2)))[1])
+    distance_m = links.distance_m
+    undisturbed_db = _level_db(gains, distance_m, diffuse, np.zeros(2))
+    as_one = links_as_one(links, fit.fit(links.los, undisturbed_db)[1])
 
     def loss(offsets_db: np.ndarray) -> float:
         inside = np.clip(offsets_db, -MAX_OFFSET_DB, MAX_OFFSET_DB)
         prior = 0.5 * (offsets_db**2).sum() / OFFSET_SD_DB**2
-        return fit.fit(links.los, level(inside))[0].sum() / as_one + float(prior)
+        level_db = _level_db(gains, distance_m, diffuse, inside)
+        return fit.fit(links.los, level_db)[0].sum() / as_one + float(prior)
 
     simplex = np.array([[0.0, 0.0], [3.0, 0.0], [0.0, 3.0]])
     found = minimize(loss, np.zeros(2), method="Nelder-Mead",
                      options={"xatol": 0.1, "fatol": 0.02, "initial_simplex": simplex})
     reflected_db, diffracted_db = np.clip(found.x, -MAX_OFFSET_DB, MAX_OFFSET_DB).tolist()
     return reflected_db, diffracted_db
+
+
+def _level_db(gains: np.ndarray, distance_m: np.ndarray, diffuse: tuple[float, float],
+              offsets_db: Offsets | np.ndarray) -> np.ndarray:
+    """Return the level (n,) [dB] of `interaction_gains` (n, 3) and diffuse power."""
+    factor = 10 ** (np.array([0.0, *offsets_db]) / 10)
+    return with_diffuse_db(gains @ factor, distance_m, *diffuse)

@@ -29,7 +29,7 @@ MAX_ROOF_M = 1e4  # of a stored roof
 
 
 class Validity(NamedTuple):
-    """What a law was published for, each as (least, greatest).
+    """Range that a law was published for, each as (least, greatest).
 
     Attributes:
         frequency_hz: of the radio [Hz].

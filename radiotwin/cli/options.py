@@ -16,6 +16,9 @@ SceneOption = Annotated[Path, typer.Option(
     help="Scene folder: the 3D map and the lattice of the UAVs.")]
 OptionalScene = Annotated[Path | None, typer.Option(
     help="Scene folder; without one every link has line of sight.")]
+PointsFile = Annotated[Path, typer.Option(
+    help="CSV file with x_m, y_m, z_m; or latitude_deg, longitude_deg, z_m, where the scene has an "
+         "origin.")]
 OnlyDevices = Annotated[str | None, typer.Option(metavar="A,B,…", help="Only these devices.")]
 Quality = Annotated[str | None, typer.Option(help="fast, default or high [default].")]
 TargetDb = Annotated[float | None, typer.Option(

@@ -8,6 +8,7 @@ import typer
 from radiotwin.cli.options import (
     Combining,
     OnlyDevices,
+    PointsFile,
     Quality,
     RaySeed,
     SceneFolder,
@@ -67,9 +68,7 @@ def trace(
 
 def gains(
     folder: SceneFolder,
-    points: Annotated[Path, typer.Option(
-        help="CSV file with x_m, y_m, z_m; or latitude_deg, longitude_deg, z_m, where the scene "
-             "has an origin.")],
+    points: PointsFile,
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="Table (.csv, .csv.gz) with a row per link.")] = Path("gains.csv"),
     devices: OnlyDevices = None,
@@ -100,9 +99,7 @@ def gains(
 
 def paths(
     folder: SceneFolder,
-    points: Annotated[Path, typer.Option(
-        help="CSV file with x_m, y_m, z_m; or latitude_deg, longitude_deg, z_m, where the scene "
-             "has an origin.")],
+    points: PointsFile,
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="NetCDF file (.nc).")] = Path("paths.nc"),
     devices: OnlyDevices = None,

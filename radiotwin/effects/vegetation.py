@@ -1,4 +1,4 @@
-"""What woodland takes from a link, by frequency (ITU-R P.833-10, Sec. 2.1, one terminal in it).
+"""Loss of a link in woodland, by frequency (ITU-R P.833-10, Sec. 2.1, one terminal in it).
 
 Of the forests of the recommendation the one that was measured over the widest range of frequencies,
 105.9 to 2117.5 MHz (mixed, trees of 16 m). Beyond it the power laws are extrapolated; that of the

@@ -212,6 +212,11 @@ class LinkData:
         """Return the same links with the devices at (k, 3) [m]."""
         return replace(self, device_m=device_m, known_los=None)
 
+    def located(self, device_m: np.ndarray) -> LinkData:
+        """Return the links of devices that have a position in (k, 3) [m], there; NaN: none."""
+        rows = np.isfinite(device_m).all(axis=1)[self.device]
+        return self.with_devices(np.nan_to_num(device_m)).select(rows)
+
     def with_receivers(self, receiver_m: np.ndarray) -> LinkData:
         """Return the same links with the receivers at (n, 3) [m]."""
         return replace(self, receiver_m=receiver_m, known_los=None)

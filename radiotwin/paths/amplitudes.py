@@ -4,7 +4,7 @@ import numpy as np
 from numba import njit
 
 from radiotwin.paths.coefficients import Slabs
-from radiotwin.paths.fields import follow_field, take_legs, vertical
+from radiotwin.paths.fields import follow_field, send, take_legs, vertical
 from radiotwin.paths.images import Candidates, PathBuffer
 from radiotwin.paths.surfaces import Surfaces
 from radiotwin.paths.vectors import dot
@@ -35,9 +35,7 @@ def path_amplitudes(
     for i in range(len(rows)):
         path = rows[i]
         legs = take_legs(buffer, path, direction, length_m)
-        sent = vertical(direction[0])
-        for axis in range(3):
-            field[axis] = sent[axis]
+        send(direction[0], 0, field)
         spread = follow_field(surfaces.planes, surfaces.edges, candidates,
                               buffer.candidate[path], wave_number, slabs, wedge, direction,
                               length_m, legs, field)

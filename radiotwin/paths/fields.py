@@ -44,21 +44,26 @@ def path_gains(
         legs = take_legs(buffer, path, direction, length_m)
         power = 0.0
         for sent in range(1 + polarisation):
-            polarised = vertical(direction[0])
-            if sent == 1:
-                polarised = cross(direction[0], polarised)
-            for axis in range(3):
-                field[axis] = polarised[axis]
+            send(direction[0], sent, field)
             spread = follow_field(surfaces.planes, surfaces.edges, candidates,
                                   buffer.candidate[path], wave_number, slabs, wedge, direction,
                                   length_m, legs, field)
             if polarisation == VERTICAL:
-                polarised = vertical(direction[legs - 1])
-                power += spread * abs(dot(field, polarised)) ** 2
+                power += spread * abs(dot(field, vertical(direction[legs - 1]))) ** 2
             else:
                 power += 0.5 * spread \
                     * (abs(field[0]) ** 2 + abs(field[1]) ** 2 + abs(field[2]) ** 2)
         gain[i] = power / (2.0 * wave_number) ** 2
+
+
+@njit(cache=True, error_model="numpy")
+def send(direction: np.ndarray, polarisation: int, field: np.ndarray) -> None:
+    """Write the field of a ray as it leaves: 0 as vertical as it can be, 1 across that."""
+    polarised = vertical(direction)
+    if polarisation == 1:
+        polarised = cross(direction, polarised)
+    for axis in range(3):
+        field[axis] = polarised[axis]
 
 
 @njit(cache=True, error_model="numpy")

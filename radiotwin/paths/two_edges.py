@@ -18,7 +18,7 @@ import numpy as np
 from numba import njit
 
 from radiotwin.paths.coefficients import Slabs
-from radiotwin.paths.fields import VERTICAL, vertical
+from radiotwin.paths.fields import VERTICAL, send, vertical
 from radiotwin.paths.surfaces import ALONG, LENGTH, NORMAL_0, NORMAL_N, START, Surfaces
 from radiotwin.paths.topology import expand
 from radiotwin.paths.vectors import cross, dot
@@ -246,11 +246,7 @@ def two_edge_gains(
                        surfaces.edges[edge[i, 1], ALONG:ALONG + 3], direction[1])
         power = 0.0
         for sent in range(1 + polarisation):
-            polarised = vertical(direction[0])
-            if sent == 1:
-                polarised = cross(direction[0], polarised)
-            for axis in range(3):
-                field[axis] = polarised[axis]
+            send(direction[0], sent, field)
             diffract(surfaces.edges, edge[i, 0], direction[0], direction[1], a,
                      wave_at_edge(a, b, c, sine2)[1], wave_number, slabs, wedge, field)
             diffract(surfaces.edges, edge[i, 1], direction[1], direction[2],

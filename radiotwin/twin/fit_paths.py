@@ -114,6 +114,5 @@ def best_dof(links: LinkData, channel: ChannelModel, device_m: np.ndarray) -> fl
 def _image_paths(links: LinkData, law: Twin, device_m: np.ndarray) -> ImagePaths:
     """Return the channel, its diffuse power fitted to links of devices that have a position."""
     channel = ImagePaths(law.channel)
-    rows = np.isfinite(device_m).all(axis=1)[links.device]
-    located = links.with_devices(np.where(np.isfinite(device_m), device_m, 0.0)).select(rows)
+    located = links.located(device_m)
     return channel.fit_diffuse(located.geometry, located.level_db, links.limit_db)

@@ -45,7 +45,7 @@ def fit_over_wrong_map(links: LinkData, scene: Scene, seed: int, start: Twin | N
         start: an earlier twin, as of `fit_twin`.
     """
     shift_m = _shift(links, seed)
-    on_map = _moved(links, shift_m, 1)
+    on_map = _moved(links, shift_m)
     with_copies = _with_copies(on_map)
     by_paths = fit_along_paths(with_copies, scene, seed, start)
     assert isinstance(by_paths.channel, ImagePaths)
@@ -69,19 +69,18 @@ def fit_over_wrong_map(links: LinkData, scene: Scene, seed: int, start: Twin | N
 
 def _shift(links: LinkData, seed: int) -> Shift:
     """Return the shift of the map, from the anchors' links."""
-    known = links.with_devices(np.nan_to_num(links.device_m))
-    known = known.select(np.isin(links.device, sorted(links.anchors)))
+    known = links.located(links.device_m)
     if not len(known):
         return NO_SHIFT
     geometry, level_db = drop_uninformative(known.geometry, known.level_db, links.limit_db)
     return estimate_shift(geometry, level_db, links.limit_db, seed)
 
 
-def _moved(links: LinkData, shift_m: Shift, sign: int) -> LinkData:
+def _moved(links: LinkData, shift_m: Shift) -> LinkData:
     """Return links whose ends are all moved by a shift."""
     if shift_m == NO_SHIFT:
         return links
-    step_m = sign * np.array([*shift_m[:2], 0.0])
+    step_m = np.array([*shift_m[:2], 0.0])
     return links.with_devices(links.device_m + step_m).with_receivers(links.receiver_m + step_m)
 
 
@@ -122,9 +121,7 @@ def _calibrated(devices: list[TwinDevice], links: LinkData) -> list[TwinDevice]:
 
 def _found(links: LinkData, devices: list[TwinDevice], shift_m: Shift, seed: int) -> Found:
     """Return the errors of a map that is not shifted any more, from devices that are not lost."""
-    device_m = reliable_m(devices, LOST_M)
-    rows = np.isfinite(device_m).all(axis=1)[links.device]
-    known = links.with_devices(np.nan_to_num(device_m)).select(rows)
+    known = links.located(reliable_m(devices, LOST_M))
     geometry, level_db = drop_uninformative(known.geometry, known.level_db, links.limit_db)
     error, diffuse = estimate_other_errors(geometry, level_db, links.limit_db, seed)
     return replace(error, shift_m=shift_m), diffuse
@@ -132,10 +129,8 @@ def _found(links: LinkData, devices: list[TwinDevice], shift_m: Shift, seed: int
 
 def _channel(links: LinkData, devices: list[TwinDevice], found: Found, seed: int) -> PathKriging:
     """Fit the channel to all devices that are located; kriging alone to those that are lost."""
-    device_m = reliable_m(devices)
     lost = tuple(np.flatnonzero(~np.isfinite(reliable_m(devices, LOST_M)).all(axis=1)).tolist())
-    rows = np.isfinite(device_m).all(axis=1)[links.device]
-    known = links.with_devices(np.nan_to_num(device_m)).select(rows)
+    known = links.located(reliable_m(devices))
     data = known.geometry, known.level_db, links.limit_db, seed
     inputs = PathKriging, *data, str(found[0].state()), found[1], lost
     return kept("channel", inputs, lambda: PathKriging(found, lost).fit(*data), PathKriging.state,
