@@ -24,13 +24,13 @@ from radiotwin.closeloop.cross_validation import (
     training_parts,
 )
 from radiotwin.closeloop.folds import Folds, make_folds
-from radiotwin.closeloop.selection import (
+from radiotwin.closeloop.scoring import (
     Candidate,
     CandidateScore,
-    SelectionResult,
     fit_candidate,
     score_candidate,
 )
+from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.base import Effect
 from radiotwin.effects.gain_drift import DeviceDrift, ReceiverDrift
 from radiotwin.links import LinkData, evidence_blocks

@@ -10,9 +10,10 @@ import numpy as np
 
 from radiotwin import __version__
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.closeloop.posterior import Step
 from radiotwin.closeloop.result_schema import ReportRecord
 from radiotwin.closeloop.run import Loop
-from radiotwin.closeloop.selection import CandidateScore
+from radiotwin.closeloop.scoring import CandidateScore
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 from radiotwin.links import LinkData
@@ -31,7 +32,9 @@ def make_report(loop: Loop) -> dict[str, Any]:
                 "params": each.params.model_dump(mode="json"),
                 "parameters": {name: vars(parameter) for name, parameter in parameters.items()},
                 "confused_with": list(each.effect.confused_with), "indistinguishable_from": rivals,
-                "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value}}
+                "probability": score.probability,
+                "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value,
+                             "evidence_nats": score.evidence_nats}}
                for rank, (score, each, parameters, rivals) in enumerate(
                    zip(kept, loop.after.whole.effects, loop.parameters, selection.rivals,
                        strict=False), start=1)]
@@ -39,7 +42,9 @@ def make_report(loop: Loop) -> dict[str, Any]:
         effects.append(_shadowing(kept[-1], loop.after, len(effects) + 1))
     candidates = [{"name": score.name, "step": score.step + 1, "heldout_rmse_db": score.rmse_db,
                    "heldout_nll_gain": score.nll_gain, "p_value": score.p_value, "kept": score.kept,
-                   "reason": score.reason} for score in selection.scores]
+                   "reason": score.reason, "evidence_nats": score.evidence_nats,
+                   "lead_nats": list(score.lead_nats), "probability": score.probability}
+                  for score in selection.scores]
     links = loop.after.links
     error: dict[str, Any] = {"before": scores(loop.before), "after": scores(loop.after),
                              "noise_floor_db": loop.noise_floor_db}
@@ -51,6 +56,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
     return _for_json({
         "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base,
         "verdict": loop.verdict, "effects": effects, "candidates": candidates,
+        "posterior": [_step(each) for each in selection.steps],
         "heldout": {"by": loop.folds.by, "folds": loop.folds.count,
                     "n": int(np.isfinite(loop.after.held_out_nll).sum())},
         "error": error, "baselines": baselines,
@@ -162,7 +168,7 @@ def _from_version_1(report: dict[str, Any]) -> dict[str, Any]:
                        for name, value in effect.items()} for effect in report["effects"]]
     new["error"] = _with_new_bias(report["error"])
     new["baselines"] = _with_new_bias(report["baselines"])
-    return new | {"schema": SCHEMA, "criteria": {}}
+    return new | {"schema": SCHEMA, "criteria": {}, "posterior": []}
 
 
 def _with_new_bias(value: Any) -> Any:
@@ -171,6 +177,14 @@ def _with_new_bias(value: Any) -> Any:
         return value
     return {name: -each if name == "bias_db" and each is not None else _with_new_bias(each)
             for name, each in value.items()}
+
+
+def _step(step: Step) -> dict[str, Any]:
+    """Return a step's probabilities, the likeliest first."""
+    ordered = sorted(step.probabilities.items(), key=lambda item: -item[1])
+    return {"step": step.number + 1, "unnamed_nats": step.unnamed_nats, "rest_db": step.rest_db,
+            "noise_db": step.noise_db,
+            "probabilities": [{"name": name, "probability": each} for name, each in ordered]}
 
 
 def _shadowing(score: CandidateScore, model: CrossValidatedModel, rank: int) -> dict[str, Any]:

@@ -54,6 +54,7 @@ class EvidenceRecord(Record):
 
     heldout_nll_gain: Number | None
     p_value: Number | None
+    evidence_nats: Number | None = None
 
 
 class EffectRecord(Record):
@@ -66,6 +67,7 @@ class EffectRecord(Record):
     parameters: dict[str, ParameterRecord]
     confused_with: list[str] = Field(default_factory=list)
     indistinguishable_from: list[str] = Field(default_factory=list)
+    probability: Number | None = None
     evidence: EvidenceRecord
 
 
@@ -79,6 +81,9 @@ class CandidateRecord(Record):
     p_value: Number | None
     kept: bool
     reason: str
+    evidence_nats: Number | None = None
+    lead_nats: list[Number | None] = Field(default_factory=list)
+    probability: Number | None = None
 
 
 class DependenceRecord(Record):
@@ -94,6 +99,23 @@ class RemainingRecord(Record):
 
     structured: bool
     drivers: list[DependenceRecord]
+
+
+class ProbabilityRecord(Record):
+    """A cause, `none` or `not in the catalogue`, and how probable it is."""
+
+    name: str
+    probability: Number | None
+
+
+class StepRecord(Record):
+    """What the residual says at one step of the selection."""
+
+    step: Whole
+    probabilities: list[ProbabilityRecord]
+    unnamed_nats: dict[str, Number | None]
+    rest_db: Number | None
+    noise_db: Number | None
 
 
 class FoldsRecord(Record):
@@ -117,9 +139,10 @@ class ReportRecord(Record):
     schema_: Literal["radiotwin.closeloop/2"] = Field(alias="schema")
     radiotwin_version: str = ""
     base: str
-    verdict: Literal["effect", "none", "unexplained"]
+    verdict: Literal["effect", "none", "unexplained", "undecided"]
     effects: list[EffectRecord]
     candidates: list[CandidateRecord]
+    posterior: list[StepRecord] = Field(default_factory=list)
     heldout: FoldsRecord
     error: ErrorRecord
     baselines: dict[str, BaselineRecord]

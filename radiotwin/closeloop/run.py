@@ -21,6 +21,7 @@ from radiotwin.closeloop.cross_validation import (
     training_parts,
 )
 from radiotwin.closeloop.folds import Folds, make_folds
+from radiotwin.closeloop.posterior import NONE, OTHER
 from radiotwin.closeloop.residual_tests import ResidualDependence, residual_dependences
 from radiotwin.closeloop.selection import SelectionResult, add_shadowing, forward_selection
 from radiotwin.closeloop.thinning import thin_links
@@ -77,12 +78,21 @@ class Loop:
 
     @property
     def verdict(self) -> str:
-        """`effect`, `none` or `unexplained`."""
-        effects = self.after.whole.effects
-        if any(each.effect.is_cause for each in effects):
+        """`effect`, `none`, `unexplained` or `undecided`.
+
+        Without a named effect: `unexplained` where a cause without a name is the likeliest, or more
+        than `max_rest_db` belongs to places; `none` where nothing is the likeliest by far.
+        """
+        if any(each.effect.is_cause for each in self.after.whole.effects):
             return "effect"
-        structured = significant(self.dependences_before, self.criteria)
-        return "unexplained" if effects or self.after.shadowing or structured else "none"
+        if not self.selection.steps:
+            return "undecided"
+        step = self.selection.steps[0]
+        likeliest = max(step.probabilities, key=lambda name: step.probabilities[name])
+        if likeliest == OTHER or step.rest_db > self.criteria.max_rest_db:
+            return "unexplained"
+        sure = step.probabilities[NONE] >= self.criteria.min_probability
+        return "none" if sure else "undecided"
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:

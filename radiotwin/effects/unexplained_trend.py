@@ -51,7 +51,7 @@ class UnexplainedTrend(GainEffect):
             return []
         receivers = np.unique(view.links.receiver).tolist()
         choices = [[None], *([receivers] if 1 < len(receivers) <= MAX_CURVES else [])]
-        knots = _knots(self.variable, value[known])
+        knots = _knots(value[known], KNOTS, self.variable in CIRCULAR)
 
         def rating(params: UnexplainedTrend.Params) -> float:
             term = self.term(view.links, params, view.level_at)
@@ -62,9 +62,9 @@ class UnexplainedTrend(GainEffect):
 
     @override
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
-        hats = _hats(self._value(links, level_at), np.array(params.knots),
-                     self.variable in CIRCULAR)
-        columns = [hats if member is None else hats * (links.receiver == member)[:, None]
+        basis = _hats(self._value(links, level_at), np.array(params.knots),
+                      self.variable in CIRCULAR)
+        columns = [basis if member is None else basis * (links.receiver == member)[:, None]
                    for member in params.receivers]
         return Term.of_columns(np.hstack(columns), PRIOR_SD_DB)
 
@@ -87,11 +87,17 @@ class UnexplainedTrend(GainEffect):
             links, (level_at,), lambda: residual_variables(links, level_at(links))[self.variable])
 
 
-def _knots(name: str, value: np.ndarray) -> list[float]:
+def curve_columns(value: np.ndarray, knots: int, circular: bool) -> np.ndarray:
+    """Return columns (n, ≤ knots) of a curve over values (n,), 0 where they are unknown."""
+    places = _knots(value[np.isfinite(value)], knots, circular)
+    return _hats(value, np.array(places), circular)
+
+
+def _knots(value: np.ndarray, count: int, circular: bool) -> list[float]:
     """Return knots round the circle, or at evenly spaced quantiles of the values."""
-    if name in CIRCULAR:
-        return (np.arange(KNOTS) * 360.0 / KNOTS).tolist()
-    return np.unique(np.quantile(value, (np.arange(KNOTS) + 0.5) / KNOTS)).tolist()
+    if circular:
+        return (np.arange(count) * 360.0 / count).tolist()
+    return np.unique(np.quantile(value, (np.arange(count) + 0.5) / count)).tolist()
 
 
 def _hats(value: np.ndarray, knots: np.ndarray, circular: bool) -> np.ndarray:

@@ -7,7 +7,7 @@ from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import CrossValidatedModel, cross_validate, training_parts
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.closeloop.run import close_loop
-from radiotwin.closeloop.selection import CandidateScore, _score
+from radiotwin.closeloop.scoring import CandidateScore, score_model
 from radiotwin.links import prepare_links
 
 
@@ -28,5 +28,5 @@ def test_a_candidate_that_no_held_out_link_can_judge_is_refused(open_ground):
     model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
     extended = CrossValidatedModel(model.whole, model.folds, model.fits, model.index, model.twin)
     extended.held_out_nll = np.full(len(links), np.nan)
-    score = _score(model, extended, CandidateScore("device_gain_offset"), None, 1, 0, SelectionCriteria())
+    score = score_model(model, extended, CandidateScore("device_gain_offset"), None, 1, 0, SelectionCriteria())
     assert "no held-out link" in score.reason

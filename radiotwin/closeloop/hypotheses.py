@@ -1,0 +1,199 @@
+"""What competes for a residual: nuisances of the base, causes without a name, and named causes.
+
+Nuisances are always there: a level and a slope of each class of line of sight, small errors of each
+device, receiver and flight, and a field over positions (`radiotwin.inference.correlated_evidence`).
+Causes without a name are curves over each variable, for all links, each receiver or each device: what
+one of them explains better than any named effect is not in the catalogue.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from radiotwin.effects.arrays import one_hot
+from radiotwin.effects.base import Effect
+from radiotwin.effects.correlated_shadowing import receivers_move
+from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.unexplained_trend import curve_columns
+from radiotwin.inference.censored_regression import FitResult
+from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
+from radiotwin.links import LinkData
+
+MAX_Z = 5.0  # an outlier counts as this many scales
+LEVEL_SD_DB, SLOPE_SD_DB = 20.0, 10.0  # of a class of line of sight, at 100 m and per decade
+DEVICE_SD_DB, RECEIVER_SD_DB, FLIGHT_SD_DB = 1.0, 0.3, 0.3  # within tolerances: no effect
+MAX_ENDS = 40  # devices or receivers that have terms of their own
+LEVEL_KNOTS, LEVEL_CURVE_SD_DB = 6, 2.0  # of the base's error over the level that it predicts
+KNOTS = 8  # of a curve over a variable
+TIME_KNOTS = 24  # of one over time
+CURVE_SD_DB = 4.0  # prior standard deviation of a curve
+MAX_COLUMNS = 250  # of one hypothesis
+
+
+@dataclass(frozen=True, eq=False)
+class Hypotheses:
+    """Evidence for causes, on the training links of one model.
+
+    Attributes:
+        evidence: of its residuals, with the field's length.
+        links: n training links.
+        scale_db: (n,) errors' scale, by which all residuals are divided.
+        nuisance: what is fitted beside any cause, over that scale.
+        base_z: (n,) residuals without any further cause.
+        mean_db: (n,) the model's mean.
+    """
+
+    evidence: CorrelatedEvidence
+    links: LinkData
+    scale_db: np.ndarray
+    nuisance: Columns
+    base_z: np.ndarray
+    mean_db: np.ndarray
+
+    @classmethod
+    def of(cls, model: FoldModel, fit: FitResult, seed: int) -> Hypotheses:
+        """Return the hypotheses about what a model lacks.
+
+        Args:
+            model: with what was found so far.
+            fit: to its training links.
+            seed: of the draw of links, where there are many.
+        """
+        links, predicted = model.links.select(model.train), model.training.predict(fit)
+        nuisance = _nuisance(links, predicted.mean_db)
+        nuisance = Columns(nuisance.values / predicted.scale_db[:, None], nuisance.prior_sd)
+        residual_db = np.where(_says_something(model, fit), model.training.residual_db(fit), np.nan)
+        z = _clipped(residual_db / predicted.scale_db)
+        moving = receivers_move(links)
+        series = links.device if moving else links.receiver
+        position_m = links.receiver_m if moving else links.device_m[links.device]
+        evidence = CorrelatedEvidence.fit(series, position_m, z, nuisance, seed)
+        return cls(evidence, links, predicted.scale_db, nuisance, z, predicted.mean_db)
+
+    @cached_property
+    def _rotated(self) -> tuple[np.ndarray, float, np.ndarray]:
+        """Nuisance columns, evidence and variances without any further cause."""
+        columns = self.evidence.rotated(self.nuisance.values)
+        found = self.evidence.of_rotated(self.evidence.rotated(self.base_z), columns,
+                                         self.nuisance.prior_sd)
+        return columns, *found
+
+    @property
+    def sizes_db(self) -> tuple[float, float]:
+        """Standard deviations of the rest that belongs to places, and of noise [dB]."""
+        _, _, theta = self._rotated
+        noise_db = np.exp(0.5 * theta[0]) * float(np.median(self.scale_db))
+        return noise_db * np.exp(0.5 * theta[1]), noise_db
+
+    def gain_nats(self, z: np.ndarray, columns: Columns | None) -> float:
+        """Return how much likelier residuals z (n,) with columns are than those of the model."""
+        nuisance, base, theta = self._rotated
+        sd = self.nuisance.prior_sd
+        if columns is not None:
+            nuisance = np.hstack([nuisance, self.evidence.rotated(columns.values)])
+            sd = np.concatenate([sd, columns.prior_sd])
+        z = np.where(np.isfinite(z), z, 0.0)
+        return self.evidence.of_rotated(self.evidence.rotated(z), nuisance, sd, theta)[0] - base
+
+    def of_named(self, model: FoldModel, fit: FitResult) -> float:
+        """Return the evidence for the last effect of a model [nats], penalised by its numbers.
+
+        Coefficients are integrated over their priors; each number that was searched for costs
+        half the logarithm of the links that it acts on (Schwarz 1978).
+
+        Args:
+            model: this one's with one more effect.
+            fit: of it.
+        """
+        applied = model.effects[-1]
+        term, own = applied.term.select(model.train), model.coefficient_slices[-1]
+        shown_db = term.columns @ fit.coefficients[own]
+        residual_db = model.training.residual_db(fit) + shown_db
+        z = _clipped(residual_db / self.scale_db)
+        columns = Columns(term.columns / self.scale_db[:, None], term.prior_sd_db)
+        variation = applied.effect.variation(applied.params)
+        numbers = 0 if variation is None else len(variation.values)
+        acts = int(((term.offset_db != 0) | (term.columns != 0).any(axis=1)).sum()) or len(z)
+        used = len(self.evidence.rows) / max(len(z), 1)
+        return self.gain_nats(z, columns) - 0.5 * numbers * np.log(max(acts * used, 2.0))
+
+    def of_unnamed(self) -> dict[str, float]:
+        """Return the evidence for a cause without a name over each variable [nats]."""
+        found: dict[str, float] = {}
+        for name, values in self._curves():
+            scaled = values / self.scale_db[:, None]
+            columns = Columns(scaled, np.full(values.shape[1], CURVE_SD_DB))
+            found[name] = self.gain_nats(self.base_z, columns)
+        return found
+
+    def _curves(self) -> Iterator[tuple[str, np.ndarray]]:
+        links = self.links
+        ends = {"": None, "receiver": links.receiver, "device": links.device}
+        flights = len(np.unique(links.flight))
+        for name, label in ends.items():
+            if label is not None and 1 < flights * len(np.unique(label)) <= MAX_COLUMNS:
+                pairs = label * (links.flight.max() + 1) + links.flight
+                if len(np.unique(pairs)) > len(np.unique(label)):
+                    yield f"flight, {name}", one_hot(pairs, np.unique(pairs).tolist())
+        variables = {
+            "time": (links.time_s, TIME_KNOTS), "time in flight": (links.time_in_flight_s, KNOTS),
+            "azimuth": (links.azimuth_deg, KNOTS), "elevation": (links.elevation_deg, KNOTS),
+            "body azimuth": (links.body_azimuth_deg, KNOTS), "distance": (links.distance_m, KNOTS),
+            "predicted level": (self.mean_db, KNOTS), "altitude": (links.receiver_m[:, 2], KNOTS)}
+        for variable, (value, knots) in variables.items():
+            known = np.isfinite(value)
+            if known.mean() < 0.5 or np.ptp(value[known]) < 1e-9:
+                continue
+            basis = curve_columns(value, knots, variable in ("azimuth", "body azimuth"))
+            for name, label in ends.items():
+                members = [None] if label is None else np.unique(label).tolist()
+                if label is not None and len(members) < 2:
+                    continue
+                if len(members) * basis.shape[1] > MAX_COLUMNS:
+                    continue
+                blocks = [basis if member is None else basis * (label == member)[:, None]
+                          for member in members]
+                yield variable + (f", {name}" if name else ""), np.hstack(blocks)
+
+
+def _clipped(z: np.ndarray) -> np.ndarray:
+    return np.clip(z, -MAX_Z, MAX_Z)
+
+
+def _says_something(model: FoldModel, fit: FitResult) -> np.ndarray:
+    """Return (m,) training links that were detected, or should have been."""
+    training = model.training
+    return np.isfinite(training.level_db) | (training.residual_db(fit) < 0)
+
+
+def _nuisance(links: LinkData, mean_db: np.ndarray) -> Columns:
+    """Return what every base may be wrong in, of n links [dB].
+
+    Args:
+        links: n links.
+        mean_db: (n,) the base's prediction: weak levels are those of ways that it does not follow.
+    """
+    slope = np.log10(links.distance_m / 100.0)
+    blocks, prior_sd_db = [], []
+    for members in (links.los, ~links.los):
+        if members.any():
+            blocks += [members[:, None].astype(float), (members * slope)[:, None]]
+            prior_sd_db += [LEVEL_SD_DB, SLOPE_SD_DB]
+    for label, sd_db in ((links.device, DEVICE_SD_DB), (links.receiver, RECEIVER_SD_DB),
+                         (links.track, FLIGHT_SD_DB)):
+        members = np.unique(label)
+        if 1 < len(members) <= MAX_ENDS:
+            blocks.append(one_hot(label, members.tolist()))
+            prior_sd_db += [sd_db] * len(members)
+    blocks.append(curve_columns(mean_db, LEVEL_KNOTS, circular=False))
+    prior_sd_db += [LEVEL_CURVE_SD_DB] * blocks[-1].shape[1]
+    return Columns(np.hstack(blocks), np.array(prior_sd_db))
+
+
+def is_judged_by_levels(effect: Effect) -> bool:
+    """Return whether an effect changes levels, so that residuals can show it."""
+    return effect.stage not in ("limit", "detection")

@@ -1,0 +1,132 @@
+"""How probable it is that an effect is there, that nothing is, or something that has no name.
+
+Evidence [nats] is worth what it turned out to be worth: a logistic regression, fitted on worlds that
+others made (`tests/undeclared/foreign`, the cities for calibration; `python -m studies foreign
+--report` judges it on the other cities), turns evidence, its lead over curves without a name and
+over other effects, and what held-out links gain into a probability (Platt 1999, 'Probabilistic
+outputs for support vector machines'). Its few numbers are in `calibration.json`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+from scipy.special import expit
+
+from radiotwin.closeloop.criteria import SelectionCriteria
+from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.closeloop.hypotheses import Hypotheses
+from radiotwin.closeloop.scoring import CandidateScore
+
+NATS = 10.0  # evidence is linear up to about this, and logarithmic beyond
+NONE, OTHER = "none", "not in the catalogue"
+
+
+@dataclass(frozen=True)
+class Step:
+    """What the residual says at one step.
+
+    Attributes:
+        number: of effects that were there.
+        unnamed_nats: evidence for a curve without a name over each variable.
+        rest_db: standard deviation of what belongs to places and has no name [dB].
+        noise_db: and of what belongs to nothing.
+        probabilities: of each effect that passed, of `NONE` and of `OTHER`.
+    """
+
+    number: int
+    unnamed_nats: dict[str, float]
+    rest_db: float
+    noise_db: float
+    probabilities: dict[str, float]
+
+
+def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypotheses: Hypotheses,
+          criteria: SelectionCriteria) -> tuple[list[CandidateScore], Step]:
+    """Return a step's scores with their probabilities, and what the step says.
+
+    Args:
+        scores: of every candidate of the step.
+        model: without any of them.
+        hypotheses: about what it lacks.
+        criteria: a candidate that passed is refused below `min_probability`.
+    """
+    unnamed = hypotheses.of_unnamed()
+    best_unnamed = max([0.0, *unnamed.values()])
+    before_db = model.rmse_db()
+    judged = []
+    for score in scores:
+        others = [each.nats for each in scores if each.name != score.name
+                  and each.gain_by_fold.size]
+        lead = score.nats - best_unnamed, score.nats - max([0.0, *others])
+        score = replace(score, lead_nats=lead)
+        if score.gain_by_fold.size:
+            probability = probability_of(score.name, features(score, before_db))
+            low = not score.reason and probability < criteria.min_probability
+            why = (f"it is not probable enough ({probability:.2f}; "
+                   f"{criteria.min_probability:g} is needed)")
+            score = replace(score, probability=probability, reason=why if low else score.reason)
+        judged.append(score)
+    rest_db, noise_db = hypotheses.sizes_db
+    return judged, Step(len(model.whole.effects), unnamed, rest_db, noise_db,
+                        _probabilities(judged, best_unnamed, rest_db, noise_db))
+
+
+def features(score: CandidateScore, before_db: float) -> np.ndarray:
+    """Return what a candidate's probability depends on, (4,).
+
+    Args:
+        score: with its leads.
+        before_db: held-out RMSE without it [dB].
+    """
+    fall = np.log(before_db / score.rmse_db) if score.rmse_db > 0 else 0.0
+    nats = [score.nats, *score.lead_nats]
+    return np.array([*np.arcsinh(np.array(nats) / NATS), 10 * np.nan_to_num(fall)])
+
+
+def probability_of(name: str, values: np.ndarray) -> float:
+    """Return the probability that an effect is there, from its `features`."""
+    weights = calibration()["effect"]
+    own = weights["names"].get(name, 0.0)
+    return float(expit(weights["intercept"] + own + np.dot(weights["weights"], values)))
+
+
+def _probabilities(scores: Sequence[CandidateScore], unnamed: float, rest_db: float,
+                   noise_db: float) -> dict[str, float]:
+    found: dict[str, float] = {}
+    for score in scores:
+        if np.isfinite(score.probability):
+            found[score.name] = max(found.get(score.name, 0.0), score.probability)
+    total = sum(found.values())
+    missing = float(np.prod([1 - each for each in found.values()]))
+    best = max([0.0, *(score.nats for score in scores if np.isfinite(score.nats))])
+    none = missing * probability_of_nothing(best, unnamed, rest_db, noise_db)
+    # Two effects may both be there: shares of what is not "none" nor without a name.
+    named = {name: each * (1 - missing) / total for name, each in found.items()} if total else {}
+    return named | {NONE: none, OTHER: missing - none}
+
+
+def probability_of_nothing(best: float, unnamed: float, rest_db: float, noise_db: float) -> float:
+    """Return the probability that nothing is hidden where no effect of the catalogue is.
+
+    Args:
+        best: most evidence for an effect [nats].
+        unnamed: most evidence for a curve without a name [nats].
+        rest_db: standard deviation of what belongs to places [dB].
+        noise_db: and of what belongs to nothing [dB].
+    """
+    weights = calibration()["nothing"]
+    values = [*np.arcsinh(np.array([best, unnamed]) / NATS), np.log(max(rest_db, 0.1)),
+              np.log(max(noise_db, 0.1))]
+    return float(expit(weights["intercept"] + np.dot(weights["weights"], values)))
+
+
+@cache
+def calibration() -> Mapping[str, dict]:
+    """Return the numbers of both logistic regressions."""
+    return json.loads(files(__package__).joinpath("calibration.json").read_text(encoding="utf-8"))

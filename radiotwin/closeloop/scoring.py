@@ -1,0 +1,183 @@
+"""A candidate fitted to all links and to each fold's others, and what held-out links say of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from radiotwin.closeloop.criteria import SelectionCriteria
+from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.closeloop.hypotheses import Hypotheses, is_judged_by_levels
+from radiotwin.effects.base import Effect
+from radiotwin.effects.fitting import add_effect
+from radiotwin.effects.fold_model import FoldModel
+from radiotwin.inference.censored_regression import FitResult
+from radiotwin.inference.evidence import cross_fit_p_value, sign_flip_p_value
+
+
+@dataclass(frozen=True, eq=False)
+class CandidateScore:
+    """A candidate of one step, and what held-out links say of it.
+
+    Attributes:
+        name: of the effect.
+        kept: whether it was added.
+        reason: why not; empty where it was.
+        nll_gain: held-out likelihood gained [nats]; NaN where it was not tried.
+        rmse_db: held-out RMSE with it [dB].
+        p_value: of no gain, links that err alike counted as one, corrected for the candidates.
+        step: number of effects that were there before.
+        gain_by_fold: (folds,) `nll_gain` of each fold over the number of links that count as one;
+            empty where it was not tried.
+        evidence_nats: beside errors of the base that are correlated, see `Hypotheses`; NaN where
+            it was not looked at.
+        lead_nats: of that over the best curve without a name, and over the best other effect.
+        probability: that it is there, by `radiotwin.closeloop.posterior`.
+    """
+
+    name: str
+    kept: bool = False
+    reason: str = ""
+    nll_gain: float = np.nan
+    rmse_db: float = np.nan
+    p_value: float = np.nan
+    step: int = 0
+    gain_by_fold: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    evidence_nats: float = np.nan
+    lead_nats: tuple[float, float] = (np.nan, np.nan)
+    probability: float = np.nan
+
+    @property
+    def nats(self) -> float:
+        """Evidence [nats]; held-out, links that err alike counted as one, where there is no other.
+
+        Levels do not show effects that make links blank.
+        """
+        return self.evidence_nats if np.isfinite(self.evidence_nats) \
+            else float(self.gain_by_fold.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """An effect fitted to all links, and how much likelier they are with it [nats].
+
+    `gain` counts every link, `evidence` knows that the base may be wrong (NaN: not looked at).
+    """
+
+    effect: Effect
+    whole: FoldModel
+    fit: FitResult
+    gain: float
+    evidence: float = np.nan
+
+
+def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
+                  criteria: SelectionCriteria, hypotheses: Hypotheses | None = None,
+                  ) -> Candidate | CandidateScore:
+    """Fit a candidate to all links; return a score with the reason if that refuses it already.
+
+    Args:
+        model: without it.
+        effect: that is tried.
+        step: number of effects that are there.
+        criteria: that decide.
+        hypotheses: about what the model lacks; None: not to be looked at.
+    """
+    refused = CandidateScore(effect.name, step=step)
+    whole = add_effect(model.whole, effect, model.fits[0])
+    if whole is None:
+        return replace(refused, reason="nothing in the residual looks like it")
+    coefficients = whole[1].coefficients[whole[0].coefficient_slices[-1]]
+    why = effect.implausible(whole[0].effects[-1].params, coefficients)
+    if why:
+        return replace(refused, reason=why)
+    gain = model.fits[0].objective - whole[1].objective
+    if gain < criteria.min_training_gain_nats:
+        return replace(refused, reason=f"gains less than {criteria.min_training_gain_nats:.0f} "
+                       "nats even on the links that it is fitted to")
+    if hypotheses is None or not is_judged_by_levels(effect):
+        return Candidate(effect, *whole, gain)
+    evidence = hypotheses.of_named(*whole)
+    if evidence < criteria.min_evidence_nats:
+        return replace(refused, evidence_nats=evidence, reason=(
+            "what the base may be wrong in explains the residual as well (the evidence is "
+            f"{evidence:.0f} nats, {criteria.min_evidence_nats:.0f} are needed)"))
+    return Candidate(effect, *whole, gain, evidence)
+
+
+def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.ndarray, tried: int,
+                    step: int, seed: int, criteria: SelectionCriteria,
+                    ) -> tuple[CandidateScore, CrossValidatedModel | None]:
+    """Fit a candidate to each fold's training links, and score it on the others.
+
+    Args:
+        model: without it.
+        candidate: fitted to all links.
+        block: (n,) piece of evidence of each link.
+        tried: number of candidates, that the p-value is corrected for.
+        step: number of effects that are there.
+        seed: of permutations.
+        criteria: that decide.
+
+    Returns:
+        the score, and the model with it; None where it does not pass.
+    """
+    models, fits = [candidate.whole], [candidate.fit]
+    like = candidate.whole.effects[-1].params
+    for each, fit in zip(model.folds, model.fits[1:], strict=True):
+        extended_fold, extended_fit = add_effect(each, candidate.effect, fit, like) or (each, fit)
+        models.append(extended_fold)
+        fits.append(extended_fit)
+    extended = model.extended(models, fits)
+    score = CandidateScore(candidate.effect.name, step=step, evidence_nats=candidate.evidence)
+    score = score_model(model, extended, score, block, tried, seed, criteria,
+                        nlos_only=candidate.effect.nlos_only)
+    return score, None if score.reason else extended
+
+
+def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score: CandidateScore,
+                block: np.ndarray | None, tried: int, seed: int, criteria: SelectionCriteria,
+                nlos_only: bool = False) -> CandidateScore:
+    """Return what held-out links say of an extended model; with the reason where it is refused.
+
+    Without pieces of evidence `block` (n,) the gain may hang on a few positions.
+    """
+    gain = model.held_out_nll - extended.held_out_nll
+    usable, los = np.isfinite(gain), model.links.los
+    if not usable.any():
+        return replace(score, reason="no held-out link can be judged with it")
+    design_effect = model.whole.view(model.fits[0]).design_effect
+
+    def by_fold(rows: np.ndarray) -> np.ndarray:
+        own = np.bincount(model.index[rows], weights=gain[rows], minlength=len(model.folds))
+        return own / design_effect
+
+    total, shares = float(gain[usable].sum()), by_fold(usable)
+    per_link = max(gain[rows].mean() for rows in (usable, usable & los) if rows.any())
+    p_value, after_db = min(tried * cross_fit_p_value(shares), 1.0), extended.rmse_db(usable)
+    few_p = 0.0
+    if block is not None:
+        few_p = sign_flip_p_value(np.bincount(block[usable], weights=gain[usable]), seed)
+    los_p = 0.0
+    if los.any() and not los.all() and not nlos_only:
+        los_p = cross_fit_p_value(by_fold(usable & los))
+    reason = ""
+    if total < criteria.min_gain_nats:
+        reason = (f"gains {total:.0f} nats on held-out links, {criteria.min_gain_nats:.0f} are "
+                  "needed")
+    elif p_value > criteria.max_p_value:
+        reason = f"its gain may be chance (p = {p_value:.2g} after correction)"
+    elif few_p > criteria.max_sign_flip_p_value:
+        reason = f"its gain hangs on a few places (p = {few_p:.2g} if signs are flipped)"
+    elif (shares > 0).mean() < criteria.min_gaining_folds:
+        reason = f"gains in {(shares > 0).sum()} of {len(shares)} folds only"
+    elif per_link < criteria.min_gain_per_link_nats \
+            and after_db > criteria.max_rmse_ratio * model.rmse_db(usable):
+        reason = (f"gains {per_link:.3f} nats a link only, {criteria.min_gain_per_link_nats} are "
+                  "needed")
+    elif los_p > criteria.max_los_p_value:
+        reason = ("links with line of sight, where the base is surest, do not support it "
+                  f"(p = {los_p:.2g})")
+    return replace(score, reason=reason, nll_gain=total, rmse_db=after_db, p_value=p_value,
+                   gain_by_fold=shares)

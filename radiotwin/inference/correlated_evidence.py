@@ -1,0 +1,171 @@
+"""Evidence for a cause beside errors that are allowed to be correlated.
+
+A base lacks more than noise: walls stand elsewhere than on the map, materials differ. Such a rest is
+a Gaussian field over positions, unknown to the catalogue, and it explains part of whatever has a
+position. So a cause is judged by how much likelier the data are with it *beside* that field, whose
+strength is fitted anew each time (Kennedy and O'Hagan 2001, 'Bayesian calibration of computer
+models', J. R. Stat. Soc. B 63; Brynjarsdóttir and O'Hagan 2014, Inverse Problems 30).
+
+Residuals z = columns · b + field + noise, with b ~ N(0, prior²), a field of exponential correlation
+(Gudmundson 1991) for each series and white noise. In the eigenbasis of a series' correlation matrix
+the two variances are diagonal, so that one marginal likelihood costs as much as a regression.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve, eigh
+from scipy.optimize import minimize
+from scipy.spatial.distance import cdist
+
+MAX_POINTS = 500  # of a series: its matrix is decomposed
+MAX_ROWS = 8000  # of all series
+MIN_POINTS = 3  # of a series that says anything
+LENGTHS = (0.02, 0.06, 0.2)  # of correlation, as shares of the extent of a series
+MIN_LENGTH_M = 2.0
+EVALUATIONS = 20  # of the likelihood, for the two variances
+START = np.array([0.0, -1.0])  # logarithms: noise variance, field over noise
+BOUNDS = np.array([[-6.0, -7.0], [6.0, 7.0]])
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Columns (n, q), and prior standard deviations (q,) of their coefficients."""
+
+    values: np.ndarray
+    prior_sd: np.ndarray
+
+    def beside(self, other: Columns) -> Columns:
+        """Return both, side by side."""
+        return Columns(np.hstack([self.values, other.values]),
+                       np.concatenate([self.prior_sd, other.prior_sd]))
+
+
+@dataclass(frozen=True, eq=False)
+class CorrelatedEvidence:
+    """Marginal likelihoods of residuals beside a correlated rest.
+
+    Attributes:
+        rows: (m,) rows that are used, series after series.
+        parts: where each series is among them.
+        bases: of each series the eigenvectors of its correlation matrix.
+        spectrum: (m,) the eigenvalues.
+        length_m: of the correlation.
+    """
+
+    rows: np.ndarray
+    parts: list[slice]
+    bases: list[np.ndarray]
+    spectrum: np.ndarray
+    length_m: float
+
+    @classmethod
+    def fit(cls, series: np.ndarray, position_m: np.ndarray, z: np.ndarray, nuisance: Columns,
+            seed: int) -> Self:
+        """Choose the length of the correlation at which residuals are likeliest.
+
+        Args:
+            series: (n,) label of the field that each row belongs to.
+            position_m: (n, 3) where [m].
+            z: (n,) residuals; NaN = of no use.
+            nuisance: what is fitted beside it.
+            seed: of the draw of rows, where there are many.
+        """
+        rng = np.random.default_rng(seed)
+        chosen, extents_m = [], []
+        known = np.flatnonzero(np.isfinite(z))
+        labels, member = np.unique(series[known], return_inverse=True)
+        most = int(np.clip(MAX_ROWS // max(len(labels), 1), MIN_POINTS, MAX_POINTS))
+        for number in range(len(labels)):
+            mine = known[member == number]
+            if len(mine) < MIN_POINTS:
+                continue
+            if len(mine) > most:
+                mine = np.sort(rng.choice(mine, most, replace=False))
+            chosen.append(mine)
+            extents_m.append(np.linalg.norm(np.ptp(position_m[mine], axis=0)))
+        if len(chosen) * most > MAX_ROWS:
+            chosen = [chosen[i] for i in sorted(rng.permutation(len(chosen))[:MAX_ROWS // most])]
+        extent_m = float(np.median(extents_m)) if extents_m else 1.0
+        tried = [cls._decomposed(chosen, position_m, max(share * extent_m, MIN_LENGTH_M))
+                 for share in LENGTHS]
+        return max(tried, key=lambda each: each.log_evidence(z, nuisance))
+
+    @classmethod
+    def _decomposed(cls, chosen: list[np.ndarray], position_m: np.ndarray,
+                    length_m: float) -> Self:
+        ends = np.cumsum([0, *(len(rows) for rows in chosen)])
+        parts = [slice(a, b) for a, b in zip(ends, ends[1:], strict=False)]
+        bases, spectra = [], [np.zeros(0)]
+        for rows in chosen:
+            apart_m = cdist(position_m[rows], position_m[rows])
+            values, vectors = eigh(np.exp(-apart_m / length_m))
+            bases.append(vectors)
+            spectra.append(np.maximum(values, 0.0))
+        rows = np.concatenate([np.zeros(0, dtype=int), *chosen])
+        return cls(rows, parts, bases, np.concatenate(spectra), length_m)
+
+    def rotated(self, values: np.ndarray) -> np.ndarray:
+        """Return values (n, …) in the eigenbasis (m, …)."""
+        mine = values[self.rows]
+        return np.concatenate([basis.T @ mine[part] for part, basis in
+                               zip(self.parts, self.bases, strict=True)]) if self.parts else mine
+
+    def log_evidence(self, z: np.ndarray, columns: Columns) -> float:
+        """Return the log marginal likelihood [nats], at the likeliest variances.
+
+        Args:
+            z: (n,) residuals.
+            columns: of n rows.
+        """
+        return self.of_rotated(self.rotated(z), self.rotated(columns.values), columns.prior_sd)[0]
+
+    def of_rotated(self, z: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
+                   start: np.ndarray = START) -> tuple[float, np.ndarray]:
+        """Return the same of rotated values (m,), (m, q), and the two variances' logarithms."""
+        if not len(z):
+            return 0.0, START
+
+        def negative(theta: np.ndarray) -> float:
+            inside = np.clip(theta, *BOUNDS)
+            outside = float(np.abs(theta - inside).sum())
+            return outside - self.at(z, columns, prior_sd, inside)
+
+        simplex = np.vstack([start, start + [0.5, 0.0], start + [0.0, 1.0]])
+        options = {"initial_simplex": simplex, "maxfev": EVALUATIONS, "xatol": 0.03, "fatol": 0.05}
+        found = minimize(negative, start, method="Nelder-Mead", options=options)
+        return -float(found.fun), np.clip(found.x, *BOUNDS)
+
+    def at(self, z: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
+           theta: np.ndarray) -> float:
+        """Return the log marginal likelihood of rotated values at given variances [nats]."""
+        variance = np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum)
+        value = np.log(variance).sum() + (z * z / variance).sum()
+        if columns.shape[1]:
+            weighted = columns.T / variance
+            inner = weighted @ columns + np.diag(1.0 / np.square(prior_sd))
+            moments = weighted @ z
+            factor = cho_factor(inner, lower=True)
+            value += 2 * np.log(np.diag(factor[0])).sum() + 2 * np.log(prior_sd).sum()
+            value -= moments @ cho_solve(factor, moments)
+        return -0.5 * float(value) - 0.5 * len(z) * np.log(2 * np.pi)
+
+    def information(self, z: np.ndarray, nuisance: Columns, pattern: np.ndarray) -> float:
+        """Return how sharply the data would show a pattern (n,) of unit size [1/size²].
+
+        Beside the nuisance terms, with the variances that fit residuals z (n,): the expected
+        log-likelihood ratio of a size s is s²/2 times this.
+        """
+        rotated, columns = self.rotated(z), self.rotated(nuisance.values)
+        if not len(rotated):
+            return 0.0
+        theta = self.of_rotated(rotated, columns, nuisance.prior_sd)[1]
+        variance = np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum)
+        own, weighted = self.rotated(pattern), columns.T / variance
+        inner = weighted @ columns + np.diag(1.0 / np.square(nuisance.prior_sd))
+        shared = weighted @ own
+        return max(float((own * own / variance).sum() - shared @ np.linalg.solve(inner, shared)),
+                   0.0)
