@@ -18,6 +18,7 @@ MIN_NLOS = 30  # links without line of sight that the diffuse power is fitted to
 DIFFUSE_DEFAULT = (-150.0, 3.0)  # nearly nothing; the exponent then does not matter
 DIFFUSE_BOUNDS = np.array([[-150.0, 2.0], [-60.0, 6.0]])
 DIFFUSE_STARTS_DB = (-100.0, -110.0, -120.0, -130.0)
+LOS_SLOPE_SD_DB, NLOS_SLOPE_SD_DB = 1.0, 5.0  # prior: how wrong the fall may be [dB per decade]
 ERROR_SCALE_DB = 4.0  # of the Cauchy loss of the fit of the diffuse power
 
 
@@ -25,8 +26,8 @@ class ImagePaths(ChannelModel):
     """Power of the paths over the map (`radiotwin.paths`) plus diffuse power.
 
     The diffuse power stands for what reaches any position on ways that are not followed: more
-    bounces and edges, rough walls. It falls with distance by a law of its own. Levels, one for each
-    class of line of sight, are fitted with the effects.
+    bounces and edges, rough walls. It falls with distance by a law of its own. Levels and slopes,
+    one for each class of line of sight, are fitted with the effects.
 
     Attributes:
         law: fitted to the same links; predicts what small changes do, quickly, and the
@@ -104,8 +105,11 @@ class ImagePaths(ChannelModel):
 
     @override
     def level_columns(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        los = links.los
-        return np.column_stack([los, ~los]).astype(float), np.full(2, ANY_LEVEL_SD_DB)
+        # Slopes: what the map's materials and walls lack adds up on the way.
+        los, slope = links.los, np.log10(links.distance_m / 100.0)
+        columns = np.column_stack([los, ~los, los * slope, ~los * slope])
+        return columns.astype(float), np.array([ANY_LEVEL_SD_DB] * 2 + [LOS_SLOPE_SD_DB,
+                                                                         NLOS_SLOPE_SD_DB])
 
     @override
     def error_group(self, links: LinkGeometry) -> np.ndarray:

@@ -23,11 +23,11 @@ from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
 from radiotwin.links import LinkData
 
-MAX_Z = 5.0  # an outlier counts as this many scales
+MAX_Z = 4.0  # an outlier counts as this many scales
 LEVEL_SD_DB, SLOPE_SD_DB = 20.0, 10.0  # of a class of line of sight, at 100 m and per decade
 DEVICE_SD_DB, RECEIVER_SD_DB, FLIGHT_SD_DB = 1.0, 0.3, 0.3  # within tolerances: no effect
 MAX_ENDS = 40  # devices or receivers that have terms of their own
-LEVEL_KNOTS, LEVEL_CURVE_SD_DB = 6, 2.0  # of the base's error over the level that it predicts
+CURVE_KNOTS, NUISANCE_SD_DB = 6, 2.0  # of the base's errors over its prediction and elevation
 KNOTS = 8  # of a curve over a variable
 TIME_KNOTS = 24  # of one over time
 CURVE_SD_DB = 4.0  # prior standard deviation of a curve
@@ -189,8 +189,9 @@ def _nuisance(links: LinkData, mean_db: np.ndarray) -> Columns:
         if 1 < len(members) <= MAX_ENDS:
             blocks.append(one_hot(label, members.tolist()))
             prior_sd_db += [sd_db] * len(members)
-    blocks.append(curve_columns(mean_db, LEVEL_KNOTS, circular=False))
-    prior_sd_db += [LEVEL_CURVE_SD_DB] * blocks[-1].shape[1]
+    for values in (mean_db, links.elevation_deg):
+        blocks.append(curve_columns(values, CURVE_KNOTS, circular=False))
+        prior_sd_db += [NUISANCE_SD_DB] * blocks[-1].shape[1]
     return Columns(np.hstack(blocks), np.array(prior_sd_db))
 
 

@@ -54,7 +54,7 @@ def fit_along_paths(links: LinkData, scene: Scene, seed: int, start: Twin | None
         warnings.warn(f"only {heard[few]} links {('without', 'with')[few]} line of sight were "
                       f"heard: their level is that of the others, {level_db:.1f} dB from what "
                       "paths bring", stacklevel=4)
-        fit = replace(fit, coefficients=np.full(2, level_db),
+        fit = replace(fit, coefficients=np.array([level_db, level_db, 0.0, 0.0]),
                       scale_db=np.full(2, fit.scale_db[many]))
     unknown = sum(device.role == "unknown" for device in twin.devices)
     if unknown > MAX_DEVICES:

@@ -207,7 +207,7 @@ def _check_levels(record: FittedRecord, channel: ChannelModel) -> None:
     if not isinstance(channel, BUILT_IN):
         return
     allowed = {(2, 1), (4, 2)} if channel.uses_map else {(2, 1)}
-    allowed = {(2, 2)} if channel.follows_paths else allowed
+    allowed = {(2, 2), (4, 2)} if channel.follows_paths else allowed
     given = len(record.level_coefficients), len(record.scale_db)
     if given not in allowed:
         raise ValueError(f"{given[0]} levels and {given[1]} scales do not fit {channel.name}")
