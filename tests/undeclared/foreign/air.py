@@ -3,6 +3,7 @@
 import numpy as np
 
 from tests.undeclared.foreign.draws import between, times
+from tests.undeclared.foreign.grounds import Grounds
 from tests.undeclared.foreign.scenario import Hidden, Scenario
 
 
@@ -25,8 +26,6 @@ def foliage(at: Scenario, rng: np.random.Generator) -> Hidden:
 
 def _grove_middle(at: Scenario, rng: np.random.Generator) -> np.ndarray:
     """(2,) near a device's lines to its receivers, in the open."""
-    from tests.undeclared.foreign.grounds import Grounds
-
     ground = Grounds(at.where.city)
     for _ in range(500):
         link = int(rng.integers(at.links))
@@ -105,8 +104,9 @@ def duty_cycled_jammer(at: Scenario, rng: np.random.Generator) -> Hidden:
 
 def _emitter_over_db(at: Scenario, rng: np.random.Generator, least: float, most: float) -> float:
     """How much more the emitter sends than a device, so that it is the stronger in a share of the links [dB]."""
-    over_db = (at.plain_db - at.spare_db[at.point])[np.isfinite(at.plain_db) & np.isfinite(at.spare_db[at.point])]
-    return float(np.quantile(over_db, between(rng, least, most)))
+    spare_db = at.spare_db[at.point]
+    both = np.isfinite(at.plain_db) & np.isfinite(spare_db)
+    return float(np.quantile(at.plain_db[both] - spare_db[both], between(rng, least, most)))
 
 
 def warm_front(at: Scenario, rng: np.random.Generator) -> Hidden:

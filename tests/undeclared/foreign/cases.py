@@ -27,7 +27,7 @@ from tests.undeclared.foreign.maps import write_map
 from tests.undeclared.foreign.readings import Habits, draw_habits, read_db, table_of
 from tests.undeclared.foreign.scenario import Hidden, Scenario
 from tests.undeclared.foreign.store import stored
-from tests.undeclared.foreign.worlds import world
+from tests.undeclared.foreign.worlds import city_of
 
 LEAST_DB, TRIES = 0.15, 30  # of what is hidden, over the links that have a path
 
@@ -75,12 +75,12 @@ def names(split: str | None = None) -> list[str]:
     if split not in (None, *SPLITS):
         raise ValueError(f"split {split!r} does not exist; there are {' and '.join(SPLITS)}")
     return [f"{name}-c{number}" for name in stored() for number in range(CASES)
-            if split in (None, world(name).city.split)]
+            if split in (None, split_of(name))]
 
 
 def split_of(name: str) -> str:
     """Return the split of a case."""
-    return world(name.rpartition("-")[0]).city.split
+    return city_of(name).split
 
 
 def families(name: str) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ from tests.undeclared.foreign.layouts import SPLITS
 from tests.undeclared.foreign.maps import write_truth
 from tests.undeclared.foreign.paths import Tracer
 from tests.undeclared.foreign.store import save, stored
-from tests.undeclared.foreign.worlds import all_names, world
+from tests.undeclared.foreign.worlds import all_names, city_of, world
 
 
 def make_world(name: str) -> None:
@@ -35,7 +35,7 @@ def main() -> None:
     if not DEALT.is_file():
         write_dealt()
     for name in all_names():
-        wanted = any(part in name for part in given.only) and given.split in (None, world(name).city.split)
+        wanted = any(part in name for part in given.only) and given.split in (None, city_of(name).split)
         if wanted and name not in stored():
             started, cpu_s = time.monotonic(), time.process_time()
             make_world(name)

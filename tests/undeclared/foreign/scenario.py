@@ -108,7 +108,8 @@ class Scenario:
         level_db = level_db + sum(one.air_db for one in hidden if one.air_db is not None)
         for one in hidden:
             if one.adds_db is not None:
-                level_db = 10 * np.log10(10**(level_db / 10) + 10**(one.adds_db / 10))
+                with np.errstate(divide="ignore"):
+                    level_db = 10 * np.log10(10**(level_db / 10) + 10**(one.adds_db / 10))
         return level_db
 
     @cached_property

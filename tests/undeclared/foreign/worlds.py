@@ -74,6 +74,11 @@ def world_name(city_number: int, number: int) -> str:
     return f"city{city_number:02d}-w{number}"
 
 
+def city_of(name: str) -> City:
+    """Return the city of a world, or of a case in it, by its name."""
+    return city(int(name[4:6]))
+
+
 def all_names() -> list[str]:
     """Return the names of all worlds, calibrate and judge in turn."""
     by_split = [[n for n in range(CITIES) if city(n).split == split] for split in ("calibrate", "judge")]
@@ -83,7 +88,7 @@ def all_names() -> list[str]:
 @cache
 def world(name: str) -> World:
     """Draw a world by its name; the same for the same name."""
-    where, number = city(int(name[4:6])), int(name[8:])
+    where, number = city_of(name), int(name[8:])
     seeds = np.random.default_rng([where.number, number, 5]).spawn(5)
     frequency_hz = float(seeds[0].choice(FREQUENCIES_HZ))
     settings = Settings(int(seeds[0].integers(3, 7)), int(seeds[0].integers(20, 36)) * 1000,
