@@ -133,7 +133,8 @@ def compared(truth: dict, effects: list[dict], hidden: ForeignCase) -> list[dict
         name of the effect, name of the parameter without the end, `truth`, `value`, `low`, `high`,
         `unit`, `determined`; empty where no effect has its name.
     """
-    mine = next((each["parameters"] for each in effects if each["name"] == truth["name"]), {})
+    mine: dict[str, dict] = next((each["parameters"] for each in effects
+                                  if each["name"] == truth["name"]), {})
     end = f"[{truth.get('device', truth.get('receiver'))}]"
     true = _true_parameters(truth, hidden)
     if truth["name"].endswith("gain_offset"):

@@ -188,8 +188,8 @@ def foreign_figures(rows: pd.DataFrame) -> dict[str, Figure]:
              xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
     families = sorted(held, reverse=True)
     for index, split in enumerate(SPLITS):
-        shares = [np.mean(held[name][split]) if split in held[name] else np.nan
-                  for name in families]
+        shares = np.array([np.mean(held[name][split]) if split in held[name] else np.nan
+                           for name in families])
         right.barh(np.arange(len(families)) + 0.2 - 0.4 * index, shares, 0.38,
                    color=COLOURS[index], label=split)
     right.axvspan(0.8, 0.97, color="black", alpha=0.1, linewidth=0, zorder=0, label="80 to 97 %")

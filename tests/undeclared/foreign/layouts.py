@@ -64,7 +64,7 @@ def city(number: int) -> City:
     side_m = float(rng.uniform(*{"suburb": (250, 300), "village": (260, 320)}.get(layout, (300, 400))))
     most = int(rng.integers(30, 71))
     footprints: list[np.ndarray] = []
-    buildings = []
+    buildings: list[Building] = []
     for corners, height_m, material in globals()[f"_{layout}"](side_m, rng):
         inside = corners.min() > 4 and corners.max() < side_m - 4
         if len(buildings) < most and inside and fits(corners, footprints, ROOM_M):
@@ -114,7 +114,8 @@ def _highrise(side_m: float, rng: np.random.Generator) -> Drawn:
     for x in np.arange(24, side_m, step_m):
         for y in np.arange(24, side_m, step_m):
             at = np.array([x, y]) + rng.uniform(-6, 6, 2)
-            yield (_box(*rng.uniform(18, 30, 2), at, rng.normal(0, 0.15)),
+            length_m, width_m = rng.uniform(18, 30, 2)
+            yield (_box(length_m, width_m, at, rng.normal(0, 0.15)),
                    rng.choice([rng.uniform(45, 120), rng.uniform(12, 35)], p=[0.55, 0.45]),
                    rng.choice(["glass", "concrete"], p=[0.6, 0.4]))
 
@@ -134,8 +135,8 @@ def _industrial(side_m: float, rng: np.random.Generator) -> Drawn:
     """Large sheds of metal, a few offices, silos."""
     for _ in range(700):
         large = rng.random() < 0.5
-        size_m = rng.uniform(30, 85, 2) if large else rng.uniform(9, 20, 2)
-        yield (_box(*size_m, rng.uniform(0, side_m, 2), rng.choice([0.1, 0.1 + np.pi / 2])),
+        length_m, width_m = rng.uniform(30, 85, 2) if large else rng.uniform(9, 20, 2)
+        yield (_box(length_m, width_m, rng.uniform(0, side_m, 2), rng.choice([0.1, 0.1 + np.pi / 2])),
                rng.uniform(8, 14) if large else rng.uniform(5, 32),
                rng.choice(["metal", "concrete"], p=[0.6, 0.4]) if large else "concrete")
 
@@ -161,7 +162,8 @@ def _slabs(side_m: float, rng: np.random.Generator) -> Drawn:
             long_m = rng.choice([36.0, 54.0, 72.0])
             middle = turned(np.array([(at + long_m / 2, row * 36.0)]), turn)[0] + side_m / 2
             across = rng.random() < 0.15
-            yield (_box(*((12.0, 30.0) if across else (long_m, 12.5)), middle, turn),
+            length_m, width_m = (12.0, 30.0) if across else (long_m, 12.5)
+            yield (_box(length_m, width_m, middle, turn),
                    rng.choice([12.0, 15.0, 30.0], p=[0.4, 0.4, 0.2]) + rng.normal(0, 0.3), "concrete")
             at += long_m + rng.uniform(14, 34)
 

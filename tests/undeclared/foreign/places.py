@@ -4,6 +4,7 @@ import numpy as np
 
 from tests.undeclared.foreign.draws import between, device
 from tests.undeclared.foreign.grounds import Grounds
+from tests.undeclared.foreign.layouts import Building
 from tests.undeclared.foreign.scenario import Hidden, Scenario, blocked
 from tests.undeclared.shapes import inside
 
@@ -13,12 +14,12 @@ def missing_obstacle(at: Scenario, rng: np.random.Generator) -> Hidden:
     plan = at.where.city.buildings
     some = np.arange(0, at.links, 7)
     a_m, b_m = at.where.device_m[at.device[some]], at.where.campaign.points_m[at.point[some]]
-    able = [index for index, one in enumerate(at.where.true) if one is not None and at.where.mapped[index]
+    able = [(index, one) for index, one in enumerate(at.where.true) if one is not None and at.where.mapped[index]
             and not inside(at.where.device_m[:, :2], plan[index].footprint_m).any()]
-    blocks = np.array([blocked([at.where.true[index]], a_m, b_m) for index in able])
+    blocks = np.array([blocked([one], a_m, b_m) for _, one in able])
     alone = (blocks & (blocks.sum(axis=0) == 1)).sum(axis=1)
-    index = able[int(rng.choice(np.argsort(-alone, kind="stable")[:6]))]
-    return Hidden("missing_obstacle", True, _building(at.where.true[index]), map_lacks=(index,))
+    index, one = able[int(rng.choice(np.argsort(-alone, kind="stable")[:6]))]
+    return Hidden("missing_obstacle", True, _building(one), map_lacks=(index,))
 
 
 def removed_obstacle(at: Scenario, rng: np.random.Generator) -> Hidden:
@@ -27,7 +28,7 @@ def removed_obstacle(at: Scenario, rng: np.random.Generator) -> Hidden:
                   map_shows=(at.where.reserve,))
 
 
-def _building(one) -> dict:
+def _building(one: Building) -> dict:
     return {"corners_m": one.footprint_m.tolist(), "height_m": one.height_m,
             "centre_m": (0.5 * (one.footprint_m.min(axis=0) + one.footprint_m.max(axis=0))).round(2).tolist()}
 

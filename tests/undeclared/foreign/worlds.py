@@ -98,7 +98,7 @@ def world(name: str) -> World:
     device_m = _devices(ground, campaign, seeds[2])
     reserve, blocks = _influence(where, device_m, campaign.points_m)
     gaps_m = float(np.exp(seeds[3].uniform(np.log(0.3), np.log(2)))), float(np.exp(seeds[3].uniform(0, np.log(4))))
-    true = [_as_built(one, gaps_m, seeds[3]) for one in where.buildings]
+    true: list[Building | None] = [_as_built(one, gaps_m, seeds[3]) for one in where.buildings]
     lost, unmapped = _changes(blocks, reserve, seeds[4])
     for index in (*lost, reserve):
         true[index] = None
