@@ -1,0 +1,1 @@
+"""Foreign worlds: cities, campaigns and effects that share nothing with the effects catalogue."""
