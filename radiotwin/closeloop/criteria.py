@@ -28,6 +28,7 @@ class SelectionCriteria:
         min_gain_per_link_nats: on held-out links, unless the RMSE falls by `max_rmse_ratio`; 0.02
             is what an RMSE lower by 2 % gains.
         max_rmse_ratio: held-out RMSE with the effect over that without.
+        max_rmse_rise: the same ratio, above which likelier links do not help.
         min_gaining_folds: share of the folds that must gain.
         max_p_value: of the cross-fit test (Wasserman et al. 2020), corrected for the number of
             candidates (Bonferroni).
@@ -54,6 +55,7 @@ class SelectionCriteria:
     min_gain_nats: float = 25.0
     min_gain_per_link_nats: float = 0.01
     max_rmse_ratio: float = 0.98
+    max_rmse_rise: float = 1.01
     min_gaining_folds: float = 0.6
     max_p_value: float = 0.01
     max_sign_flip_p_value: float = 0.1

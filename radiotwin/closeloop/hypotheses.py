@@ -45,6 +45,7 @@ class Hypotheses:
         nuisance: what is fitted beside any cause, over that scale.
         base_z: (n,) residuals without any further cause.
         mean_db: (n,) the model's mean.
+        coefficients: of its fit, levels first.
     """
 
     evidence: CorrelatedEvidence
@@ -53,6 +54,7 @@ class Hypotheses:
     nuisance: Columns
     base_z: np.ndarray
     mean_db: np.ndarray
+    coefficients: np.ndarray
 
     @classmethod
     def of(cls, model: FoldModel, fit: FitResult, seed: int) -> Hypotheses:
@@ -72,7 +74,8 @@ class Hypotheses:
         series = links.device if moving else links.receiver
         position_m = links.receiver_m if moving else links.device_m[links.device]
         evidence = CorrelatedEvidence.fit(series, position_m, z, nuisance, seed)
-        return cls(evidence, links, predicted.scale_db, nuisance, z, predicted.mean_db)
+        return cls(evidence, links, predicted.scale_db, nuisance, z, predicted.mean_db,
+                   fit.coefficients)
 
     @cached_property
     def _rotated(self) -> tuple[np.ndarray, float, np.ndarray]:
@@ -99,6 +102,12 @@ class Hypotheses:
         z = np.where(np.isfinite(z), z, 0.0)
         return self.evidence.of_rotated(self.evidence.rotated(z), nuisance, sd, theta)[0] - base
 
+    def information(self, pattern_db: np.ndarray) -> float:
+        """Return how sharply the data would show a change (n,) of unit size [1/size²]."""
+        columns, _, theta = self._rotated
+        pattern = self.evidence.rotated(pattern_db / self.scale_db)
+        return self.evidence.information(pattern, columns, self.nuisance.prior_sd, theta)
+
     def of_named(self, model: FoldModel, fit: FitResult) -> float:
         """Return the evidence for the last effect of a model [nats], penalised by its numbers.
 
@@ -111,9 +120,13 @@ class Hypotheses:
         """
         applied = model.effects[-1]
         term, own = applied.term.select(model.train), model.coefficient_slices[-1]
+        z = _clipped(model.training.residual_db(fit) / self.scale_db)
+        # What its columns brought, and what levels gave way for it, is integrated over again.
         shown_db = term.columns @ fit.coefficients[own]
-        residual_db = model.training.residual_db(fit) + shown_db
-        z = _clipped(residual_db / self.scale_db)
+        levels = model.level_columns[model.train]
+        p = levels.shape[1]
+        shown_db += levels @ (fit.coefficients[:p] - self.coefficients[:p])
+        z += shown_db / self.scale_db
         columns = Columns(term.columns / self.scale_db[:, None], term.prior_sd_db)
         variation = applied.effect.variation(applied.params)
         numbers = 0 if variation is None else len(variation.values)
@@ -146,7 +159,7 @@ class Hypotheses:
             "predicted level": (self.mean_db, KNOTS), "altitude": (links.receiver_m[:, 2], KNOTS)}
         for variable, (value, knots) in variables.items():
             known = np.isfinite(value)
-            if known.mean() < 0.5 or np.ptp(value[known]) < 1e-9:
+            if known.mean() < 0.5 or len(np.unique(value[known])) < KNOTS:  # a label, then
                 continue
             basis = curve_columns(value, knots, variable in ("azimuth", "body azimuth"))
             for name, label in ends.items():

@@ -176,6 +176,9 @@ def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score
             and after_db > criteria.max_rmse_ratio * model.rmse_db(usable):
         reason = (f"gains {per_link:.3f} nats a link only, {criteria.min_gain_per_link_nats} are "
                   "needed")
+    elif after_db > criteria.max_rmse_rise * model.rmse_db(usable):
+        reason = (f"the error of held-out links would rise to {after_db:.2f} dB, though they become "
+                  "likelier")
     elif los_p > criteria.max_los_p_value:
         reason = ("links with line of sight, where the base is surest, do not support it "
                   f"(p = {los_p:.2g})")

@@ -153,19 +153,21 @@ class CorrelatedEvidence:
             value -= moments @ cho_solve(factor, moments)
         return -0.5 * float(value) - 0.5 * len(z) * np.log(2 * np.pi)
 
-    def information(self, z: np.ndarray, nuisance: Columns, pattern: np.ndarray) -> float:
-        """Return how sharply the data would show a pattern (n,) of unit size [1/size²].
+    def information(self, pattern: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
+                    theta: np.ndarray) -> float:
+        """Return how sharply the data would show a pattern of unit size [1/size²].
 
-        Beside the nuisance terms, with the variances that fit residuals z (n,): the expected
-        log-likelihood ratio of a size s is s²/2 times this.
+        Twice the expected log-likelihood ratio of the pattern beside columns that are fitted, too.
+
+        Args:
+            pattern: (m,) rotated.
+            columns: (m, q) rotated.
+            prior_sd: (q,) of their coefficients.
+            theta: the two variances' logarithms.
         """
-        rotated, columns = self.rotated(z), self.rotated(nuisance.values)
-        if not len(rotated):
-            return 0.0
-        theta = self.of_rotated(rotated, columns, nuisance.prior_sd)[1]
         variance = np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum)
-        own, weighted = self.rotated(pattern), columns.T / variance
-        inner = weighted @ columns + np.diag(1.0 / np.square(nuisance.prior_sd))
-        shared = weighted @ own
-        return max(float((own * own / variance).sum() - shared @ np.linalg.solve(inner, shared)),
-                   0.0)
+        weighted = columns.T / variance
+        inner = weighted @ columns + np.diag(1.0 / np.square(prior_sd))
+        shared = weighted @ pattern
+        left = (pattern * pattern / variance).sum() - shared @ np.linalg.solve(inner, shared)
+        return max(float(left), 0.0)
