@@ -45,9 +45,9 @@ class DetectionLimit(LimitEffect):
     def propose(self, view: ResidualView) -> list[Params]:
         links, found = view.links, {}
         blank = np.isnan(links.level_db)
-        declared_db = -np.inf if links.limit_db is None else links.limit_db
         for receiver in frequent_labels(links.receiver[~blank], MIN_READINGS):
             mine = links.receiver == receiver
+            declared_db = float(np.median(links.limit_db[mine]))
             missed = mine & blank
             if missed.sum() < MIN_BLANKS:
                 continue
