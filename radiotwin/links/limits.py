@@ -32,7 +32,8 @@ SURE_SDS = 3.0  # beyond that
 ROUNDS = 2  # of levels and limits in turn
 QUANTILE_90 = 1.645  # of the normal distribution
 MIN_BELOW, BELOW_SHARE = 3, 0.002  # readings below a declared limit that contradict it
-DEAF_DB, DEAF_SDS = 3.0, 4.5  # above the usual limit: a receiver that stands out
+DIFFER_DB = 3.0  # between receivers, from which on it is told
+DEAF_DB, DEAF_SDS = 6.0, 4.5  # above the usual limit: a receiver that stands out
 MAX_NAMED = 5
 
 
@@ -58,14 +59,14 @@ class LimitEstimate:
         return self.nats > MIN_NATS
 
 
-def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray, as_one: float,
+def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarray, as_one: float,
                    declared_db: float = -np.inf) -> LimitEstimate | None:
     """Estimate the limit of detection of one receiver.
 
     Args:
         level_db: (n,) readings [dB]; NaN: not detected.
         mean_db: (n,) predicted levels [dB].
-        sd_db: (n,) standard deviation of their errors [dB].
+        scale_db: (n,) scale of their errors, Student-t with `DOF` degrees of freedom [dB].
         as_one: number of links that count as one, as of `design_effect`.
         declared_db: to be compared with [dB]; -inf: none.
 
@@ -81,7 +82,7 @@ def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
     count = min(int((high_db - low_db + BELOW_DB) / STEP_DB) + 2, MAX_STEPS)
     tried_db = np.append(np.linspace(low_db - BELOW_DB, high_db, count),
                          declared_db if np.isfinite(declared_db) else low_db)
-    nats, none = _nats(tried_db, read_db, mean_db[blank], sd_db[blank], as_one)
+    nats, none = _nats(tried_db, read_db, mean_db[blank], scale_db[blank], as_one)
     nats, declared = nats[:-1], nats[-1]
     weight = np.exp(nats - nats.max())
     weight /= weight.sum()
@@ -92,7 +93,7 @@ def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
                          float(logsumexp(nats) - np.log(len(nats)) - none), lead)
 
 
-def _nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
+def _nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarray,
           as_one: float) -> tuple[np.ndarray, float]:
     """Return the log-likelihood of limits (k,), and that of none at all [nats].
 
@@ -100,13 +101,13 @@ def _nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray, sd_db:
         tried_db: (k,) [dB].
         read_db: readings in order [dB].
         mean_db: (m,) predicted levels of the blanks [dB].
-        sd_db: (m,) standard deviation of the errors of these [dB].
-        as_one: number of links that count as one. Blanks next to each other come together; which of
-            two readings a receiver reports does not depend on the other's.
+        scale_db: (m,) scale of the errors of these [dB].
+        as_one: number of links that count as one.
     """
     readings, blanks = len(read_db), len(mean_db)
-    alike, times = np.unique(np.round(mean_db / BIN_DB) * BIN_DB + 1j * sd_db, return_counts=True)
-    below = stdtr(DOF, (tried_db[:, None] - alike.real) / (SD_SHARE * alike.imag))
+    mean_db = np.round(mean_db / BIN_DB) * BIN_DB
+    alike, times = np.unique(mean_db + 1j * scale_db, return_counts=True)
+    below = stdtr(DOF, (tried_db[:, None] - alike.real) / alike.imag)
     share = blanks / (readings + blanks)
     lost = np.array(LOST_SHARES) * share
     of_blanks = np.array([np.log(p + (1 - p) * below) @ times for p in lost])
@@ -137,14 +138,14 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
     count = np.bincount(links.receiver, minlength=len(links.receiver_names))
     rows = np.split(np.argsort(links.receiver, kind="stable"), np.cumsum(count)[:-1])
     found, together = _estimates(links, rows, declared)
-    usual_db = _usual_db(links, found, together, declared)
+    usual_db = _usual_db(links, rows, found, together, declared)
     own_db, lost = np.full(len(rows), -np.inf), []
     for receiver, mine in enumerate(rows):
         each, level_db = found[receiver], links.level_db[mine]
         read_db = np.sort(level_db[np.isfinite(level_db)])
         trusted = np.isfinite(declared) and not _below(read_db, declared)
         if each is not None and each.is_sure:
-            trusted = trusted and not _overrules(each, declared)
+            trusted = trusted and not _overrules(each, read_db, declared)
             own_db[receiver] = declared if trusted else each.limit_db
         elif len(read_db) == len(level_db):
             own_db[receiver] = declared if trusted and usual_db == declared else -np.inf
@@ -155,20 +156,22 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
     return own_db[links.receiver], _notes(links, rows, own_db, found, declared, lost)
 
 
-def _usual_db(links: LinkData, found: list[LimitEstimate | None], together: LimitEstimate | None,
-              declared_db: float) -> float | None:
+def _usual_db(links: LinkData, rows: list[np.ndarray], found: list[LimitEstimate | None],
+              together: LimitEstimate | None, declared_db: float) -> float | None:
     """Return the limit of receivers whose own links do not tell [dB]; None: nothing is known.
 
     The declared one, unless most other receivers overrule it, or all links together. Where none is
     declared, that of the others, or of all links together, or the lowest reading of few links.
     """
-    sure = [each for each in found if each is not None and each.is_sure]
+    sure = [(each, mine) for each, mine in zip(found, rows, strict=True) if each and each.is_sure]
     if np.isfinite(declared_db):
-        against = sum(_overrules(each, declared_db) for each in sure)
-        if 2 * against <= len(sure) and (sure or not _overrules(together, declared_db)):
+        asked = sure or ([(together, np.arange(len(links)))] if together else [])
+        against = sum(_overrules(each, np.sort(links.level_db[mine]), declared_db)
+                      for each, mine in asked)
+        if 2 * against <= len(asked):
             return declared_db
     if sure:
-        return lower_median([each.limit_db for each in sure])
+        return lower_median([each.limit_db for each, _ in sure])
     if together is None:
         return float(np.nanmin(links.level_db))
     return together.limit_db if together.is_sure else None
@@ -180,13 +183,16 @@ def _below(read_db: np.ndarray, limit_db: float) -> bool:
     return bool(below >= max(MIN_BELOW, BELOW_SHARE * len(read_db)))
 
 
-def _overrules(found: LimitEstimate | None, declared_db: float) -> bool:
-    """Return whether an estimate is surely not what is declared."""
-    if found is None or not found.is_sure:
-        return False
+def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) -> bool:
+    """Return whether an estimate, from readings in order (n,), surely differs from the declared.
+
+    A receiver that reads levels down to the declared limit has that, however few they are.
+    """
     rise_db = found.limit_db - declared_db
     off_db = max(rise_db - RISE_DB, -rise_db - FALL_DB)
-    return off_db > SURE_SDS * found.sd_db and found.over_declared_nats > MIN_NATS
+    reaches = rise_db > 0 and _below(read_db, declared_db + RISE_DB + FALL_DB)
+    sure = off_db > SURE_SDS * found.sd_db and found.over_declared_nats > MIN_NATS
+    return found.is_sure and sure and not reaches
 
 
 def _estimates(links: LinkData, rows: list[np.ndarray], declared_db: float,
@@ -202,10 +208,10 @@ def _estimates(links: LinkData, rows: list[np.ndarray], declared_db: float,
         crude = crude_level(links.level_db, own_db[links.receiver], links.distance_m, links.device,
                             links.receiver)
         z = np.where(blank, 0.0, (links.level_db - crude.mean_db) / crude.sd_db)
-        as_one, sd_db = design_effect(block, z), np.full(len(links), crude.sd_db)
-        *found, together = [receiver_limit(links.level_db[mine], crude.mean_db[mine], sd_db[mine],
-                                           as_one, declared_db)
-                            for mine in (*rows, np.arange(len(links)))]
+        as_one, scale_db = design_effect(block, z), np.full(len(links), SD_SHARE * crude.sd_db)
+        *found, together = [
+            receiver_limit(links.level_db[mine], crude.mean_db[mine], scale_db[mine], as_one,
+                           declared_db) for mine in (*rows, np.arange(len(links)))]
         before_db, own_db = own_db, np.array([
             each.limit_db if each is not None and each.is_sure else limit_db
             for each, limit_db in zip(found, own_db, strict=True)])
@@ -238,7 +244,7 @@ def _notes(links: LinkData, rows: list[np.ndarray], own_db: np.ndarray,
                          for r in other[:MAX_NAMED])
         notes.append(f"the declared limit of detection, {declared_db:g} {unit}, is not that of the "
                      f"readings: {lie}. Used instead: {used}{_more(other)}")
-    elif len(known_db) and np.ptp(known_db) > DEAF_DB:
+    elif len(known_db) and np.ptp(known_db) > DIFFER_DB:
         low, high = (links.receiver_names[int(np.flatnonzero(own_db == end)[0])]
                      for end in (known_db.min(), known_db.max()))
         notes.append(f"limits of detection differ between receivers: from {known_db.min():.1f} "
