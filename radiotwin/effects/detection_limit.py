@@ -24,6 +24,7 @@ class DetectionLimit(LimitEffect):
     name = "noise_floor_censoring"
     variant = "a receiver's own limit of detection"
     confused_with = ("lock_loss", "missing_obstacle", "receiver_gain_offset")
+    nlos_only = True  # as good as: over a map, links with line of sight are far above a limit
 
     class Params(EffectParams):
         """Limits of receivers."""
