@@ -9,6 +9,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from radiotwin.errors import BadInput
+from radiotwin.inference.gaussian import Limit, limits_of
 from radiotwin.links import LinkData, LinkGeometry
 
 MIN_DETECTED = 20  # detected links that a line and its standard deviation are learnt from
@@ -33,16 +34,16 @@ class ChannelModel(ABC):
     """Whether predictions follow paths over the map, so that `quick` is much quicker."""
 
     @abstractmethod
-    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int) -> Self:
         """Fit to measured links.
 
         Args:
             links: n links.
             level_db: (n,) gain [dB] or received power [dBm]; NaN: not detected.
-            limit_db: level below which the receiver does not detect [dB]: links that were not
-                detected count as below it (left-censored). None: unknown, those links are left
-                out with a warning.
+            limit_db: level below which the receiver does not detect [dB], one for all or (n,):
+                links that were not detected count as below it (left-censored). None or -inf:
+                unknown, such links are left out with a warning.
             seed: of whatever is random; equal data and seed give equal bits.
 
         Returns:
@@ -148,19 +149,19 @@ def check_fit_data(links: LinkGeometry, level_db: np.ndarray, *, needs_los: bool
             "metres, z above sea level), or fit log_distance, which needs no map")
 
 
-def drop_uninformative(links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
-                       ) -> tuple[LinkGeometry, np.ndarray]:
-    """Return the links that a fit can use: all, or the detected ones where there is no limit.
+def drop_uninformative(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
+                       ) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
+    """Return the links that a fit can use: those that were detected, or have a limit.
 
     Warns where links are left out.
 
     Args:
         links: n links.
         level_db: (n,) [dB]; NaN: not detected.
-        limit_db: limit of detection [dB]; None: unknown.
+        limit_db: limit of detection [dB], one for all or (n,); None or -inf: unknown.
 
     Returns:
-        m links, and their levels (m,) [dB].
+        m links, their levels (m,), and their limits (m,) [dB].
 
     Raises:
         BadInput: too few links are detected, or a level is infinite.
@@ -171,11 +172,12 @@ def drop_uninformative(links: LinkGeometry, level_db: np.ndarray, limit_db: floa
         raise BadInput(f"the level of link {row} is {level_db[row]} dB: allowed are finite "
                        "numbers, or blank")
     check_fit_data(links, level_db, needs_los=False)
-    missing = np.isnan(level_db)
-    if limit_db is not None or not missing.any():
-        return links, level_db
+    limits_db = limits_of(limit_db, len(level_db))
+    missing = np.isnan(level_db) & np.isneginf(limits_db)
+    if not missing.any():
+        return links, level_db, limits_db
     warnings.warn(
         f"{missing.sum()} of {len(links)} links were not detected and are left out, because the "
         "limit of detection is not known: the channel will look better than it is. Give the "
         "receiver's sensitivity.", stacklevel=3)
-    return links.select(~missing), level_db[~missing]
+    return links.select(~missing), level_db[~missing], limits_db[~missing]

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from radiotwin.inference import student
+from radiotwin.inference.gaussian import Limit, limits_of
 from radiotwin.links import LinkGeometry, design_effect
 
 DOF = 4.0  # of the errors
@@ -71,9 +72,9 @@ class LinkFit:
         limits_db: (n,) below which levels are not detected [dB].
     """
 
-    def __init__(self, level_db: np.ndarray, limit_db: float | None) -> None:
+    def __init__(self, level_db: np.ndarray, limit_db: Limit) -> None:
         self.level_db = level_db
-        self.limits_db = np.full(len(level_db), -np.inf if limit_db is None else limit_db)
+        self.limits_db = limits_of(limit_db, len(level_db))
         self._start: dict[bool, np.ndarray] = {}
 
     def fit(self, los: np.ndarray, paths_db: np.ndarray, square_db: np.ndarray | None = None

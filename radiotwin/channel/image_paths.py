@@ -12,6 +12,7 @@ from radiotwin.channel.base import ANY_LEVEL_SD_DB, ChannelModel
 from radiotwin.channel.followed_paths import path_gains
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.channel.stored import require_names, require_number
+from radiotwin.inference.gaussian import Limit, limits_of
 from radiotwin.links import LinkGeometry
 
 MIN_NLOS = 30  # links without line of sight that the diffuse power is fitted to
@@ -45,24 +46,26 @@ class ImagePaths(ChannelModel):
         self.diffuse = diffuse
 
     @override
-    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
         self.law.fit(links, level_db, limit_db, seed)
         return self.fit_diffuse(links, level_db, limit_db)
 
     def fit_diffuse(self, links: LinkGeometry, level_db: np.ndarray,
-                    limit_db: float | None) -> Self:
+                    limit_db: Limit) -> Self:
         """Fit the diffuse power to links without line of sight, beside a level of their own.
 
         Args:
             links: n links over a map.
             level_db: (n,) [dB]; NaN = not detected.
-            limit_db: below which levels are not detected [dB]; None = unknown.
+            limit_db: below which levels are not detected [dB], one for all or (n,); None or -inf:
+                unknown.
         """
         nlos = links.select(~links.los)
         level_db = level_db[~links.los]
         blank = np.isnan(level_db)
-        level_db = np.where(blank, -np.inf if limit_db is None else limit_db, level_db)
+        limits_db = limits_of(limit_db, len(links))[~links.los]
+        level_db = np.where(blank, limits_db, level_db)
         known = np.isfinite(level_db)
         # Blanks alone say no more than that it is weak, and the least is.
         if known.sum() < MIN_NLOS or blank[known].all():

@@ -10,6 +10,7 @@ from typing_extensions import override
 from radiotwin.channel.base import ChannelModel, drop_uninformative
 from radiotwin.channel.stored import MAX_DB, require_array, require_lines, require_names
 from radiotwin.inference.censored_line import LogDistanceLine, fit_line
+from radiotwin.inference.gaussian import Limit
 from radiotwin.links import LinkGeometry
 
 
@@ -23,9 +24,9 @@ class LogDistance(ChannelModel):
         self.line: LogDistanceLine = line  # type: ignore[assignment]  # None only until it is fitted
 
     @override
-    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
-        links, level_db = drop_uninformative(links, level_db, limit_db)
+        links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.line = fit_line(links.log_distance, level_db, limit_db)
         return self
 

@@ -16,6 +16,7 @@ from radiotwin.channel.map_shift import NO_SHIFT, Shift, estimate_shift
 from radiotwin.channel.map_sizes import Size, estimate_sizes
 from radiotwin.channel.path_levels import MAX_OFFSET_DB, Offsets, fit_offsets, moved
 from radiotwin.channel.stored import require_names, require_number
+from radiotwin.inference.gaussian import Limit, limits_of
 from radiotwin.links import LinkGeometry
 
 LINKS = 400  # that are looked at
@@ -104,14 +105,14 @@ Found = tuple[MapError, tuple[float, float]]
 """Errors of a map, and the power beside its paths, see `ImagePaths`."""
 
 
-def estimate_map_error(links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+def estimate_map_error(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                        seed: int) -> Found:
     """Estimate the errors of the map that links lie over.
 
     Args:
         links: n links over a map, to devices whose positions are known.
         level_db: (n,) [dB]; NaN: not detected.
-        limit_db: below which levels are not detected [dB]; None: unknown.
+        limit_db: below which levels are not detected [dB], one for all or (n,); None: unknown.
         seed: of the choice of links, and of the maps' errors.
 
     Returns:
@@ -123,16 +124,17 @@ def estimate_map_error(links: LinkGeometry, level_db: np.ndarray, limit_db: floa
     return replace(error, shift_m=shift_m), diffuse
 
 
-def estimate_other_errors(links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+def estimate_other_errors(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                           seed: int) -> Found:
     """Do as `estimate_map_error` for a map that is not shifted."""
     diffuse = ImagePaths().fit_diffuse(links, level_db, limit_db).diffuse
-    known = np.flatnonzero(np.isfinite(level_db) | (limit_db is not None))
+    limits_db = limits_of(limit_db, len(links))
+    known = np.flatnonzero(np.isfinite(level_db) | np.isfinite(limits_db))
     if len(known) < MIN_LINKS:
         return MapError(), diffuse
     rng = np.random.default_rng(seed)
     rows = np.sort(rng.choice(known, min(LINKS, len(known)), replace=False))
-    links, level_db = links.select(rows), level_db[rows]
-    offsets_db = fit_offsets(links, level_db, limit_db, diffuse)
-    sizes = estimate_sizes(links, level_db, limit_db, diffuse, offsets_db, seed)
+    links, level_db, limits_db = links.select(rows), level_db[rows], limits_db[rows]
+    offsets_db = fit_offsets(links, level_db, limits_db, diffuse)
+    sizes = estimate_sizes(links, level_db, limits_db, diffuse, offsets_db, seed)
     return MapError(sizes.wall_m, sizes.height_m, offsets_db=offsets_db), diffuse

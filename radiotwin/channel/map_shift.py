@@ -9,6 +9,7 @@ from radiotwin.channel.class_fit import LinkFit
 from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.channel.map_sizes import estimate_sizes
 from radiotwin.channel.path_levels import moved, paths_db
+from radiotwin.inference.gaussian import Limit, limits_of
 from radiotwin.links import LinkGeometry
 from radiotwin.progress import progress
 
@@ -28,14 +29,14 @@ Shift = tuple[float, float, float]
 NO_SHIFT: Shift = (0.0, 0.0, 0.0)
 
 
-def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: float | None, seed: int
+def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, seed: int
                    ) -> Shift:
     """Estimate the shift of a map from links between declared positions (maximum likelihood).
 
     Args:
         links: n links over a map; those to devices of estimated position are not looked at.
         level_db: (n,) [dB]; NaN: not detected.
-        limit_db: below which levels are not detected [dB]; None: unknown.
+        limit_db: below which levels are not detected [dB], one for all or (n,); None: unknown.
         seed: of the choice of links, and of the maps' errors.
 
     Returns:
@@ -43,7 +44,8 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: float | 
         look like another shift about each device; so one that is found without a device must
         explain the links of that device, and more than errors of single walls do.
     """
-    known = np.isfinite(level_db) | (limit_db is not None)
+    limits_db = limits_of(limit_db, len(links))
+    known = np.isfinite(level_db) | np.isfinite(limits_db)
     if links.estimated is not None:
         known &= ~links.estimated
     rows = np.flatnonzero(known)
@@ -51,11 +53,11 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: float | 
         return NO_SHIFT
     rng = np.random.default_rng(seed)
     rows = np.sort(rng.choice(rows, min(LINKS, len(rows)), replace=False))
-    links, level_db = links.select(rows), level_db[rows]
+    links, level_db, limits_db = links.select(rows), level_db[rows], limits_db[rows]
     device = np.unique(links.device, return_inverse=True)[1]
     if device.max() + 1 < MIN_DEVICES:
         return NO_SHIFT
-    search = _Search(links, level_db, limit_db)
+    search = _Search(links, level_db, limits_db)
     with progress("looking for a shift of the map", total=None):
         best = search.best()
     shifts = np.array(list(search.nll))
@@ -69,7 +71,7 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: float | 
     if np.hypot(*best) < SEEN_SHIFT_M or not chance < SURE:
         return NO_SHIFT
     diffuse, offsets_db = search.diffuse, (0.0, 0.0)
-    here, there = (estimate_sizes(each, level_db, limit_db, diffuse, offsets_db, seed)
+    here, there = (estimate_sizes(each, level_db, limits_db, diffuse, offsets_db, seed)
                    for each in (links, moved(links, *best)))
     if here.nll - there.nll < SURE_NATS * there.as_one:  # walls that are off explain as much
         return NO_SHIFT
@@ -87,7 +89,7 @@ class _Search:
         nll: shift -> negative log-likelihood of each link (n,) [nats]; the first is no shift.
     """
 
-    def __init__(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None) -> None:
+    def __init__(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit) -> None:
         self._links, self._fit = links, LinkFit(level_db, limit_db)
         self.diffuse = ImagePaths().fit_diffuse(links, level_db, limit_db).diffuse
         self.nll: dict[tuple[float, float], np.ndarray] = {}

@@ -14,6 +14,7 @@ import numpy as np
 
 from radiotwin.channel.class_fit import LinkFit, links_as_one
 from radiotwin.channel.path_levels import Offsets, paths_db
+from radiotwin.inference.gaussian import Limit
 from radiotwin.links import LinkGeometry
 from radiotwin.progress import progress
 from radiotwin.scene.perturbation import perturbed_map
@@ -44,14 +45,14 @@ class Sizes:
     as_one: float
 
 
-def estimate_sizes(links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+def estimate_sizes(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                    diffuse: tuple[float, float], offsets_db: Offsets, seed: int) -> Sizes:
     """Estimate the errors of walls and roofs.
 
     Args:
         links: n links over a map, to devices whose positions are known.
         level_db: (n,) [dB]; NaN: not detected.
-        limit_db: below which levels are not detected [dB]; None: unknown.
+        limit_db: below which levels are not detected [dB], one for all or (n,); None: unknown.
         diffuse: power beside the paths, see `ImagePaths`.
         offsets_db: see `Offsets`.
         seed: of the maps' errors.

@@ -22,7 +22,7 @@ from radiotwin.channel.stored import (
     require_names,
     require_number,
 )
-from radiotwin.inference.gaussian import standardised
+from radiotwin.inference.gaussian import Limit, standardised
 from radiotwin.links import LinkGeometry
 from radiotwin.scene.perturbation import perturbed_map
 
@@ -75,16 +75,16 @@ class PathKriging(ChannelModel):
         self.seed = 0
 
     @override
-    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
-        links, level_db = drop_uninformative(links, level_db, limit_db)
+        links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.seed = seed
         sure = ~np.isin(links.device, self.lost)
         self.map_error, self.diffuse = self._found or estimate_map_error(
-            links.select(sure), level_db[sure], limit_db, seed)
+            links.select(sure), level_db[sure], limit_db[sure], seed)
         links = self.map_error.on_map(links)
         self.kriging.fit(links, level_db, limit_db, seed)
-        links, level_db = links.select(sure), level_db[sure]
+        links, level_db, limit_db = links.select(sure), level_db[sure], limit_db[sure]
         paths = self._over_maps(links)
         self._fit_classes(links, level_db, limit_db, *paths)
         self._fit_field(links, level_db, limit_db, *paths)
@@ -125,14 +125,13 @@ class PathKriging(ChannelModel):
         unbiased = len(levels_db) / max(len(levels_db) - 1, 1)
         return np.mean(levels_db, axis=0), unbiased * np.var(levels_db, axis=0)
 
-    def _fit_classes(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+    def _fit_classes(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
                      mean_db: np.ndarray, square_db: np.ndarray) -> None:
-        limits_db = np.full(len(links), -np.inf if limit_db is None else limit_db)
         heard = [int(np.isfinite(level_db[links.los == los]).sum()) for los in (False, True)]
         for los in (False, True):
             mine = links.los == los
             if heard[los]:
-                fit = fit_class(level_db[mine], limits_db[mine], mean_db[mine], square_db[mine])
+                fit = fit_class(level_db[mine], limit_db[mine], mean_db[mine], square_db[mine])
                 self.classes[int(los)] = fit.level_db, np.exp(fit.numbers[1])
         for los in (False, True):
             if not heard[los]:  # nothing is known of it but what the other shows
@@ -144,7 +143,7 @@ class PathKriging(ChannelModel):
         level_db, own_db = self.classes[links.los.astype(int)].T
         return mean_db + level_db, SPREAD_FACTOR * scale_db(own_db, square_db)
 
-    def _fit_field(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+    def _fit_field(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
                    mean_db: np.ndarray, square_db: np.ndarray) -> None:
         mean_db, sd_db = self._at_paths(links, mean_db, square_db)
         residual = standardised(level_db, mean_db, sd_db, limit_db)
@@ -156,7 +155,7 @@ class PathKriging(ChannelModel):
         mean, sd = field.predict(links.device, links.receiver_m)
         return mean_db + sd_db * mean, sd_db * sd
 
-    def _held_out_weight(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+    def _held_out_weight(self, links: LinkGeometry, level_db: np.ndarray, limit_db: np.ndarray,
                          mean_db: np.ndarray, square_db: np.ndarray) -> np.ndarray:
         """Return the weights (2,) that predict links in squares of ground left out best.
 

@@ -10,6 +10,7 @@ from scipy.optimize import minimize
 from radiotwin.channel.class_fit import LinkFit, links_as_one
 from radiotwin.channel.followed_paths import interaction_gains
 from radiotwin.channel.image_paths import with_diffuse_db
+from radiotwin.inference.gaussian import Limit
 from radiotwin.links import LinkGeometry
 
 OFFSET_SD_DB = 6.0  # prior of what reflections and diffractions lie above those of the map
@@ -39,7 +40,7 @@ def moved(links: LinkGeometry, east_m: float, north_m: float) -> LinkGeometry:
     return replace(links, device_m=device_m, receiver_m=receiver_m, los=los)
 
 
-def fit_offsets(links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+def fit_offsets(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
                 diffuse: tuple[float, float]) -> Offsets:
     """Return what reflections and diffractions carry beside those over the map [dB].
 
@@ -49,7 +50,7 @@ def fit_offsets(links: LinkGeometry, level_db: np.ndarray, limit_db: float | Non
     Args:
         links: n links over a map.
         level_db: (n,) [dB]; NaN: not detected.
-        limit_db: below which levels are not detected [dB]; None: unknown.
+        limit_db: below which levels are not detected [dB], one for all or (n,); None: unknown.
         diffuse: power beside the paths, see `ImagePaths`.
     """
     fit, gains = LinkFit(level_db, limit_db), interaction_gains(links)

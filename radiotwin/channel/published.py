@@ -19,6 +19,7 @@ from typing_extensions import override
 from radiotwin.channel.base import ChannelModel
 from radiotwin.channel.stored import MAX_DB, require_names, require_number
 from radiotwin.errors import BadInput
+from radiotwin.inference.gaussian import Limit
 from radiotwin.links import LinkGeometry
 from radiotwin.scene.citymap import CityMap
 
@@ -82,7 +83,7 @@ class PublishedLaw(ChannelModel):
         raise NotImplementedError(f"{self.name} has no probability of line of sight")
 
     @override
-    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
         """Take frequency and map from links; nothing is fitted, and there may be no link at all.
 

@@ -10,7 +10,7 @@ from typing_extensions import override
 from radiotwin.channel.base import ChannelModel, drop_uninformative
 from radiotwin.channel.residual_field import ResidualField
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.inference.gaussian import standardised
+from radiotwin.inference.gaussian import Limit, standardised
 from radiotwin.links import LinkGeometry
 
 
@@ -34,9 +34,9 @@ class RegressionKriging(ChannelModel):
         self.field = ResidualField()
 
     @override
-    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
-        links, level_db = drop_uninformative(links, level_db, limit_db)
+        links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)
         mean_db, sd_db = self.law.predict(links)
         residual = standardised(level_db, mean_db, sd_db, limit_db)

@@ -12,6 +12,7 @@ from typing_extensions import override
 from radiotwin.channel.base import MIN_DETECTED, ChannelModel, drop_uninformative
 from radiotwin.channel.stored import MAX_DB, require_array, require_lines, require_names
 from radiotwin.inference.censored_line import LogDistanceLine, fit_line, shift_line
+from radiotwin.inference.gaussian import Limit
 from radiotwin.links import LinkGeometry
 
 # Prior of the gap between the lines: in 3GPP TR 38.901 UMi, at 100 m and 2.4 GHz, LoS lies 19 dB
@@ -43,23 +44,23 @@ class SegmentedLogDistance(ChannelModel):
         self.borrowed = borrowed
 
     @override
-    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
-        links, level_db = drop_uninformative(links, level_db, limit_db)
+        links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         data = {
-            "los": (links.log_distance[links.los], level_db[links.los]),
-            "nlos": (links.log_distance[~links.los], level_db[~links.los]),
+            name: (links.log_distance[rows], level_db[rows], limit_db[rows])
+            for name, rows in (("los", links.los), ("nlos", ~links.los))
         }
-        detected = {name: int(np.isfinite(level).sum()) for name, (_, level) in data.items()}
+        detected = {name: int(np.isfinite(level).sum()) for name, (_, level, _) in data.items()}
         poor, rich = sorted(detected, key=lambda name: detected[name])
-        lines = {rich: fit_line(*data[rich], limit_db)}
+        lines = {rich: fit_line(*data[rich])}
         self.borrowed = poor if detected[poor] < MIN_DETECTED else None
         if self.borrowed is None:
-            lines[poor] = fit_line(*data[poor], limit_db)
+            lines[poor] = fit_line(*data[poor])
         else:
             wide = replace(lines[rich], sd_db=max(lines[rich].sd_db, BORROWED_SD_DB))
             prior_db = NLOS_LOSS_DB if poor == "los" else -NLOS_LOSS_DB
-            lines[poor] = shift_line(wide, *data[poor], limit_db, prior_db, NLOS_LOSS_SD_DB)
+            lines[poor] = shift_line(wide, *data[poor], prior_db, NLOS_LOSS_SD_DB)
             shift_db = lines[poor].intercept_db - lines[rich].intercept_db
             labels = {"los": "LoS", "nlos": "NLoS"}
             warnings.warn(

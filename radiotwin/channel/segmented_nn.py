@@ -27,6 +27,7 @@ from radiotwin.channel.stored import (
     require_names,
 )
 from radiotwin.inference.censored_line import fit_sd_db
+from radiotwin.inference.gaussian import Limit
 from radiotwin.links import LinkGeometry
 
 BLOCK_M = 100.0  # side of a block on the ground that is held out as a whole
@@ -71,9 +72,9 @@ class SegmentedNN(ChannelModel):
         self.weights: dict[str, np.ndarray] = {}
 
     @override
-    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: float | None,
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
-        links, level_db = drop_uninformative(links, level_db, limit_db)
+        links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)
         law_db, law_sd_db = self.law.predict(links)
         segment = links.los.astype(np.intp)
@@ -85,7 +86,7 @@ class SegmentedNN(ChannelModel):
             source = coordinates[segment == s] if corrected[s] else coordinates[use]
             self.low[s], self.high[s] = np.quantile(source, [TRIM, 1.0 - TRIM], axis=0)
         censored = np.isnan(level_db)
-        residual = (np.where(censored, limit_db or 0.0, level_db) - law_db) / law_sd_db
+        residual = (np.where(censored, limit_db, level_db) - law_db) / law_sd_db
         data = TrainingData(
             inputs=self._inputs(coordinates, segment)[use],
             target=residual[use],
@@ -100,7 +101,7 @@ class SegmentedNN(ChannelModel):
             mask = segment == s
             if corrected[s]:
                 self.residual_db[s] = np.quantile(mean_db[mask] - law_db[mask], [TRIM, 1.0 - TRIM])
-                self.sd_db[s] = fit_sd_db(level_db[mask], mean_db[mask], limit_db)
+                self.sd_db[s] = fit_sd_db(level_db[mask], mean_db[mask], limit_db[mask])
             else:
                 self.residual_db[s], self.sd_db[s] = 0.0, line.sd_db
         self._tabulate()

@@ -13,6 +13,7 @@ from radiotwin.channel.base import ChannelModel
 from radiotwin.channel.registry import BUILT_IN, channel_models
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_file
+from radiotwin.inference.gaussian import Limit
 from radiotwin.inputs import parse_json, read_bytes
 from radiotwin.links import LinkGeometry
 from radiotwin.pieces import kept
@@ -33,7 +34,7 @@ def save_channel(model: ChannelModel, path: str | Path) -> None:
 
 
 def fit_once(kind: type[ChannelModel], links: LinkGeometry, level_db: np.ndarray,
-             limit_db: float | None, seed: int) -> ChannelModel:
+             limit_db: Limit, seed: int) -> ChannelModel:
     """Fit a new model, or take it from an earlier run that was to fit the same.
 
     Args:

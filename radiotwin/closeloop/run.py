@@ -31,6 +31,7 @@ from radiotwin.effects.unexplained_trend import UnexplainedTrend
 from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import mean_if_detected
 from radiotwin.links import LinkData, LinkGeometry, prepare_links, residual_variables
+from radiotwin.links.limits import limits_to_explain
 from radiotwin.measurements import Measurements
 from radiotwin.pieces import kept
 from radiotwin.scene import Scene
@@ -137,7 +138,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
                        "base log-distance")
     criteria = criteria or SelectionCriteria()
     all_links = prepare_links(measurements, scene)
-    links = thin_links(all_links, seed)
+    links = limits_to_explain(thin_links(all_links, seed))
     folds = make_folds(links, seed, hold_out)
     names = [base]
     if base == "auto":
@@ -192,16 +193,15 @@ def _baselines(model: CrossValidatedModel, criteria: SelectionCriteria) -> dict[
         for number, fold in enumerate(model.folds):
             test, train, links = (model.index == number) & fold.usable, fold.train, fold.links
             own_db, sd_db = _learnt_and_predicted(
-                kind, links.geometry.select(train), links.level_db[train], links.limit_db,
+                kind, links.geometry.select(train), links.level_db[train], links.limit_db[train],
                 links.geometry.select(test))
-            mean_db[test] = own_db if links.limit_db is None else mean_if_detected(
-                own_db, sd_db, links.limit_db)
+            mean_db[test] = mean_if_detected(own_db, sd_db, links.limit_db[test])
         result[kind.name] = mean_db
     return result
 
 
 def _learnt_and_predicted(kind: type[ChannelModel], train: LinkGeometry, level_db: np.ndarray,
-                          limit_db: float | None, test: LinkGeometry,
+                          limit_db: np.ndarray, test: LinkGeometry,
                           ) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and standard deviation of n links by a model that is fitted to others [dB]."""
     def predict() -> tuple[np.ndarray, np.ndarray]:

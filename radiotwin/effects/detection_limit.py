@@ -1,27 +1,21 @@
-"""A receiver less sensitive than declared: its links are blank below a limit of its own.
+"""A receiver less sensitive than the others: its links are blank below a limit of its own.
 
 A blank then means "below that limit" (Tobin 1958, 'Estimation of relationships for limited
-dependent variables', Econometrica 26) and not "below the declared one". The likeliest limit is the
-lowest level that the receiver has read.
+dependent variables', Econometrica 26) and not "below the usual one". Receivers whose limits hardly
+differ, and a declared limit that is wrong, are no effect: `radiotwin.links.limits` sees to them.
 """
 
 import numpy as np
 from pydantic import Field
-from scipy.special import stdtr
 from typing_extensions import override
 
-from radiotwin.effects.arrays import frequent_labels
 from radiotwin.effects.base import LimitEffect
 from radiotwin.effects.params import Decibels, EffectParams, Estimate, Parameter, ReceiverIndex
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
+from radiotwin.links.limits import MIN_NATS, receiver_limit
 
-MIN_READINGS, MIN_BLANKS = 40, 10  # of a receiver
-MIN_NATS = 4.0  # that a limit must gain to be proposed for a receiver
-MIN_RISE_DB = 2.0  # above the declared limit
-DOF = 4.0  # of the errors: heavy tails
-LOWEST = 0.005  # quantile: a single odd reading below the limit does not count
-NEAREST = 10  # readings above the limit, for their usual gap
+MIN_RISE_DB = 2.0  # above the usual limit
 
 
 class DetectionLimit(LimitEffect):
@@ -30,12 +24,15 @@ class DetectionLimit(LimitEffect):
     name = "noise_floor_censoring"
     variant = "a receiver's own limit of detection"
     confused_with = ("lock_loss", "missing_obstacle", "receiver_gain_offset")
+    nlos_only = True  # as good as: over a map, links with line of sight are far above a limit
 
     class Params(EffectParams):
         """Limits of receivers."""
 
         receivers: dict[ReceiverIndex, Decibels] = Field(
             description="Limit of detection of each receiver, by index [dB].")
+        sd_db: dict[ReceiverIndex, Decibels] = Field(
+            default_factory=dict, description="Standard deviation of each [dB].")
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
@@ -43,23 +40,16 @@ class DetectionLimit(LimitEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        links, found = view.links, {}
-        blank = np.isnan(links.level_db)
-        declared_db = -np.inf if links.limit_db is None else links.limit_db
-        for receiver in frequent_labels(links.receiver[~blank], MIN_READINGS):
+        links, found, sd_db = view.links, {}, {}
+        for receiver in np.unique(links.receiver):
             mine = links.receiver == receiver
-            missed = mine & blank
-            if missed.sum() < MIN_BLANKS:
-                continue
-            limit_db = float(np.quantile(links.level_db[mine & ~blank], LOWEST))
-            mean_db, scale_db = view.mean_db[missed], view.scale_db[missed]
-            nats = np.log(stdtr(DOF, (limit_db - mean_db) / scale_db))
-            if np.isfinite(declared_db):
-                nats = nats - np.log(stdtr(DOF, (declared_db - mean_db) / scale_db))
-            if (limit_db > declared_db + MIN_RISE_DB
-                    and nats.sum() / view.design_effect > MIN_NATS):
-                found[receiver] = limit_db
-        return [self.Params(receivers=found)] if found else []
+            usual_db = float(np.median(links.limit_db[mine]))
+            limit = receiver_limit(links.level_db[mine], view.mean_db[mine], view.scale_db[mine],
+                                   view.design_effect, usual_db)
+            if (limit is not None and limit.is_sure and limit.limit_db > usual_db + MIN_RISE_DB
+                    and (np.isinf(usual_db) or limit.over_declared_nats > MIN_NATS)):
+                found[int(receiver)], sd_db[int(receiver)] = limit.limit_db, limit.sd_db
+        return [self.Params(receivers=found, sd_db=sd_db)] if found else []
 
     @override
     def limits_db(self, links: LinkData, params: Params) -> np.ndarray:
@@ -70,14 +60,7 @@ class DetectionLimit(LimitEffect):
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
-        result, unit = {}, "dB" if links.is_gain else "dBm"
-        for receiver, limit_db in params.receivers.items():
-            mine = (links.receiver == receiver) & (links.level_db >= limit_db)
-            read_db = np.sort(links.level_db[mine])
-            nearest = min(NEAREST, len(read_db) - 1)
-            gap_db = (read_db[nearest] - read_db[0]) / nearest
-            # Gaps are exponential: one ln(10) times the usual is exceeded in 10 % of cases.
-            low_db = limit_db - np.log(10.0) * float(gap_db)
-            result[f"limit[{links.receiver_names[receiver]}]"] = Parameter(
-                limit_db, low_db, float(read_db[0]), unit)
-        return result
+        unit = "dB" if links.is_gain else "dBm"
+        return {f"limit[{links.receiver_names[receiver]}]": Parameter.normal(
+                    limit_db, params.sd_db.get(receiver, np.nan), unit)
+                for receiver, limit_db in params.receivers.items()}

@@ -146,8 +146,7 @@ class FoldModel:
     @cached_property
     def limit_db(self) -> np.ndarray:
         """(n,) level below which a link is blank [dB]; -inf where none is known."""
-        declared_db = -np.inf if self.links.limit_db is None else self.links.limit_db
-        limit_db = np.full(len(self.links), declared_db)
+        limit_db = self.links.limit_db
         for each in self.effects:
             if isinstance(each.effect, LimitEffect):
                 own_db = each.effect.limits_db(self.links, each.params)

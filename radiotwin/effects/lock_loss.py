@@ -52,19 +52,18 @@ class LockLoss(DetectionEffect):
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
-        if links.limit_db is None:
+        if not np.isfinite(links.limit_db).any():
             return "the limit of detection is not known, so that a blank has no meaning"
         return None if np.isnan(links.level_db).any() else "no link is blank"
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         links, found = view.links, {}
-        assert links.limit_db is not None  # else it is unavailable
         # Behind buildings, links are blank for want of a path, too.
         clear = links.los if links.los.any() else np.ones(len(links), dtype=bool)
         for receiver in frequent_labels(links.receiver[clear], MIN_LINKS):
             rows = np.flatnonzero(clear & (links.receiver == receiver))
-            margin = (links.limit_db - view.mean_db[rows]) / view.scale_db[rows]
+            margin = (links.limit_db[rows] - view.mean_db[rows]) / view.scale_db[rows]
             probability, nats = _likeliest(stdtr(DOF, margin), np.isnan(links.level_db[rows]))
             # A receiver less sensitive than declared misses no strong links, and an obstacle
             # affects some devices only.

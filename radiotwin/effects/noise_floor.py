@@ -25,6 +25,7 @@ from radiotwin.links import LinkData
 
 MIN_LINKS = 40  # of a receiver, to estimate its floor
 MIN_RECEIVERS = 3  # with a floor, so that their median is the usual one
+MIN_NATS = 2.0  # that a floor must gain to be proposed for a receiver alone
 QUANTILES = (0.01, 0.05, 0.1, 0.2, 0.35, 0.5)  # of a receiver's readings, tried as its floor
 COMMON_QUANTILES = (0.03, 0.15)  # the same for all receivers
 
@@ -34,6 +35,7 @@ class NoiseFloor(ReceiverEffect):
 
     name = "noise_floor_censoring"
     confused_with = ("interference", "excess_attenuation")
+    nlos_only = True  # as good as: over a map, links with line of sight are far above a floor
 
     class Params(EffectParams):
         """Floors of receivers."""
@@ -43,7 +45,7 @@ class NoiseFloor(ReceiverEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        links, found = view.links, {}
+        links, found, own = view.links, {}, {}
         seen = np.isfinite(links.level_db)
         for receiver in frequent_labels(links.receiver[seen], MIN_LINKS):
             rows = seen & (links.receiver == receiver)
@@ -52,12 +54,27 @@ class NoiseFloor(ReceiverEffect):
             found[receiver] = max(
                 (-float(weight @ (residual_db + mean_db - floored(mean_db, floor_db)[0]) ** 2),
                  float(floor_db)) for floor_db in np.quantile(links.level_db[rows], QUANTILES))[1]
+            every = np.flatnonzero(links.receiver == receiver)
+            nats, floor_db = max(
+                (self._gain_nats(view, every, floor_db), float(floor_db))
+                for floor_db in np.quantile(links.level_db[rows], QUANTILES))
+            if nats > MIN_NATS:
+                own[receiver] = floor_db
         if not found:
             return []
         # A law that was fitted without a floor is too flat and hides it, so usual ones are tried.
         tried = [{receiver: float(np.nanquantile(links.level_db[links.receiver == receiver], share))
                   for receiver in found} for share in COMMON_QUANTILES]
-        return [self.Params(receivers=floors_db) for floors_db in (found, *tried)]
+        # Where links are blank below a limit, a floor above it is wrong for most receivers: then
+        # one may have a floor alone.
+        alone = [own] if own and own.keys() != found.keys() else []
+        return [self.Params(receivers=floors_db) for floors_db in (*alone, found, *tried)]
+
+    @staticmethod
+    def _gain_nats(view: ResidualView, rows: np.ndarray, floor_db: float) -> float:
+        """Return how much likelier links (r,), blanks as well, become by a floor [nats]."""
+        change_db = floored(view.mean_db[rows], floor_db)[0] - view.mean_db[rows]
+        return float(view.gain_nats(rows, change_db).sum())
 
     @override
     def inputs(self, links: LinkData, params: Params) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 from scipy.special import log_ndtr
 
-from radiotwin.inference.gaussian import HALF_LOG_2PI, gaussian_nll
+from radiotwin.inference.gaussian import HALF_LOG_2PI, Limit, gaussian_nll, limits_of
 
 MIN_SD_DB, MAX_SD_DB = 0.1, 100.0  # of a fitted standard deviation: far outside what is measured
 # Mean and sd of a normal prior: it decides only where the distances hardly differ.
@@ -35,7 +35,7 @@ class LogDistanceLine:
 
 
 def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
-             limit_db: float | None) -> LogDistanceLine:
+             limit_db: Limit) -> LogDistanceLine:
     """Return the line of highest likelihood, with a weak prior on the exponent.
 
     The Tobit likelihood has one maximum only (Olsen 1978, 'Note on the uniqueness of the maximum
@@ -45,7 +45,7 @@ def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
     Args:
         log_distance: (n,) log10(d / 1 m).
         level_db: (n,) [dB], at least two of them detected; NaN: below the limit.
-        limit_db: limit of detection [dB]; None only where all were detected.
+        limit_db: limit of detection [dB]; unknown only for levels that were detected.
 
     Returns:
         line
@@ -55,7 +55,8 @@ def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
     # Centred and scaled: L-BFGS wants parameters of about one size.
     x_mid, x_scale, y_mid = x.mean(), max(float(x.std()), 1e-3), y.mean()
     u, v = (x - x_mid) / x_scale, y - y_mid
-    u_below, limit = (log_distance[~detected] - x_mid) / x_scale, (limit_db or 0.0) - y_mid
+    u_below = (log_distance[~detected] - x_mid) / x_scale
+    limit = limits_of(limit_db, len(level_db))[~detected] - y_mid
     prior_slope, prior_sd = (10.0 * x_scale * value for value in EXPONENT_PRIOR)
 
     def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
@@ -85,7 +86,7 @@ def fit_line(log_distance: np.ndarray, level_db: np.ndarray,
 
 
 def shift_line(line: LogDistanceLine, log_distance: np.ndarray, level_db: np.ndarray,
-               limit_db: float | None, prior_db: float, prior_sd_db: float) -> LogDistanceLine:
+               limit_db: Limit, prior_db: float, prior_sd_db: float) -> LogDistanceLine:
     """Return the line, moved up or down to few or no levels: a maximum a posteriori shift.
 
     Args:
@@ -111,7 +112,7 @@ def shift_line(line: LogDistanceLine, log_distance: np.ndarray, level_db: np.nda
     return LogDistanceLine(line.intercept_db + float(shift_db), line.exponent, line.sd_db)
 
 
-def fit_sd_db(level_db: np.ndarray, mean_db: np.ndarray, limit_db: float | None) -> float:
+def fit_sd_db(level_db: np.ndarray, mean_db: np.ndarray, limit_db: Limit) -> float:
     """Return the standard deviation of highest likelihood around given means.
 
     Args:

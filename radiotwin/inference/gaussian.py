@@ -12,9 +12,17 @@ if TYPE_CHECKING:
 
 HALF_LOG_2PI = 0.5 * np.log(2.0 * np.pi)
 
+Limit = float | np.ndarray | None
+"""Level below which nothing is detected [dB], for all links or each (n,); None or -inf: unknown."""
+
+
+def limits_of(limit_db: Limit, n: int) -> np.ndarray:
+    """Return the limit of each of n links [dB]; -inf where it is unknown."""
+    return np.broadcast_to(np.asarray(-np.inf if limit_db is None else limit_db, float), n)
+
 
 def gaussian_nll(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
-                 limit_db: float | None) -> np.ndarray:
+                 limit_db: Limit) -> np.ndarray:
     """Return the negative log-likelihood of each level [nats].
 
     The arguments broadcast against each other. A level that was not detected counts as
@@ -25,7 +33,8 @@ def gaussian_nll(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
         level_db: measured [dB]; NaN: not detected.
         mean_db: expected [dB].
         sd_db: standard deviation [dB].
-        limit_db: limit of detection [dB]; None: what was not detected counts 0.
+        limit_db: limit of detection [dB]; None: what was not detected counts 0, as it does where
+            the limit is -inf.
 
     Returns:
         [nats], of the broadcast shape.
@@ -34,11 +43,14 @@ def gaussian_nll(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
     seen = 0.5 * ((level_db - mean_db) / sd_db) ** 2 + np.log(sd_db) + HALF_LOG_2PI
     if not missing.any():
         return seen
-    below = 0.0 if limit_db is None else -log_ndtr((limit_db - mean_db) / sd_db)
+    if limit_db is None:
+        return np.where(missing, 0.0, seen)
+    below = np.where(np.isneginf(limit_db), 0.0, -log_ndtr((limit_db - mean_db) / sd_db))
     return np.where(missing, below, seen)
 
 
-def mean_if_detected(mean_db: np.ndarray, sd_db: np.ndarray, limit_db: float) -> np.ndarray:
+def mean_if_detected(mean_db: np.ndarray, sd_db: np.ndarray,
+                     limit_db: np.ndarray | float) -> np.ndarray:
     """Return the mean of a level given that it lies above the limit.
 
     Compare measured levels with this: near the limit only the strong ones were detected, whose mean
@@ -58,7 +70,7 @@ def mean_if_detected(mean_db: np.ndarray, sd_db: np.ndarray, limit_db: float) ->
 
 
 def standardised(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
-                 limit_db: float | None) -> np.ndarray:
+                 limit_db: Limit) -> np.ndarray:
     """Return the standardised residual (level - mean) / sd of each link.
 
     A link that was not detected gets its conditional mean below the limit, -phi(a) / Phi(a),
@@ -68,7 +80,7 @@ def standardised(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
         level_db: (n,) measured [dB]; NaN: not detected.
         mean_db: (n,) expected [dB].
         sd_db: (n,) standard deviation [dB].
-        limit_db: limit of detection [dB]; None only where all were detected.
+        limit_db: limit of detection [dB]; unknown only for links that were detected.
 
     Returns:
         (n,) residual in standard deviations.
@@ -76,7 +88,8 @@ def standardised(level_db: np.ndarray, mean_db: np.ndarray, sd_db: np.ndarray,
     residual = (level_db - mean_db) / sd_db
     missing = np.isnan(residual)
     if missing.any():
-        below = (limit_db - mean_db[missing]) / sd_db[missing]
+        limits_db = limits_of(limit_db, len(level_db))
+        below = (limits_db[missing] - mean_db[missing]) / sd_db[missing]
         residual[missing] = -np.exp(-0.5 * below**2 - HALF_LOG_2PI - log_ndtr(below))
     return residual
 

@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.constants import speed_of_light
 
 from radiotwin.links.geometry import REFERENCE_DISTANCE_M, LinkGeometry
@@ -22,8 +23,8 @@ ROOF_CHUNK = 5000  # links a time: bounds the memory of that to 10 MB
 Tracks = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
 """(receiver, flight) -> times (t,) in order [s] and positions (t, 3) then [m]."""
 
-_OF_EACH_LINK = ("level_db", "receiver_m", "device", "receiver", "flight", "time_s", "heading_deg",
-                 "pitch_deg", "roll_deg", "quality", "known_los", "time_in_flight_s")
+_OF_EACH_LINK = ("level_db", "limit_db", "receiver_m", "device", "receiver", "flight", "time_s",
+                 "heading_deg", "pitch_deg", "roll_deg", "quality", "known_los", "time_in_flight_s")
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +33,8 @@ class LinkData:
 
     Attributes:
         level_db: (n,) measured gain [dB] or power [dBm]; NaN = not detected.
-        limit_db: level below which receivers do not detect [dB]; None where it is unknown.
+        limit_db: (n,) level below which the link's receiver does not detect [dB]; -inf where it is
+            unknown, and a blank says nothing of the level.
         receiver_m: (n, 3) positions of the receivers [m].
         device_m: (k, 3) positions of the devices as far as they are known [m]; NaN where not.
         device, receiver, flight: (n,) index into the names.
@@ -54,7 +56,7 @@ class LinkData:
     """
 
     level_db: np.ndarray
-    limit_db: float | None
+    limit_db: np.ndarray
     receiver_m: np.ndarray
     device_m: np.ndarray
     device: np.ndarray
@@ -111,7 +113,8 @@ class LinkData:
         """
         n = len(receiver_m)
         unset, unknown = np.full(n, -1), np.full(n, np.nan)
-        return cls(unknown, limit_db, receiver_m, device_m, device, unset, unset, unknown, unknown,
+        limits_db = np.full(n, -np.inf if limit_db is None else limit_db)
+        return cls(unknown, limits_db, receiver_m, device_m, device, unset, unset, unknown, unknown,
                    list(device_names), [], [], frequency_hz, city, is_gain, anchors)
 
     @cached_property
@@ -120,6 +123,18 @@ class LinkData:
         estimated = ~np.isin(self.device, sorted(self.anchors))
         return LinkGeometry(self.device_m[self.device], self.receiver_m, self.los, self.device,
                             self.city, self.frequency_hz, estimated)
+
+    @cached_property
+    def receiver_limits_db(self) -> np.ndarray:
+        """(r,) limit of detection of each receiver [dB], the median over its links; else -inf."""
+        limits_db = pd.Series(self.limit_db).groupby(self.receiver).median()
+        return limits_db.reindex(range(len(self.receiver_names)), fill_value=-np.inf).to_numpy()
+
+    @property
+    def usual_limit_db(self) -> float | None:
+        """The limit of detection of most receivers [dB]: the median; None where none is known."""
+        known_db = np.sort(self.receiver_limits_db[np.isfinite(self.receiver_limits_db)])
+        return float(known_db[(len(known_db) - 1) // 2]) if len(known_db) else None
 
     @cached_property
     def track(self) -> np.ndarray:

@@ -1,5 +1,7 @@
 """Measurements joined with devices, 3D map and radio: checked, and without what cannot be used."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 
@@ -13,6 +15,7 @@ from radiotwin.links.checks import (
     unheard_devices,
     useless_receivers,
 )
+from radiotwin.links.limits import estimate_limits
 from radiotwin.links.link_data import LinkData
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
@@ -22,7 +25,9 @@ ASSUMED_HEIGHT_M = 1.5  # of an end whose height is blank: a hand-held phone's
 
 
 def join_links(measurements: Measurements, scene: Scene) -> LinkData:
-    """Join all measurements with a scene as they are: nothing is checked, nothing left out.
+    """Join all measurements with a scene as they are: nothing is left out.
+
+    Only the limit of detection that the scene declares is compared with the readings.
 
     Args:
         measurements: n links.
@@ -129,20 +134,18 @@ def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | N
                      "is in degrees, clockwise from north")
     is_gain = measurements.level_column == "gain_db"
     anchors = frozenset(np.flatnonzero(measurements.is_anchor[kept_devices]).tolist())
-    return LinkData(
-        level_db, _limit_db(level_db, scene, is_gain), receiver_m, device_m, device, receiver,
+    links = LinkData(
+        level_db, np.full(len(level_db), -np.inf), receiver_m, device_m, device, receiver,
         flight, _column(table, "time_s"), heading_deg % 360,
         list(measurements.devices["device"].iloc[kept_devices]), list(receiver_names),
         list(flight_names), _frequency_hz(measurements, scene), scene.city if scene else None,
         is_gain, anchors, notes, _column(table, "pitch_deg"), _column(table, "roll_deg"),
         _column(table, "quality"))
-
-
-def _limit_db(level_db: np.ndarray, scene: Scene | None, is_gain: bool) -> float | None:
+    declared_db = None
     if scene is not None:
-        return scene.config.gain_limit_db if is_gain else scene.config.radio.sensitivity_dbm
-    # Without a scene nobody declares it; nothing detected lies below the lowest that was.
-    return float(np.nanmin(level_db)) if np.isnan(level_db).any() else None
+        declared_db = scene.config.gain_limit_db if is_gain else scene.config.radio.sensitivity_dbm
+    limit_db, more = estimate_limits(links, declared_db)
+    return replace(links, limit_db=limit_db, notes=[*notes, *more])
 
 
 def _frequency_hz(measurements: Measurements, scene: Scene | None) -> float:

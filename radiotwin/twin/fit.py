@@ -60,17 +60,23 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
             raise BadInput(f"model {model} follows paths outside buildings only; take another "
                            "model where unknown devices may be indoors")
         links = prepare_links(measurements, scene)
-        for note in links.notes:
-            warnings.warn(note, stacklevel=2)
+        _warn(links.notes)
         fit = fit_along_paths if channel is ImagePaths else fit_over_wrong_map
         twin = fit(links, scene, seed, start)
         twin.provenance.update(flights=flights, seed=seed)
         return twin
     _check_heights(measurements)
     settings = LocalizeSettings(allow_indoor=allow_indoor)
-    twin = fit_links(join_links(measurements, scene), scene, channel, seed, start, settings)
+    links = join_links(measurements, scene)
+    _warn(links.notes)
+    twin = fit_links(links, scene, channel, seed, start, settings)
     twin.provenance.update(flights=flights, seed=seed)
     return twin
+
+
+def _warn(notes: list[str]) -> None:
+    for note in notes:
+        warnings.warn(note, stacklevel=3)
 
 
 def _thinned(measurements: Measurements, seed: int) -> Measurements:

@@ -26,8 +26,6 @@ from radiotwin.pieces import kept
 from radiotwin.scene import Scene
 from radiotwin.twin.twin import Twin
 
-MAX_BLANK, LIMIT_GAP_DB = 0.02, 10.0  # beyond both, blanks and the limit of detection disagree
-
 
 def fit_links(links: LinkData, scene: Scene, channel: type[ChannelModel], seed: int,
               start: Twin | None = None, settings: LocalizeSettings | None = None) -> Twin:
@@ -45,7 +43,6 @@ def fit_links(links: LinkData, scene: Scene, channel: type[ChannelModel], seed: 
         BadInput: as of `fit_twin`.
     """
     _check_positions(links, scene)
-    _check_limit(links)
     is_anchor = np.isin(np.arange(len(links.device_m)), sorted(links.anchors))
     anchors_m = np.where(is_anchor[:, None], links.device_m, np.nan)
     if issubclass(channel, PublishedLaw):
@@ -65,7 +62,7 @@ def fit_links(links: LinkData, scene: Scene, channel: type[ChannelModel], seed: 
     if isinstance(fitted, PublishedLaw):
         for note in fitted.outside(_known_links(links, reliable_m(devices))[0]):
             warnings.warn(note, stacklevel=3)
-    return Twin(fitted, devices, level_of(links), links.limit_db, provenance(links, scene))
+    return Twin(fitted, devices, level_of(links), links.usual_limit_db, provenance(links, scene))
 
 
 def fit_known(links: LinkData, channel: type[ChannelModel], seed: int) -> Twin:
@@ -80,7 +77,7 @@ def fit_known(links: LinkData, channel: type[ChannelModel], seed: int) -> Twin:
     fitted = fit_once(channel, geometry, links.level_db, links.limit_db, seed)
     devices = [TwinDevice.anchor(name, *position_m)
                for name, position_m in zip(links.device_names, links.device_m, strict=True)]
-    return Twin(fitted, devices, level_of(links), links.limit_db, provenance(links, None))
+    return Twin(fitted, devices, level_of(links), links.usual_limit_db, provenance(links, None))
 
 
 def reliable_m(devices: list[TwinDevice], max_radius_m: float = np.inf) -> np.ndarray:
@@ -104,19 +101,21 @@ def _fit_channel(links: LinkData, device_m: np.ndarray, channel: type[ChannelMod
                        "from devices whose positions are known; give at least one device x_m, y_m "
                        "and the role anchor in devices.csv, or take a published law, such as "
                        "tr36777_uma, which is not learned")
-    geometry, level_db = _known_links(links, device_m)
+    geometry, level_db, limit_db = _known_links(links, device_m)
     if not len(geometry):
         raise BadInput("no link to an anchor: none of the devices with role anchor was measured; "
                        "fly nearer to them")
     check_fit_data(geometry, level_db, needs_los=channel.uses_map)
-    return fit_once(channel, geometry, level_db, links.limit_db, seed)
+    return fit_once(channel, geometry, level_db, limit_db, seed)
 
 
-def _known_links(links: LinkData, device_m: np.ndarray) -> tuple[LinkGeometry, np.ndarray]:
-    """Return the m links of devices with a position in `device_m` (k, 3), and their levels."""
+def _known_links(links: LinkData, device_m: np.ndarray
+                 ) -> tuple[LinkGeometry, np.ndarray, np.ndarray]:
+    """Return the m links of devices with a position in `device_m` (k, 3), levels and limits."""
     known = np.isfinite(device_m[:, :2]).all(axis=1)[links.device]
     geometry = link_geometry(device_m, links.receiver_m[known], links.device[known], links.city)
-    return replace(geometry, frequency_hz=links.frequency_hz), links.level_db[known]
+    return replace(geometry, frequency_hz=links.frequency_hz), links.level_db[known], \
+        links.limit_db[known]
 
 
 def _published(links: LinkData, device_m: np.ndarray, scene: Scene,
@@ -125,8 +124,8 @@ def _published(links: LinkData, device_m: np.ndarray, scene: Scene,
 
     That is the median over detected links of anchors of what it must be, or the declared one.
     """
-    geometry, level_db = _known_links(links, device_m)
-    fitted = law().fit(geometry, level_db, links.limit_db)
+    geometry, level_db, limit_db = _known_links(links, device_m)
+    fitted = law().fit(geometry, level_db, limit_db)
     if links.is_gain:
         return fitted
     surplus_db = level_db - fitted.predict(geometry)[0]
@@ -145,11 +144,15 @@ def _locate(links: LinkData, scene: Scene, channel: ChannelModel, unknown: np.nd
     if start is not None:
         before = {device.device: (device.x_m, device.y_m) for device in start.devices}
         start_m = np.array([before.get(links.device_names[i], (np.nan, np.nan)) for i in unknown])
-    rows = np.isin(links.device, unknown)
+    # A position may be heard by several receivers: below the highest of their limits is all that
+    # blanks of each surely are.
+    known = np.isfinite(links.limit_db)
+    limit_db = float(links.limit_db[known].max()) if known.any() else None
+    rows = np.isin(links.device, unknown) & (known | np.isfinite(links.level_db))
     measured = links.receiver_m[rows], links.device[rows], links.level_db[rows], channel
     options: dict[str, Any] = {
         "devices": unknown, "bounds": scene.config.extent.bounds, "city": scene.city,
-        "z_m": links.device_m[unknown, 2], "limit_db": links.limit_db, "seed": seed,
+        "z_m": links.device_m[unknown, 2], "limit_db": limit_db, "seed": seed,
         "start_m": start_m, "settings": settings}
     names = [links.device_names[index] for index in unknown]
     return kept("positions", (*measured, options, names),
@@ -185,18 +188,6 @@ def _check_positions(links: LinkData, scene: Scene) -> None:
         if odd.any():
             warnings.warn(f"{odd.sum()} of {len(odd)} receiver positions lie {where}: do "
                           "measurements and scene share one frame and unit?", stacklevel=4)
-
-
-def _check_limit(links: LinkData) -> None:
-    """Warn where blanks should lie below a limit that no measured level comes near."""
-    level_db, limit_db = links.level_db, links.limit_db
-    blank = np.isnan(level_db)
-    if limit_db is not None and blank.mean() > MAX_BLANK and not blank.all() \
-            and np.nanmin(level_db) > limit_db + LIMIT_GAP_DB:
-        warnings.warn(f"{blank.sum()} levels are blank and taken for levels below the scene's "
-                      f"limit of detection, {limit_db:.0f} dB, but the weakest measured one is "
-                      f"{np.nanmin(level_db):.0f} dB: check sensitivity_dbm and tx_power_dbm in "
-                      "scene.toml", stacklevel=4)
 
 
 def level_of(links: LinkData) -> str:

@@ -80,7 +80,7 @@ def fit_paths(links: LinkData, scene: Scene, law: Twin, relocation: Relocation) 
     channel = _image_paths(links, law, law.device_m)
     devices = relocation.relocate(links, law.devices, channel)
     channel = _image_paths(links, law, reliable_m(devices, LOST_M))
-    return Twin(channel, devices, law.level, links.limit_db, provenance(links, scene))
+    return Twin(channel, devices, law.level, links.usual_limit_db, provenance(links, scene))
 
 
 def relocation_from(scene: Scene, max_radius_m: float, start: Twin | None = None) -> Relocation:
@@ -115,4 +115,4 @@ def _image_paths(links: LinkData, law: Twin, device_m: np.ndarray) -> ImagePaths
     """Return the channel, its diffuse power fitted to links of devices that have a position."""
     channel = ImagePaths(law.channel)
     located = links.located(device_m)
-    return channel.fit_diffuse(located.geometry, located.level_db, links.limit_db)
+    return channel.fit_diffuse(located.geometry, located.level_db, located.limit_db)

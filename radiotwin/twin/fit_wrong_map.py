@@ -64,7 +64,7 @@ def fit_over_wrong_map(links: LinkData, scene: Scene, seed: int, start: Twin | N
                    for each, more in zip(devices, more_m, strict=True)]
     devices = [_moved_device(each, shift_m) for each in _calibrated(devices, on_map)]
     channel = _channel(links, devices, found, seed)
-    return Twin(channel, devices, by_paths.level, links.limit_db, provenance(links, scene))
+    return Twin(channel, devices, by_paths.level, links.usual_limit_db, provenance(links, scene))
 
 
 def _shift(links: LinkData, seed: int) -> Shift:
@@ -72,8 +72,8 @@ def _shift(links: LinkData, seed: int) -> Shift:
     known = links.located(links.device_m)
     if not len(known):
         return NO_SHIFT
-    geometry, level_db = drop_uninformative(known.geometry, known.level_db, links.limit_db)
-    return estimate_shift(geometry, level_db, links.limit_db, seed)
+    informative = drop_uninformative(known.geometry, known.level_db, known.limit_db)
+    return estimate_shift(*informative, seed)
 
 
 def _moved(links: LinkData, shift_m: Shift) -> LinkData:
@@ -122,8 +122,8 @@ def _calibrated(devices: list[TwinDevice], links: LinkData) -> list[TwinDevice]:
 def _found(links: LinkData, devices: list[TwinDevice], shift_m: Shift, seed: int) -> Found:
     """Return the errors of a map that is not shifted any more, from devices that are not lost."""
     known = links.located(reliable_m(devices, LOST_M))
-    geometry, level_db = drop_uninformative(known.geometry, known.level_db, links.limit_db)
-    error, diffuse = estimate_other_errors(geometry, level_db, links.limit_db, seed)
+    informative = drop_uninformative(known.geometry, known.level_db, known.limit_db)
+    error, diffuse = estimate_other_errors(*informative, seed)
     return replace(error, shift_m=shift_m), diffuse
 
 
@@ -131,7 +131,7 @@ def _channel(links: LinkData, devices: list[TwinDevice], found: Found, seed: int
     """Fit the channel to all devices that are located; kriging alone to those that are lost."""
     lost = tuple(np.flatnonzero(~np.isfinite(reliable_m(devices, LOST_M)).all(axis=1)).tolist())
     known = links.located(reliable_m(devices))
-    data = known.geometry, known.level_db, links.limit_db, seed
+    data = known.geometry, known.level_db, known.limit_db, seed
     inputs = PathKriging, *data, str(found[0].state()), found[1], lost
     return kept("channel", inputs, lambda: PathKriging(found, lost).fit(*data), PathKriging.state,
                 PathKriging.from_state)

@@ -76,7 +76,8 @@ def locate_file(measurements: Measurements, twin: Twin, scene: Scene | None,
     links = links.renumber_receivers([*model.receivers, *strangers])
     links = replace(links, device_m=np.nan_to_num(links.device_m), known_los=None,
                     # A few links do not tell how weak a level can be detected.
-                    limit_db=links.limit_db if twin.limit_db is None else twin.limit_db)
+                    limit_db=links.limit_db if twin.limit_db is None else
+                    np.full(len(links), twin.limit_db))
     area_m = scene.config.extent.bounds if scene is not None else whole_area(model, links)
     found = list(locate(model, links, area_m, on_progress))
     table = pd.DataFrame({"device": [links.device_names[each.device] for each in found],

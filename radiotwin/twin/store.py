@@ -186,7 +186,8 @@ def _check_terms(effects: list[FittedEffect], devices: list[str], receivers: lis
     n = max(len(devices), len(receivers), 2)
     row, nothing = np.arange(n), np.zeros(n)
     links = LinkData(
-        np.full(n, -80.0), None, np.column_stack([100.0 + row, nothing, np.full(n, 30.0)]),
+        np.full(n, -80.0), np.full(n, -np.inf),
+        np.column_stack([100.0 + row, nothing, np.full(n, 30.0)]),
         np.zeros((len(devices), 3)), row % len(devices), row % max(len(receivers), 1),
         row % 2, row.astype(float), nothing, devices, receivers or ["any"], ["f0", "f1"], 2.4e9,
         None, True, frozenset(range(len(devices))))

@@ -38,7 +38,8 @@ class Twin:
         channel: fitted.
         devices: in the order of the measurements' `devices.csv`.
         level: `gain_db`, or `rssi_dbm` where transmit power is unknown.
-        limit_db: level below which receivers do not detect [dB]; None where it was not known.
+        limit_db: level below which receivers do not detect [dB]: the median of theirs, see
+            `LinkData.usual_limit_db`; None where it was not known.
         provenance: measurements, scene, seed and version that made it.
         fitted: levels, effects and errors fitted upon the channel; None where `close-loop` did not
             look and the channel does not need levels.
@@ -118,8 +119,7 @@ class Twin:
         if self.fitted is not None:
             return self.fitted.predict(links)
         mean_db, sd_db = self.channel.predict(links.geometry)
-        limit_db = -np.inf if links.limit_db is None else links.limit_db
-        return Prediction(mean_db, sd_db, detection_probability(mean_db, sd_db, limit_db))
+        return Prediction(mean_db, sd_db, detection_probability(mean_db, sd_db, links.limit_db))
 
     def radio_map(self, scene: Scene) -> RadioMap:
         """Return mean and standard deviation of the level over a scene's lattice.

@@ -23,7 +23,8 @@ def make_links():
                   "time_s": np.full(count, np.nan), "heading_deg": np.full(count, np.nan), "limit_db": None} | given
         names = [[f"{letter}{i}" for i in range(total)] for letter, total in
                  (("d", each), ("r", values["receiver"].max() + 1), ("f", values["flight"].max() + 1))]
-        return LinkData(values["level_db"], values["limit_db"], np.repeat(receiver_m, each, axis=0), device_m,
+        limit_db = -np.inf if values["limit_db"] is None else values["limit_db"]
+        return LinkData(values["level_db"], np.full(count, float(limit_db)), np.repeat(receiver_m, each, axis=0), device_m,
                         np.tile(np.arange(each), len(receiver_m)), values["receiver"], values["flight"],
                         values["time_s"], values["heading_deg"], *names, values.get("frequency_hz", 2.4e9),
                         values.get("city"), True, frozenset(range(each)))
@@ -34,8 +35,8 @@ def make_links():
 def view():
     """Make the view of links whose predicted levels (n,) and whose scale of the errors [dB] are known."""
     def make(links, mean_db, scale_db, level_at=None):
-        limit_db = np.inf if links.limit_db is None else links.limit_db
-        residual_db = np.where(np.isnan(links.level_db), np.minimum(limit_db - mean_db, 0.0),
+        excess_db = np.where(np.isfinite(links.limit_db), links.limit_db - mean_db, 0.0)
+        residual_db = np.where(np.isnan(links.level_db), np.minimum(excess_db, 0.0),
                                links.level_db - mean_db)
         return ResidualView(links, residual_db, np.full(len(links), float(scale_db)), mean_db, level_at)
     return make

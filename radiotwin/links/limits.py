@@ -1,0 +1,300 @@
+"""The limit of detection of each receiver, from its readings: a declared one is only a claim.
+
+A receiver reports a level y with the probability Φ((y - limit) / width), and a link is blank too
+where it was lost whatever its level. The likelihood of a limit is that of the readings, few of
+which lie below it, and of the blanks, which a crude prediction of their levels puts below it (Tobin
+1958; the p-tobit of Deaton and Irish 1984). Width and share of lost links are averaged over.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import logsumexp, ndtr, stdtr
+
+from radiotwin.links.crude_level import crude_level
+from radiotwin.links.evidence import design_effect, evidence_blocks
+from radiotwin.links.link_data import LinkData
+
+MIN_READINGS, MIN_BLANKS = 30, 10  # of a receiver, to have a limit estimated
+BIN_DB, FINE_DB = 0.5, 0.05  # of predicted levels, and of readings, that count as equal: saves time
+WIDTHS_DB = (0.2, 0.7, 1.5, 3.0)  # of the way from never to always detected, averaged over
+WIDTH_SHARES = (0.4, 0.3, 0.2, 0.1)  # their prior: most receivers are not that undecided
+LOST_SHARES = (1e-3, 0.01, 0.03, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 0.9, 1.0)  # of the blanks
+ODD = 1e-3  # probability of a reading that should not be there
+ODD_SHARE = 2e-3  # of the readings: the lowest ones, which need not be right
+STEP_DB, MAX_STEPS = 0.25, 160  # of the limits that are tried
+BELOW_DB, HIGHEST = 8.0, 0.3  # they begin below the lowest reading, and end at that quantile
+DOF = 4.0  # of the errors of the crude prediction: heavy tails
+SD_SHARE = np.sqrt((DOF - 2) / DOF)  # of the scale of a t distribution in its standard deviation
+MIN_NATS = 5.0  # that speak for a limit, or against a declared one: 150 to 1
+RISE_DB, FALL_DB = 2.0, 1.0  # above and below a declared limit: as good as there
+SURE_SDS = 3.0  # beyond that
+ROUNDS = 2  # of levels and limits in turn
+QUANTILE_90 = 1.645  # of the normal distribution
+MIN_BELOW, BELOW_SHARE = 3, 0.002  # readings below a declared limit that contradict it
+DIFFER_DB = 3.0  # between receivers, from which on it is told
+DEAF_DB, DEAF_SDS = 6.0, 4.5  # above the usual limit: a receiver that stands out
+MAX_NAMED = 5
+
+
+@dataclass(frozen=True)
+class LimitEstimate:
+    """Limit of detection of one receiver.
+
+    Attributes:
+        limit_db: mean of its posterior under a flat prior [dB].
+        sd_db: standard deviation of that [dB].
+        nats: log of the odds that there is one, against links lost whatever their level.
+        over_declared_nats: by which it is likelier than the declared one; 0 without one.
+    """
+
+    limit_db: float
+    sd_db: float
+    nats: float
+    over_declared_nats: float = 0.0
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether a limit explains the blanks, and not only lost links."""
+        return self.nats > MIN_NATS
+
+
+def receiver_limit(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarray, as_one: float,
+                   declared_db: float = -np.inf) -> LimitEstimate | None:
+    """Estimate the limit of detection of one receiver.
+
+    Args:
+        level_db: (n,) readings [dB]; NaN: not detected.
+        mean_db: (n,) predicted levels [dB].
+        scale_db: (n,) scale of their errors, Student-t with `DOF` degrees of freedom [dB].
+        as_one: number of links that count as one, as of `design_effect`.
+        declared_db: to be compared with [dB]; -inf: none.
+
+    Returns:
+        the estimate; None where there are too few readings or blanks.
+    """
+    blank = np.isnan(level_db)
+    read_db = np.sort(level_db[~blank])
+    if len(read_db) < MIN_READINGS or blank.sum() < MIN_BLANKS:
+        return None
+    low_db = read_db[int(ODD_SHARE * len(read_db))]
+    high_db = max(np.quantile(read_db, HIGHEST), low_db + BELOW_DB)
+    count = min(int((high_db - low_db + BELOW_DB) / STEP_DB) + 2, MAX_STEPS)
+    tried_db = np.append(np.linspace(low_db - BELOW_DB, high_db, count),
+                         declared_db if np.isfinite(declared_db) else low_db)
+    nats, none = _nats(tried_db, read_db, mean_db[blank], scale_db[blank], as_one)
+    nats, declared = nats[:-1], nats[-1]
+    weight = np.exp(nats - nats.max())
+    weight /= weight.sum()
+    limit_db = float(weight @ tried_db[:-1])
+    variance = float(weight @ (tried_db[:-1] - limit_db) ** 2) + (tried_db[1] - tried_db[0])**2 / 12
+    lead = float(nats.max() - declared) if np.isfinite(declared_db) else 0.0
+    return LimitEstimate(limit_db, float(np.sqrt(variance)),
+                         float(logsumexp(nats) - np.log(len(nats)) - none), lead)
+
+
+def _nats(tried_db: np.ndarray, read_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarray,
+          as_one: float) -> tuple[np.ndarray, float]:
+    """Return the log-likelihood of limits (k,), and that of none at all [nats].
+
+    Args:
+        tried_db: (k,) [dB].
+        read_db: readings in order [dB].
+        mean_db: (m,) predicted levels of the blanks [dB].
+        scale_db: (m,) scale of the errors of these [dB].
+        as_one: number of links that count as one.
+    """
+    readings, blanks = len(read_db), len(mean_db)
+    mean_db = np.round(mean_db / BIN_DB) * BIN_DB
+    alike, times = np.unique(mean_db + 1j * scale_db, return_counts=True)
+    below = stdtr(DOF, (tried_db[:, None] - alike.real) / alike.imag)
+    share = blanks / (readings + blanks)
+    lost = np.array(LOST_SHARES) * share
+    of_blanks = np.array([np.log(p + (1 - p) * below) @ times for p in lost])
+    of_blanks += readings * np.log1p(-lost)[:, None]
+    near, times = np.unique(np.round(read_db[read_db < tried_db.max() + 4 * max(WIDTHS_DB)]
+                                     / FINE_DB) * FINE_DB, return_counts=True)
+    of_readings = np.array([
+        np.log(ODD + (1 - ODD) * ndtr((near - tried_db[:, None]) / width)) @ times
+        for width in WIDTHS_DB])
+    both = (of_readings[:, None] + of_blanks) / as_one
+    prior = np.array(WIDTH_SHARES)[:, None, None] / len(lost)
+    nats = logsumexp(both, axis=(0, 1), b=prior)
+    return nats, (blanks * np.log(share) + readings * np.log1p(-share)) / as_one
+
+
+def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndarray, list[str]]:
+    """Estimate the limit of detection of each receiver, and judge a declared one.
+
+    Args:
+        links: n links; their own limits are not looked at.
+        declared_db: as a scene declares it [dB]; None: nobody does.
+
+    Returns:
+        (n,) below which a link is blank [dB]; -inf where the readings do not tell, and none is
+        declared that they allow. And notes on what is odd, a sentence each.
+    """
+    declared = -np.inf if declared_db is None else declared_db
+    count = np.bincount(links.receiver, minlength=len(links.receiver_names))
+    rows = np.split(np.argsort(links.receiver, kind="stable"), np.cumsum(count)[:-1])
+    found, together = _estimates(links, rows, declared)
+    usual_db = _usual_db(links, rows, found, together, declared)
+    own_db, lost = np.full(len(rows), -np.inf), []
+    for receiver, mine in enumerate(rows):
+        each, level_db = found[receiver], links.level_db[mine]
+        read_db = np.sort(level_db[np.isfinite(level_db)])
+        trusted = np.isfinite(declared) and not _below(read_db, declared)
+        if each is not None and each.is_sure:
+            trusted = trusted and not _overrules(each, read_db, declared)
+            own_db[receiver] = declared if trusted else each.limit_db
+        elif len(read_db) == len(level_db):
+            own_db[receiver] = declared if trusted and usual_db == declared else -np.inf
+        elif usual_db is not None and not _below(read_db, usual_db - RISE_DB):
+            own_db[receiver] = usual_db  # its own blanks do not tell
+        else:
+            lost.append(receiver)
+    return own_db[links.receiver], _notes(links, rows, own_db, found, declared, lost)
+
+
+def _usual_db(links: LinkData, rows: list[np.ndarray], found: list[LimitEstimate | None],
+              together: LimitEstimate | None, declared_db: float) -> float | None:
+    """Return the limit of receivers whose own links do not tell [dB]; None: nothing is known.
+
+    The declared one, unless most other receivers overrule it, or all links together. Where none is
+    declared, that of the others, or of all links together, or the lowest reading of few links.
+    """
+    sure = [(each, mine) for each, mine in zip(found, rows, strict=True) if each and each.is_sure]
+    if np.isfinite(declared_db):
+        asked = sure or ([(together, np.arange(len(links)))] if together else [])
+        against = sum(_overrules(each, np.sort(links.level_db[mine]), declared_db)
+                      for each, mine in asked)
+        if 2 * against <= len(asked):
+            return declared_db
+    if sure:
+        return lower_median([each.limit_db for each, _ in sure])
+    if together is None:
+        return float(np.nanmin(links.level_db))
+    return together.limit_db if together.is_sure else None
+
+
+def _below(read_db: np.ndarray, limit_db: float) -> bool:
+    """Return whether readings in order (n,) [dB] contradict a limit: not one or two odd ones."""
+    below = np.searchsorted(read_db, limit_db - FALL_DB)
+    return bool(below >= max(MIN_BELOW, BELOW_SHARE * len(read_db)))
+
+
+def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) -> bool:
+    """Return whether an estimate, from readings in order (n,), surely differs from the declared.
+
+    A receiver that reads levels down to the declared limit has that, however few they are.
+    """
+    rise_db = found.limit_db - declared_db
+    off_db = max(rise_db - RISE_DB, -rise_db - FALL_DB)
+    reaches = rise_db > 0 and _below(read_db, declared_db + RISE_DB + FALL_DB)
+    sure = off_db > SURE_SDS * found.sd_db and found.over_declared_nats > MIN_NATS
+    return found.is_sure and sure and not reaches
+
+
+def _estimates(links: LinkData, rows: list[np.ndarray], declared_db: float,
+               ) -> tuple[list[LimitEstimate | None], LimitEstimate | None]:
+    """Return the estimate of each receiver's links, and that of all links together."""
+    blank = np.isnan(links.level_db)
+    if not blank.any():
+        return [None] * len(rows), None
+    lowest_db = np.array([_lowest_db(links.level_db[mine]) for mine in rows])
+    own_db = np.where(np.isfinite(lowest_db), lowest_db, lowest_db.min())
+    block = evidence_blocks(links)
+    for _ in range(ROUNDS):
+        crude = crude_level(links.level_db, own_db[links.receiver], links.distance_m, links.device,
+                            links.receiver)
+        z = np.where(blank, 0.0, (links.level_db - crude.mean_db) / crude.sd_db)
+        as_one, scale_db = design_effect(block, z), np.full(len(links), SD_SHARE * crude.sd_db)
+        *found, together = [
+            receiver_limit(links.level_db[mine], crude.mean_db[mine], scale_db[mine], as_one,
+                           declared_db) for mine in (*rows, np.arange(len(links)))]
+        before_db, own_db = own_db, np.array([
+            each.limit_db if each is not None and each.is_sure else limit_db
+            for each, limit_db in zip(found, own_db, strict=True)])
+        if np.abs(own_db - before_db).max() < STEP_DB:
+            break
+    return found, together
+
+
+def _lowest_db(level_db: np.ndarray) -> float:
+    """Return the lowest of readings (n,) [dB] but for the share that may be odd; inf: none."""
+    read_db = np.sort(level_db[np.isfinite(level_db)])
+    return float(read_db[int(ODD_SHARE * len(read_db))]) if len(read_db) else np.inf
+
+
+def _notes(links: LinkData, rows: list[np.ndarray], own_db: np.ndarray,
+           found: list[LimitEstimate | None], declared_db: float, lost: list[int]) -> list[str]:
+    """Return what is odd about the limits of receivers (r,), a sentence each."""
+    unit, notes = "dB" if links.is_gain else "dBm", []
+    other = [r for r in range(len(rows)) if np.isfinite(declared_db) and own_db[r] != declared_db]
+    known_db = own_db[np.isfinite(own_db)]
+    if other:
+        level_db = links.level_db[np.concatenate([rows[r] for r in other])]
+        read_db = level_db[np.isfinite(level_db)]
+        below = int((read_db < declared_db).sum())
+        lie = "no reading lies near it"
+        if below:
+            lie = (f"{below:,} of {len(read_db):,} readings ({below / len(read_db):.1%}) lie below "
+                   f"it, down to {read_db.min():g}")
+        used = "; ".join(_used(links.receiver_names[r], own_db[r], found[r], unit)
+                         for r in other[:MAX_NAMED])
+        notes.append(f"the declared limit of detection, {declared_db:g} {unit}, is not that of the "
+                     f"readings: {lie}. Used instead: {used}{_more(other)}")
+    elif len(known_db) and np.ptp(known_db) > DIFFER_DB:
+        low, high = (links.receiver_names[int(np.flatnonzero(own_db == end)[0])]
+                     for end in (known_db.min(), known_db.max()))
+        notes.append(f"limits of detection differ between receivers: from {known_db.min():.1f} "
+                     f"{unit} ({low}) to {known_db.max():.1f} {unit} ({high}), by their readings")
+    if lost:
+        names = ", ".join(links.receiver_names[r] for r in lost[:MAX_NAMED])
+        notes.append(f"links of receiver {names}{_more(lost)} are blank at any level: they count "
+                     "as lost, not as weak")
+    return notes
+
+
+def _used(name: str, limit_db: float, found: LimitEstimate | None, unit: str) -> str:
+    if np.isinf(limit_db):
+        return f"none for {name}, as no blank shows one"
+    own = found is not None and limit_db == found.limit_db
+    how = f" ± {QUANTILE_90 * found.sd_db:.1f}" if found is not None and own else ""
+    return f"{limit_db:.1f}{how} {unit} for {name}"
+
+
+def _more(receivers: list[int]) -> str:
+    return f" and {len(receivers) - MAX_NAMED:,} more" if len(receivers) > MAX_NAMED else ""
+
+
+def lower_median(values: np.ndarray | list[float]) -> float:
+    """Return the median; of an even number the lower of both in the middle."""
+    return float(np.sort(values)[(len(values) - 1) // 2])
+
+
+def limits_to_explain(links: LinkData) -> LinkData:
+    """Return links with the limits of faultless receivers, so that effects must explain blanks.
+
+    A receiver that is clearly less sensitive than most has the usual limit, and one whose links are
+    blank at any level has at most the usual one, or the lowest reading of all.
+
+    Args:
+        links: n links with the limits of `estimate_limits`.
+    """
+    usual_db = links.usual_limit_db
+    known = np.isfinite(links.limit_db)
+    limit_db = links.limit_db.copy()
+    if usual_db is None:
+        blank = np.isnan(links.level_db)
+        if blank.any():
+            limit_db[:] = np.nanmin(links.level_db)
+        return replace(links, limit_db=limit_db)
+    own_db = links.receiver_limits_db
+    off_db = own_db - usual_db
+    finite = np.isfinite(own_db)
+    scatter_db = 1.48 * lower_median(np.abs(off_db[finite]))
+    deaf = off_db > max(DEAF_DB, DEAF_SDS * scatter_db)
+    shift_db = np.where(deaf, off_db, 0.0)[links.receiver]
+    limit_db = np.where(known, limit_db - shift_db, usual_db)
+    return replace(links, limit_db=limit_db)

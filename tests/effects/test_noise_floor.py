@@ -1,0 +1,71 @@
+"""The noise floor of one receiver, under a law of distance and under levels that are nearly known (paths)."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from radiotwin.channel.log_distance import LogDistance
+from radiotwin.closeloop.criteria import SelectionCriteria
+from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.closeloop.selection import fit_candidate, score_candidate
+from radiotwin.effects.fitting import add_effect
+from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.noise_floor import NoiseFloor
+from radiotwin.inference.censored_line import LogDistanceLine
+from radiotwin.links import evidence_blocks
+
+LIMIT_DB, FLOOR_DB, RAISED = -112.0, -97.0, 1
+RECEIVERS, LINKS = 3, 500
+
+
+class KnownLevels(LogDistance):
+    """Stands for paths over a map: levels are right but for one constant a class, and no slope is fitted again."""
+
+    def level_columns(self, links):
+        return np.column_stack([links.los, ~links.los]).astype(float), np.full(2, 300.0)
+
+    def error_group(self, links):
+        return links.los.astype(int)
+
+
+@pytest.fixture
+def flown(make_links):
+    """Links of three receivers of which one, by powers that add, reads noise."""
+    rng = np.random.default_rng(0)
+    receiver = np.repeat(np.arange(RECEIVERS), LINKS)
+    receiver_m = np.column_stack([rng.uniform(0, 1500, (len(receiver), 2)), np.full(len(receiver), 40.0)])
+    links = make_links([[700.0, 800, 1.5]], receiver_m, limit_db=LIMIT_DB, receiver=receiver)
+    level_db = -22 - 30 * np.log10(links.distance_m) + rng.normal(0, 2.5, len(links))
+    noisy = receiver == RAISED
+    level_db[noisy] = 10 * np.log10(10 ** (level_db[noisy] / 10) + 10 ** (FLOOR_DB / 10))
+    level_db += rng.normal(0, 0.5, len(links))
+    links.level_db[:] = np.where(level_db < LIMIT_DB, np.nan, level_db)
+    return links
+
+
+@pytest.mark.parametrize("kind", [LogDistance, KnownLevels])
+def test_only_the_receiver_that_has_one_gets_a_floor(flown, kind):
+    assert np.isnan(flown.level_db[flown.receiver != RAISED]).mean() > 0.05
+    model = FoldModel.build(flown, kind(LogDistanceLine(-20.0, -3.0, 3.0)), 5.0)
+    before = model.fit()
+    found, after = add_effect(model, NoiseFloor(), before)
+    floors_db = found.effects[-1].params.receivers
+    assert floors_db[RAISED] == pytest.approx(FLOOR_DB, abs=1.0)
+    assert all(floor_db < LIMIT_DB for receiver, floor_db in floors_db.items() if receiver != RAISED)
+    assert before.objective - after.objective > 50
+
+
+def test_links_with_line_of_sight_which_are_strong_need_not_show_it(flown):
+    """As over a map: links with line of sight are far above the floor, and tell nothing of it."""
+    los = flown.distance_m < 400
+    links = replace(flown, known_los=los, level_db=flown.level_db + 25.0 * los)
+    index = np.arange(len(links)) // 25 % 5
+    channel = KnownLevels(LogDistanceLine(-20.0, -3.0, 3.0))
+    whole, *folds = (FoldModel.build(links.with_los(los), channel, 5.0, channel_db=channel.predict(links.geometry)[0]
+                                     + 25.0 * los, train=index != number) for number in range(-1, 5))
+    model = CrossValidatedModel(whole, folds, [each.fit() for each in (whole, *folds)], index, None)
+    criteria = SelectionCriteria()
+    candidate = fit_candidate(model, NoiseFloor(), 0, criteria)
+    score, extended = score_candidate(model, candidate, evidence_blocks(links), 20, 0, 0, criteria)
+    assert score.reason == "" and extended is not None
