@@ -87,7 +87,7 @@ def _located(model: CrossValidatedModel, links: LinkData, base: Base) -> LinkDat
     known = np.isfinite(device_m).all(axis=1)
     device_m = np.where(known[:, None], device_m, links.device_m)
     anchors = frozenset(np.flatnonzero(known).tolist()) | links.anchors
-    return replace(links.with_devices(device_m), anchors=anchors)
+    return replace(links.with_devices(device_m), anchors=anchors, evidence=model.links.evidence)
 
 
 def _stands_out(model: CrossValidatedModel, candidate: Candidate | CandidateScore,
