@@ -8,12 +8,14 @@ weighted least squares (Cressie 1985, Math. Geology 17).
 """
 
 import numpy as np
+import pandas as pd
 from scipy.spatial import cKDTree
 
 from radiotwin.links.link_data import LinkData
 
-MOVING_RATIO = 5  # more devices for each position of a receiver are positions of one that moves
+MIN_SERIES = 3  # mean readings of a device by a receiver on a flight, to be a series
 MAX_LINKS = 20_000  # a sample of more has pairs enough
+MAX_STEPS = 5_000  # places whose nearest one is looked up
 NEIGHBOURS = 8  # nearest, of each link: the short distances
 LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144)  # along a track: the longer ones
 BINS, MIN_PAIRS = 16, 40  # of distances; and pairs in each
@@ -25,9 +27,10 @@ MIN_STEP_M = 0.1
 
 
 def devices_move(links: LinkData) -> bool:
-    """Return whether devices are many positions of one that moves, among few receivers."""
-    places = len(np.unique(np.round(links.receiver_m), axis=0))
-    return len(links.device_names) > MOVING_RATIO * places
+    """Return whether devices are positions of one that moves: most are read once by a receiver."""
+    series = pd.DataFrame({"device": links.device, "receiver": links.receiver,
+                           "flight": links.flight})
+    return len(series.drop_duplicates()) > len(links) / MIN_SERIES
 
 
 def moving_end_m(links: LinkData) -> np.ndarray:
@@ -51,39 +54,38 @@ def extent_m(position_m: np.ndarray) -> float:
 
 
 def step_m(links: LinkData) -> float:
-    """Return the usual distance from a position to the next one of its pair of ends [m]."""
-    position_m = moving_end_m(links)
-    place = _apart(links, position_m)
-    places = np.unique(np.round(place / MIN_STEP_M), axis=0) * MIN_STEP_M
+    """Return the usual distance from a place to the nearest other one of its pair of ends [m]."""
+    place, offset_m = _apart(links, pair_of_ends(links))
+    places = pd.DataFrame(np.round(place / MIN_STEP_M)).drop_duplicates().to_numpy() * MIN_STEP_M
     if len(places) < 2:
         return 0.0
-    rows = places if len(places) <= MAX_LINKS else places[::-(-len(places) // MAX_LINKS)]
-    nearest = cKDTree(places).query(rows, 2)[0][:, 1]
-    nearest = nearest[nearest < _offset_m(position_m)]  # to another place of the same pair
+    some = places[::-(-len(places) // MAX_STEPS)]
+    nearest = cKDTree(places).query(some, 2)[0][:, 1]
+    nearest = nearest[nearest < offset_m / 2]  # of the same pair
     return float(np.median(nearest)) if len(nearest) else 0.0
 
 
 def correlation_length_m(links: LinkData, z: np.ndarray) -> float:
     """Return the distance over which the correlation of a residual falls to 1/e [m].
 
-    At least the usual step between positions, which is also what a residual without any
-    correlation gives; at most a quarter of the extent of the positions.
+    At least the usual step between places, which is also what a residual without any correlation
+    gives; at most a quarter of the extent of the campaign.
 
     Args:
         links: n links.
         z: (n,) residuals over their scale; those of blank links do not count.
     """
-    position_m = moving_end_m(links)
-    least_m, most_m = step_m(links), EXTENT_SHARE * extent_m(position_m)
+    least_m, most_m = step_m(links), EXTENT_SHARE * extent_m(moving_end_m(links))
     seen = np.flatnonzero(np.isfinite(links.level_db) & np.isfinite(z))
     if least_m <= 0 or most_m <= least_m or len(seen) < MIN_PAIRS:
         return least_m
     part = links.select(seen)
-    order = np.lexsort((np.arange(len(seen)), part.time_s, part.flight, pair_of_ends(part)))
-    place = _apart(part, position_m[seen], part.flight)[order]
+    pair = pair_of_ends(part)
+    order = np.lexsort((np.arange(len(seen)), part.time_s, part.flight, pair))
+    place = _apart(part, pair * (part.flight.max() + 2) + part.flight)[0][order]
     first, second = _pairs(place)
     distance_m = np.linalg.norm(place[first] - place[second], axis=1)
-    kept = distance_m < 2 * most_m  # farther apart are mostly different pairs of ends, or a trend
+    kept = distance_m < 2 * most_m  # the rest shows trends
     own = np.clip(z[seen][order], -MAX_Z, MAX_Z)
     difference = np.sqrt(np.abs(own[first[kept]] - own[second[kept]]))
     at_m, gamma, pairs = _variogram(distance_m[kept], difference, least_m)
@@ -92,23 +94,18 @@ def correlation_length_m(links: LinkData, z: np.ndarray) -> float:
     return _fitted_length_m(at_m, gamma, pairs, least_m, most_m)
 
 
-def _offset_m(position_m: np.ndarray) -> float:
-    """Return a distance [m] beyond all that occur, to set series apart."""
-    return 4.0 * float(np.ptp(position_m, axis=0).max(initial=0.0)) + 1.0
+def _apart(links: LinkData, label: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return places (n, 7) [m] and the distance between series [m].
 
-
-def _apart(links: LinkData, position_m: np.ndarray, flight: np.ndarray | None = None,
-           ) -> np.ndarray:
-    """Return places (n, 4) [m]: positions, and far apart for each pair of ends (and flight)."""
-    label = pair_of_ends(links)
-    if flight is not None:
-        label = label * (flight.max(initial=0) + 2) + flight
-    label = np.unique(label, return_inverse=True)[1]
-    return np.column_stack([position_m, label * _offset_m(position_m)])
+    A place is both ends' positions, and far from all places of another label (n,).
+    """
+    ends_m = np.column_stack([links.receiver_m, np.nan_to_num(links.device_m[links.device])])
+    offset_m = 4.0 * float(np.ptp(ends_m, axis=0).max(initial=0.0)) + 1.0
+    return np.column_stack([ends_m, pd.factorize(label)[0] * offset_m]), offset_m
 
 
 def _pairs(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rows (p,) and rows (p,) of pairs of places (n, 4) of one series."""
+    """Return rows (p,) and rows (p,) of pairs of places (n, 7) of one series."""
     n = len(place)
     every = np.arange(n) if n <= MAX_LINKS else np.sort(
         np.random.default_rng(0).choice(n, MAX_LINKS, replace=False))
@@ -121,7 +118,7 @@ def _pairs(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     a, b = np.concatenate(first), np.concatenate(second)
     same = (b < n) & (a != b)
     a, b = a[same], b[same]
-    same = place[a, 3] == place[b, 3]
+    same = place[a, -1] == place[b, -1]
     return a[same], b[same]
 
 
