@@ -53,6 +53,13 @@ def _elsewhen_db(position_m: np.ndarray, flight: np.ndarray, residual_db: np.nda
     return result
 
 
+def compared_where_possible_db(view: ResidualView) -> tuple[np.ndarray, np.ndarray]:
+    """Return residuals (n,) as `compared_db`, elsewhere as they are [dB]; and where compared."""
+    rest_db = compared_db(view)
+    known = np.isfinite(rest_db)
+    return np.where(known, rest_db, view.residual_db), known
+
+
 def share_alike(label: np.ndarray, value_db: np.ndarray, minimum: int, least_db: float) -> float:
     """Return the share of members whose median is beyond a level, with its sign.
 

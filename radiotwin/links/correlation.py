@@ -20,6 +20,7 @@ NEIGHBOURS = 8  # nearest, of each link: the short distances
 LAGS = (1, 2, 3, 5, 8, 13, 21, 34, 55, 89, 144)  # along a track: the longer ones
 BINS, MIN_PAIRS = 16, 40  # of distances; and pairs in each
 LENGTHS = 80  # tried, evenly on a logarithmic scale
+MIN_TREND_LINKS = 60  # of a pair of ends, for its trends
 MAX_Z = 4.0  # outliers count as this many scales
 MIN_CORRELATED = 0.1  # share of the variance that is correlated, below which there is no length
 EXTENT_SHARE = 0.25  # of the extent: a longer correlation looks like a trend
@@ -83,15 +84,37 @@ def correlation_length_m(links: LinkData, z: np.ndarray) -> float:
     pair = pair_of_ends(part)
     order = np.lexsort((np.arange(len(seen)), part.time_s, part.flight, pair))
     place = _apart(part, pair * (part.flight.max() + 2) + part.flight)[0][order]
+    z = _without_trends(part, np.clip(z[seen], -MAX_Z, MAX_Z), pair)[order]
     first, second = _pairs(place)
     distance_m = np.linalg.norm(place[first] - place[second], axis=1)
     kept = distance_m < 2 * most_m  # the rest shows trends
-    own = np.clip(z[seen][order], -MAX_Z, MAX_Z)
-    difference = np.sqrt(np.abs(own[first[kept]] - own[second[kept]]))
+    difference = np.sqrt(np.abs(z[first[kept]] - z[second[kept]]))
     at_m, gamma, pairs = _variogram(distance_m[kept], difference, least_m)
     if len(at_m) < 3:
         return least_m
     return _fitted_length_m(at_m, gamma, pairs, least_m, most_m)
+
+
+def _without_trends(links: LinkData, z: np.ndarray, pair: np.ndarray) -> np.ndarray:
+    """Return z (n,) without the level of each series, and trends of each pair of ends (n,).
+
+    A slope over distance that the base lacks, or an antenna's pattern over azimuth, is alike over
+    the whole campaign, and says nothing of how far shadows reach.
+    """
+    azimuth = np.radians(links.azimuth_deg)
+    columns = np.column_stack([z, np.log(links.distance_m), np.cos(azimuth), np.sin(azimuth),
+                               np.cos(2 * azimuth), np.sin(2 * azimuth)])
+    series = pd.factorize(pair * (links.flight.max() + 2) + links.flight)[0]
+    count = np.bincount(series)
+    for i, column in enumerate(columns.T):
+        columns[:, i] -= (np.bincount(series, weights=column) / count)[series]
+    rest = columns[:, 0].copy()
+    for own in np.split(np.argsort(pair, kind="stable"),
+                        np.cumsum(np.unique(pair, return_counts=True)[1])[:-1]):
+        if len(own) >= MIN_TREND_LINKS:
+            trend = np.linalg.lstsq(columns[own, 1:], rest[own], rcond=None)[0]
+            rest[own] -= columns[own, 1:] @ trend
+    return rest
 
 
 def _apart(links: LinkData, label: np.ndarray) -> tuple[np.ndarray, float]:
