@@ -61,11 +61,11 @@ def _select_one_kind(result: SelectionResult, effect: ReceiverDrift | DeviceDrif
     if not _stands_out(result.model, first, criteria):
         return
     on_progress(f"{effect.name}, held out by block")
-    links = _located(result.model, links, base)
+    links = located_links(result.model, links, base)
     folds = make_folds(links, seed, "block")
     model = cross_validate(links, base, folds, training_parts(links, folds))
     for each in result.model.whole.effects:
-        model = _with_effect(model, each.effect, each.params)
+        model = with_effect(model, each.effect, each.params)
     block = evidence_blocks(model.links)
     while not result.is_full:
         step = len(result.model.whole.effects)
@@ -78,16 +78,16 @@ def _select_one_kind(result: SelectionResult, effect: ReceiverDrift | DeviceDrif
             return
         model = extended
         params = candidate.whole.effects[-1].params
-        result.keep(score, _with_effect(result.model, effect, params))
+        result.keep(score, with_effect(result.model, effect, params))
 
 
-def _located(model: CrossValidatedModel, links: LinkData, base: Base) -> LinkData:
+def located_links(model: CrossValidatedModel, links: LinkData, base: Base) -> LinkData:
     """Return the links with the devices that the base has located as anchors there."""
     device_m = base.device_m(model.twin)
     known = np.isfinite(device_m).all(axis=1)
     device_m = np.where(known[:, None], device_m, links.device_m)
     anchors = frozenset(np.flatnonzero(known).tolist()) | links.anchors
-    return replace(links.with_devices(device_m), anchors=anchors)
+    return replace(links.with_devices(device_m), anchors=anchors, evidence=model.links.evidence)
 
 
 def _stands_out(model: CrossValidatedModel, candidate: Candidate | CandidateScore,
@@ -126,7 +126,7 @@ def _stands_out(model: CrossValidatedModel, candidate: Candidate | CandidateScor
     return bool(p_value <= criteria.max_p_value)
 
 
-def _with_effect(model: CrossValidatedModel, effect: Effect, params: Any) -> CrossValidatedModel:
+def with_effect(model: CrossValidatedModel, effect: Effect, params: Any) -> CrossValidatedModel:
     """Return a model with one more effect in the whole and every fold, its parameters given."""
     models = [each.with_effects([*each.effects, each.apply(effect, params)])
               for each in model.models]

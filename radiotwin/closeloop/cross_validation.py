@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -15,7 +15,7 @@ from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.student import mean_if_detected
-from radiotwin.links import LinkData
+from radiotwin.links import LinkData, with_evidence
 from radiotwin.twin.fit_paths import best_dof
 from radiotwin.twin.twin import Twin
 
@@ -129,6 +129,9 @@ def cross_validate(links: LinkData, base: Base, folds: Folds,
     device_m = base.device_m(twin)
     dof = best_dof(links, twin.channel, device_m)
     whole = FoldModel.build(links, twin.channel, dof, device_m=device_m)
+    links = _with_evidence(links, whole)
+    whole = replace(whole, links=replace(whole.links, evidence=links.evidence, notes=links.notes,
+                                         known_los=whole.links.los))
     models = []
     for number, part in enumerate(parts):
         with warnings.catch_warnings():
@@ -138,3 +141,13 @@ def cross_validate(links: LinkData, base: Base, folds: Folds,
                                       train=folds.index != number))
     fits = [model.fit() for model in (whole, *models)]
     return CrossValidatedModel(whole, models, fits, folds.index, twin)
+
+
+def _with_evidence(links: LinkData, whole: FoldModel) -> LinkData:
+    """Return links with pieces of evidence that fit the base's residual, if they have none yet."""
+    if links.evidence is not None:
+        return links
+    view, z = whole.view(whole.fit()), np.full(len(links), np.nan)
+    z[whole.train] = view.residual_db / view.scale_db
+    located = with_evidence(whole.links, z)
+    return replace(links, evidence=located.evidence, notes=located.notes)

@@ -7,12 +7,16 @@ import numpy as np
 from radiotwin.errors import BadInput
 from radiotwin.inference.groups import deal_groups
 from radiotwin.links import LinkData
+from radiotwin.links.correlation import moving_end_m
+from radiotwin.links.evidence import fitting_width_m
 
 WAYS = ("flight", "block", "device")
 MIN_FLIGHTS = 4  # that most devices and receivers must be in, for flights to be held out
 MAX_FOLDS = 6
 BLOCK_M = 60.0  # side of a block on the ground
 MIN_BLOCKS = 10
+MIN_CLUSTERS = 6  # places that are held out one by one
+STRETCHES = 4  # of each fold, where nothing moves
 MAX_ENDS = 500  # more are positions of one end that moves, and need not return
 
 
@@ -60,14 +64,24 @@ def make_folds(links: LinkData, seed: int, by: str = "auto") -> Folds:
         return Folds(by, index)
     if by != "block":
         raise BadInput(f"links cannot be held out by {by!r}; allowed are auto, {', '.join(WAYS)}")
-    ends = (links.receiver_m, np.nan_to_num(links.device_m[links.device]))
-    blocks = [np.unique(np.floor(end[:, :2] / BLOCK_M).astype(np.int64), axis=0,
-                        return_inverse=True)[1].ravel() for end in ends]
-    block = max(blocks, key=lambda cells: cells.max())  # of the end that moves
-    if block.max() + 1 < MIN_BLOCKS:
-        # Nothing moves: stretches of the file.
-        block = np.arange(len(links)) * MAX_FOLDS * 4 // len(links)
-    return Folds(by, deal_groups(block, MAX_FOLDS, rng))
+    return Folds(by, deal_groups(_blocks(links), MAX_FOLDS, rng))
+
+
+def _blocks(links: LinkData) -> np.ndarray:
+    """Return labels (n,) of squares of ground of the end that moves, or of stretches of time.
+
+    Where `BLOCK_M` is too wide for `MIN_BLOCKS`, squares are smaller. Clusters of positions that no
+    square parts are held out as they are; where there are too few of them, stretches are.
+    """
+    width_m = fitting_width_m(links, BLOCK_M, MIN_BLOCKS)
+    cell = np.floor(moving_end_m(links)[:, :2] / width_m).astype(np.int64)
+    block = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    if block.max() + 1 >= MIN_CLUSTERS:
+        return block
+    order = np.lexsort((np.arange(len(links)), links.time_s, links.flight))
+    stretch = np.empty(len(links), dtype=int)
+    stretch[order] = np.arange(len(links)) * MAX_FOLDS * STRETCHES // len(links)
+    return stretch
 
 
 def _require_several(index: np.ndarray, by: str) -> np.ndarray:

@@ -20,6 +20,7 @@ from radiotwin.closeloop.cross_validation import (
     cross_validate,
     training_parts,
 )
+from radiotwin.closeloop.faults import select_faults
 from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.posterior import NONE, OTHER
 from radiotwin.closeloop.residual_tests import ResidualDependence, residual_dependences
@@ -153,7 +154,10 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     on_progress("looking at the residual")
     dependences_before = _dependences(before, seed)
     selection = SelectionResult(before, criteria)
-    forward_selection(selection, [effect() for effect in catalogue()], seed, on_progress)
+    effects = [effect() for effect in catalogue()]
+    select_faults(selection, effects, links, bases[best], seed, on_progress)
+    forward_selection(selection, [effect for effect in effects if not effect.within_flights], seed,
+                      on_progress)
     select_change_points(selection, links, bases[best], folds, seed, on_progress)
     selection.explained = selection.model
     on_progress("looking at what is left")

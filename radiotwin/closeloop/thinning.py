@@ -1,13 +1,43 @@
-"""Of very many links a sample: neighbours err alike, and a loop over all would take hours."""
+"""Links that say nothing new left out: piles at one place, and of very many links all but a sample."""
 
 from dataclasses import replace
 
 import numpy as np
 
 from radiotwin.links import LinkData
+from radiotwin.links.correlation import moving_end_m, pair_of_ends
 
+PLACE_M = 5.0  # side of a square of ground that counts as one place
+PILE, MIN_PILE = 5, 20  # times the usual number of readings at one place is a pile; and at least
+MIN_SURPLUS = 0.05  # share of all links in piles, to thin them
 MAX_LINKS = 120_000  # up to which all are used
 SAMPLE_LINKS = 60_000  # of more: takes minutes
+
+
+def thin_piles(links: LinkData) -> LinkData:
+    """Return links of which no place has far more than the others have, with a note.
+
+    A receiver that hovers reads one and the same error many times. What a place (of one pair of
+    ends, on one flight) has beyond `PILE` times the usual number is left out, evenly in time.
+
+    Args:
+        links: n links.
+    """
+    cell = np.floor(moving_end_m(links)[:, :2] / PLACE_M).astype(np.int64)
+    keys = np.column_stack([cell, pair_of_ends(links), links.flight])
+    order = np.lexsort((np.arange(len(links)), links.time_s, *keys.T))
+    starts = np.flatnonzero(np.r_[True, np.diff(keys[order], axis=0).any(axis=1)])
+    count = np.diff(np.r_[starts, len(links)])
+    most = max(PILE * float(np.median(count)), MIN_PILE)
+    if np.maximum(count - most, 0).sum() < MIN_SURPLUS * len(links):
+        return links
+    share = np.repeat(np.minimum(most / count, 1.0), count)
+    place = np.arange(len(links)) - np.repeat(starts, count)
+    kept = np.sort(order[np.floor((place + 1) * share) > np.floor(place * share)])
+    note = (f"receivers stayed at {(count > most).sum():,} places, where {len(links) - len(kept):,} "
+            f"of {len(links):,} links are left out, evenly in time: readings at one place err alike "
+            f"and count as one, and at most {most:.0f} of them are used")
+    return replace(links.select(kept), notes=[*links.notes, note])
 
 
 def thin_links(links: LinkData, seed: int) -> LinkData:
@@ -21,6 +51,7 @@ def thin_links(links: LinkData, seed: int) -> LinkData:
         links: n links.
         seed: of the draw.
     """
+    links = thin_piles(links)
     n = len(links)
     if n <= MAX_LINKS:
         return links

@@ -85,6 +85,8 @@ class Effect(ABC):
         repeatable: whether there may be several, each found in a step of its own.
         of_receiver: whether it belongs to a receiver, so that it is no part of a map.
         is_cause: whether it is a physical cause, not merely a description of what is left.
+        within_flights: whether it acts at certain times only, so that other flights do not show it:
+            it is scored on devices, or blocks of ground, that are held out in all flights.
         always_exact: whether `exact` may be asked of every candidate, not only of what is kept.
     """
 
@@ -98,6 +100,7 @@ class Effect(ABC):
     repeatable: ClassVar[bool] = False
     of_receiver: ClassVar[bool] = False
     is_cause: ClassVar[bool] = True
+    within_flights: ClassVar[bool] = False
     always_exact: ClassVar[bool] = False
 
     def unavailable(self, links: LinkData) -> str | None:

@@ -94,6 +94,8 @@ class _GainDrift(GainEffect):
     def unavailable(self, links: LinkData) -> str | None:
         if np.isfinite(links.time_s).sum() < MIN_LINKS:
             return "there is no time_s"
+        if links.time_restarts and "warm_up_each_flight" not in self._forms:
+            return "time_s begins anew in each flight, so that flights have no order"
         return None
 
     @override
@@ -228,7 +230,7 @@ def _shape(drift: Drift, links: LinkData, time_s: np.ndarray,
 def _candidates(links: LinkData, residual_db: np.ndarray,
                 weight: np.ndarray) -> Iterator[tuple[float, str, float]]:
     """Yield (nats, form, number) of each form that the times of one member's links allow."""
-    time_s = links.time_s
+    time_s, comparable = links.time_s, not links.time_restarts
     yield 0.0, "step", float(time_s.mean())
 
     def nats(shape: np.ndarray) -> float:
@@ -238,17 +240,17 @@ def _candidates(links: LinkData, residual_db: np.ndarray,
             return 0.0
         return 0.5 * (weight @ (centred * residual_db)) ** 2 / (power + 1 / PRIOR_SD_DB**2)
 
-    if np.ptp(time_s) > 0:
+    if np.ptp(time_s) > 0 and comparable:
         yield nats((time_s - time_s.mean()) / np.ptp(time_s)), "ageing", float(time_s.mean())
     for constant_s in TIME_CONSTANTS_S:
         for form, since_s in zip(WARM_UPS, (time_s - links.first_s, links.time_in_flight_s)):
-            if constant_s < np.ptp(since_s):
+            if constant_s < np.ptp(since_s) and (comparable or form == "warm_up_each_flight"):
                 yield nats(np.exp(-since_s / constant_s)), form, constant_s
     order = np.argsort(time_s, kind="stable")
     sums = np.cumsum(weight[order]), np.cumsum((weight * residual_db)[order])
     gaps = np.flatnonzero(np.diff(time_s[order]) > 0)
     gaps = gaps[(gaps >= MIN_SIDE) & (gaps < len(order) - MIN_SIDE)]
-    if len(gaps):
+    if len(gaps) and comparable:
         total, moment = sums[0][-1], sums[1][-1]
         before, moment_before = sums[0][gaps], sums[1][gaps]
         step_db = moment_before / before - (moment - moment_before) / (total - before)

@@ -9,7 +9,9 @@ from radiotwin.effects.body_shadowing import BodyShadowing
 from radiotwin.effects.building_entry import BuildingEntry
 from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.detection_limit import DetectionLimit
+from radiotwin.effects.episode import Episode
 from radiotwin.effects.excess_attenuation import ExcessAttenuation
+from radiotwin.effects.faulty_flight import FaultyFlight
 from radiotwin.effects.foliage import Foliage
 from radiotwin.effects.gain_drift import DeviceDrift, ReceiverDrift
 from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
@@ -33,7 +35,7 @@ BUILT_IN: tuple[type[Effect], ...] = (
     NoiseFloor, DetectionLimit, SectorAntenna, TiltedDipole, BodyShadowing, ExcessAttenuation,
     DevicePositionError, ReceiverPositionError, ReceiverClockOffset, MissingObstacle,
     RemovedObstacle, BuildingEntry, Foliage, WallReflection, Diffraction, GroundReflection,
-    Interference, LockLoss)
+    Interference, LockLoss, FaultyFlight, Episode)
 
 _registered: list[type[Effect]] = []
 

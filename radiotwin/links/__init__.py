@@ -1,11 +1,13 @@
 """Measured links: joined with devices, 3D map and geometry once, checked, and cut into parts."""
 
-from radiotwin.links.evidence import design_effect, evidence_blocks
+from radiotwin.links.correlation import correlation_length_m
+from radiotwin.links.evidence import design_effect, evidence_blocks, with_evidence
 from radiotwin.links.geometry import LinkGeometry, link_geometry
 from radiotwin.links.link_data import LinkData
 from radiotwin.links.prepare import join_links, prepare_links
 from radiotwin.links.sites import site_of
 from radiotwin.links.variables import residual_variables
 
-__all__ = ["LinkData", "LinkGeometry", "design_effect", "evidence_blocks", "join_links",
-           "link_geometry", "prepare_links", "residual_variables", "site_of"]
+__all__ = ["LinkData", "LinkGeometry", "correlation_length_m", "design_effect", "evidence_blocks",
+           "join_links", "link_geometry", "prepare_links", "residual_variables", "site_of",
+           "with_evidence"]

@@ -1,19 +1,32 @@
 """Links that err alike: pieces of evidence, and how many links count as one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 
+from radiotwin.links.correlation import (
+    correlation_length_m,
+    extent_m,
+    moving_end_m,
+    pair_of_ends,
+    step_m,
+)
 from radiotwin.links.link_data import LinkData
 
-EVIDENCE_M = 100.0  # side of the square of ground within which links of one pair of ends err alike
-MAX_DEVICES = 1000  # more devices are positions of one that moves, and are no key of their own
+LENGTHS = 2.0  # side of a piece over the correlation length
+UNKNOWN_M = 100.0  # side of a piece while no residual has been looked at
+MIN_PLACES = 6  # that the ground of a campaign is cut into, where it is wide enough
+NARROWER = 0.8  # from one width that is tried to the next
+LITTLE = 30  # pieces of evidence: fewer say little
 
 
 def evidence_blocks(links: LinkData) -> np.ndarray:
     """Return the piece of evidence that each link belongs to.
 
     Links of one device and receiver that are close to each other on the ground and in one flight
-    have nearly the same shadowing, and count as one.
+    have nearly the same shadowing, and count as one. How close, `with_evidence` has found out; on
+    links that it has not seen, the pieces are `UNKNOWN_M` wide.
 
     Args:
         links: n links.
@@ -21,11 +34,57 @@ def evidence_blocks(links: LinkData) -> np.ndarray:
     Returns:
         (n,) int label.
     """
-    ends = [np.floor(end[:, :2] / EVIDENCE_M).astype(np.int64) for end in
+    if links.evidence is not None:
+        return links.evidence
+    return _pieces(links, fitting_width_m(links, UNKNOWN_M))
+
+
+def with_evidence(links: LinkData, z: np.ndarray) -> LinkData:
+    """Return links whose pieces of evidence fit a residual, with notes on them.
+
+    Done once, by the residual of the base: then all that is scored later counts the same pieces.
+
+    Args:
+        links: n links.
+        z: (n,) residuals of the base over their scale.
+    """
+    length_m = correlation_length_m(links, z)
+    width_m = fitting_width_m(links, LENGTHS * length_m)
+    pieces = _pieces(links, width_m)
+    count, notes = len(np.unique(pieces)), []
+    if width_m < 0.99 * LENGTHS * length_m:
+        notes.append(f"errors are alike over {length_m:.0f} m, and the campaign is only "
+                     f"{extent_m(moving_end_m(links)):.0f} m wide: pieces of evidence of "
+                     f"{width_m:.0f} m are not independent, and evidence is little")
+    elif count < LITTLE:
+        notes.append(f"there are {count} independent pieces of evidence only: links within "
+                     f"{width_m:.0f} m of each other err alike, so evidence is little")
+    return replace(links, evidence=pieces, notes=[*links.notes, *notes])
+
+
+def fitting_width_m(links: LinkData, wanted_m: float, places: int = MIN_PLACES) -> float:
+    """Return the side of squares that the ground is cut into [m].
+
+    As wanted, or less where the end that moves would then be in fewer than so many squares; at
+    least the usual step between its positions.
+    """
+    position_m, least_m = moving_end_m(links), max(step_m(links), 0.1)
+    width_m = max(wanted_m, least_m)
+    while width_m > least_m and _occupied(position_m, width_m) < places:
+        width_m = max(NARROWER * width_m, least_m)
+    return float(width_m)
+
+
+def _occupied(position_m: np.ndarray, width_m: float) -> int:
+    """Return the number of squares of ground with positions (n, 3) in them."""
+    return len(np.unique(np.floor(position_m[:, :2] / width_m), axis=0))
+
+
+def _pieces(links: LinkData, width_m: float) -> np.ndarray:
+    """Return labels (n,) of squares of ground of one pair of ends and flight."""
+    ends = [np.floor(end[:, :2] / width_m).astype(np.int64) for end in
             (links.receiver_m, np.nan_to_num(links.device_m[links.device]))]
-    keys = np.column_stack([*ends, links.receiver, links.flight])
-    if len(links.device_names) <= MAX_DEVICES:
-        keys = np.column_stack([keys, links.device])
+    keys = np.column_stack([*ends, pair_of_ends(links), links.flight])
     return pd.DataFrame(keys).groupby(list(range(keys.shape[1]))).ngroup().to_numpy()
 
 
@@ -41,6 +100,6 @@ def design_effect(block: np.ndarray, z: np.ndarray, max_z: float = 4.0) -> float
     """
     z = np.clip(z, -max_z, max_z)
     size = np.bincount(block)
-    mean = np.bincount(block, weights=z) / size
+    mean = np.bincount(block, weights=z) / np.maximum(size, 1)
     between = (size * (mean - z.mean()) ** 2).sum() / max((size > 0).sum(), 1)
     return max(float(between / max(z.var(), 1e-9)), 1.0)

@@ -14,17 +14,16 @@ import numpy as np
 import pandas as pd
 from scipy.constants import speed_of_light
 
+from radiotwin.links.clocks import Tracks, clocks_restart
 from radiotwin.links.geometry import REFERENCE_DISTANCE_M, LinkGeometry
 from radiotwin.scene.citymap import CityMap
 
 ROOF_SAMPLES = 60  # points along a link at which the roofs below it are looked up
 ROOF_CHUNK = 5000  # links a time: bounds the memory of that to 10 MB
 
-Tracks = dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
-"""(receiver, flight) -> times (t,) in order [s] and positions (t, 3) then [m]."""
-
 _OF_EACH_LINK = ("level_db", "limit_db", "receiver_m", "device", "receiver", "flight", "time_s",
-                 "heading_deg", "pitch_deg", "roll_deg", "quality", "known_los", "time_in_flight_s")
+                 "heading_deg", "pitch_deg", "roll_deg", "quality", "known_los", "time_in_flight_s",
+                 "evidence")
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +52,10 @@ class LinkData:
         first_s, last_s: time of the first and the last measurement [s]; NaN without times. They,
             and `tracks`, stay those of all the data when links are selected.
         tracks: where each receiver was in each flight; only links with a time count.
+        time_restarts: whether clocks begin anew in each flight, so that `time_s` orders readings
+            within a flight only; stays that of all the data, too.
+        evidence: (n,) piece of evidence of each link, see `radiotwin.links.with_evidence`; None
+            before a residual has been looked at.
     """
 
     level_db: np.ndarray
@@ -80,13 +83,16 @@ class LinkData:
     first_s: float = None  # type: ignore[assignment]
     last_s: float = None  # type: ignore[assignment]
     tracks: Tracks = None  # type: ignore[assignment]
+    time_restarts: bool = None  # type: ignore[assignment]
+    evidence: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         timed = np.isfinite(self.time_s).any()
         derived: dict[str, Any] = {
             "first_s": lambda: float(np.nanmin(self.time_s)) if timed else np.nan,
             "last_s": lambda: float(np.nanmax(self.time_s)) if timed else np.nan,
-            "time_in_flight_s": self._time_in_flight_s, "tracks": self._tracks}
+            "time_in_flight_s": self._time_in_flight_s, "tracks": self._tracks,
+            "time_restarts": lambda: clocks_restart(self.tracks)}
         for name, derive in derived.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, derive())
@@ -141,6 +147,11 @@ class LinkData:
         """(n,) index of the flight of a receiver that a link was measured on."""
         key = self.flight * (self.receiver.max() + 1) + self.receiver
         return np.unique(key, return_inverse=True)[1]
+
+    @cached_property
+    def absolute_time_s(self) -> np.ndarray:
+        """(n,) `time_s` where flights can be compared by it [s]; NaN where clocks restart."""
+        return np.full(len(self), np.nan) if self.time_restarts else self.time_s
 
     @cached_property
     def offset_m(self) -> np.ndarray:

@@ -15,6 +15,7 @@ from radiotwin.links.checks import (
     unheard_devices,
     useless_receivers,
 )
+from radiotwin.links.clocks import RESTART_NOTE
 from radiotwin.links.limits import estimate_limits
 from radiotwin.links.link_data import LinkData
 from radiotwin.measurements import Measurements
@@ -116,8 +117,10 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
                        + ("; ".join(notes) or "measure more"))
     refuse_empty_levels(level_db[keep], measurements.level_column)
     device = (np.cumsum(placed) - 1)[device_index[keep]]
-    return _link_data(measurements, table[keep], scene, level_db[keep], receiver_m[keep],
-                      device_m[placed], device, np.flatnonzero(placed), notes)
+    links = _link_data(measurements, table[keep], scene, level_db[keep], receiver_m[keep],
+                       device_m[placed], device, np.flatnonzero(placed), notes)
+    notes += [RESTART_NOTE] * links.time_restarts
+    return links
 
 
 def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,

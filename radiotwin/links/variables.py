@@ -26,7 +26,7 @@ def residual_variables(links: LinkData, mean_db: np.ndarray) -> dict[str, np.nda
         "distance_m": links.distance_m, "elevation_deg": links.elevation_deg,
         "azimuth_deg": links.azimuth_deg, "body_azimuth_deg": links.body_azimuth_deg,
         "heading_deg": links.heading_deg, "time_in_flight_s": links.time_in_flight_s,
-        "time_s": links.time_s, "flight": links.flight, "altitude_m": links.receiver_m[:, 2],
+        "time_s": links.absolute_time_s, "flight": links.flight, "altitude_m": links.receiver_m[:, 2],
         "receiver": links.receiver, "device": links.device, "los": links.los.astype(int),
         "predicted_level_db": mean_db, "metres_inside_m": links.metres_inside,
         "diffraction_parameter": links.diffraction_parameter,

@@ -1,0 +1,109 @@
+"""Faults at certain times: flights, episodes and bursts, which other flights cannot show.
+
+Held out by flight, what happens on one flight is never learnt. So these candidates are scored on
+devices that are held out, which the same receiver read at the same times; where there are few
+devices, on blocks of ground that are held out in all flights at once. They come before all other
+candidates, or these would explain the faulty readings by walls and positions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from radiotwin.closeloop.bases import Base
+from radiotwin.closeloop.change_points import located_links, with_effect
+from radiotwin.closeloop.cross_validation import (
+    CrossValidatedModel,
+    cross_validate,
+    training_parts,
+)
+from radiotwin.closeloop.folds import Folds, make_folds
+from radiotwin.closeloop.selection import (
+    Candidate,
+    CandidateScore,
+    SelectionResult,
+    fit_candidate,
+    score_candidate,
+)
+from radiotwin.effects.base import Effect
+from radiotwin.links import LinkData, evidence_blocks
+from radiotwin.links.correlation import devices_move
+
+MIN_DEVICES = 4  # of known position, to hold some of them out
+
+
+def select_faults(result: SelectionResult, effects: list[Effect], links: LinkData, base: Base,
+                  seed: int, on_progress: Callable[[str], None]) -> None:
+    """Add the effects that act at certain times, one after the other, until none passes.
+
+    Args:
+        result: is extended.
+        effects: candidates; those that are not `within_flights` are passed over.
+        links: n links.
+        base: of the model.
+        seed: of folds and permutations.
+        on_progress: called with what is being done.
+    """
+    timed = [effect for effect in effects
+             if effect.within_flights and not effect.unavailable(result.model.links)]
+    model: CrossValidatedModel | None = None
+    while not result.is_full:
+        step, refused = len(result.model.whole.effects), []
+        fitted = [fit_candidate(result.model, effect, step, result.criteria) for effect in timed]
+        candidates = [each for each in fitted if isinstance(each, Candidate)]
+        kept = None
+        for candidate in sorted(candidates, key=lambda each: -each.gain):
+            on_progress(f"step {step + 1}: {candidate.effect.name}, held out within flights")
+            model = model or _within_flights(result, links, base, seed)
+            score, extended = _score(model, candidate.effect, len(timed), step, seed, result)
+            if extended is not None:
+                kept = candidate
+                model = extended
+                result.keep(score, _adopted(result.model, candidate))
+                break
+            refused.append(score)
+        if kept is None:
+            result.scores += refused
+            return
+
+
+def _within_flights(result: SelectionResult, links: LinkData, base: Base,
+                    seed: int) -> CrossValidatedModel:
+    """Return the model as it is, fitted to folds that leave part of each flight."""
+    links = located_links(result.model, links, base)
+    folds = _folds(links, seed)
+    model = cross_validate(links, base, folds, training_parts(links, folds))
+    for each in result.model.whole.effects:
+        model = with_effect(model, each.effect, each.params)
+    return model
+
+
+def _folds(links: LinkData, seed: int) -> Folds:
+    by_device = len(links.anchors & set(links.device.tolist())) >= MIN_DEVICES
+    return make_folds(links, seed, "device" if by_device and not devices_move(links) else "block")
+
+
+def _score(model: CrossValidatedModel, effect: Effect, tried: int, step: int, seed: int,
+           result: SelectionResult) -> tuple[CandidateScore, CrossValidatedModel | None]:
+    candidate = fit_candidate(model, effect, step, result.criteria)
+    if isinstance(candidate, CandidateScore):
+        return candidate, None
+    return score_candidate(model, candidate, evidence_blocks(model.links), tried, step, seed,
+                           result.criteria)
+
+
+def _adopted(model: CrossValidatedModel, candidate: Candidate) -> CrossValidatedModel:
+    """Return a model with the effect; a fold has it as far as its own training links show it."""
+    effect, like = candidate.effect, candidate.whole.effects[-1].params
+    models, fits = [candidate.whole], [candidate.fit]
+    for each, fit in zip(model.folds, model.fits[1:], strict=True):
+        own: list[Any] = effect.propose_like(each.view(fit), like)
+        if own:
+            each = each.with_effects([*each.effects, each.apply(effect, own[0])])
+            fit = each.fit(fit)
+        models.append(each)
+        fits.append(fit)
+    return model.extended(models, fits)

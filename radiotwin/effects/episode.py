@@ -1,0 +1,303 @@
+"""Something that takes from levels between two times: rain, a wet antenna, a plug that was loose.
+
+A loss [dB], or an attenuation along the path [dB/km] (ITU-R P.838, 'Specific attenuation model for
+rain'), of one receiver or of all. The times are the two change points between which the residual,
+compared with that of other flights at the same places, differs most from the rest (circular binary
+segmentation, Olshen et al. 2004, Biostatistics 5); no other window of that length may differ like
+that.
+"""
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+from scipy.stats import t
+from typing_extensions import override
+
+from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.atmosphere import max_gas_db_km, max_rain_db_km
+from radiotwin.effects.base import GainEffect, Term
+from radiotwin.effects.comparison import compared_where_possible_db, flight_mask, share_alike
+from radiotwin.effects.params import (
+    EffectParams,
+    Estimate,
+    Parameter,
+    ReceiverIndex,
+    Seconds,
+)
+from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.links import LinkData
+
+MIN_LINKS = 60  # with a time, of a receiver or a flight
+MIN_INSIDE = 20  # links between the two times, and outside
+MAX_INSIDE = 0.5  # share of the links between the two times: more are the usual state
+MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal errors
+MIN_NATS = 10.0  # that an episode must gain to be proposed
+MIN_DB = 1.5  # mean change; a smaller one changes no decision
+INTERVAL_NATS = 2.0  # below the best: a change point's 90 % interval is wider than a mean's (1.35)
+BINS = 160  # of times, whose ends are tried
+MIN_WINDOWS = 4  # of the same length elsewhere, to compare with
+MAX_P_VALUE = 0.01  # that one of the windows differs like that by chance
+MIN_MEMBER_LINKS = 5  # of a device or receiver in the episode, to be asked whether it agrees
+MIN_KNOWN, MIN_DEVICES = 0.5, 4  # share that is compared, or else devices that must be there
+MIN_MEMBERS = 0.7  # share of them that must agree: it acts on all
+SAME_SHARE = 0.9  # of a flight's links: an episode of one receiver that long is a faulty flight
+PRIOR_SD_DB, PRIOR_SD_DB_KM = 15.0, 30.0
+
+
+class _Window(NamedTuple):
+    """Links between two times: how much likelier, when (and between which times), in which form."""
+
+    nats: float
+    start_s: float
+    end_s: float
+    start_within_s: tuple[float, float]
+    end_within_s: tuple[float, float]
+    form: Literal["loss", "attenuation"]
+
+
+class Episode(GainEffect):
+    """A loss or an attenuation between two times; a step finds the strongest."""
+
+    name = "episode"
+    figure = "dependence"
+    of_receiver = True
+    repeatable = True
+    within_flights = True
+    confused_with = ("faulty_flight", "receiver_drift", "excess_attenuation")
+
+    class Params(EffectParams):
+        """Who is affected, when, and in which form."""
+
+        receiver: ReceiverIndex | None = Field(description="Index of the receiver; None: all.")
+        flight: str | None = Field(
+            None, max_length=10_000,
+            description="Name of the flight, where clocks restart in each; None: times tell.")
+        start_s: Seconds = Field(description="First time [s].")
+        end_s: Seconds = Field(description="Last time [s].")
+        start_within_s: tuple[Seconds, Seconds] = Field(
+            description="90 % interval of the time at which it began [s].")
+        end_within_s: tuple[Seconds, Seconds] = Field(
+            description="90 % interval of the time at which it ended [s].")
+        form: Literal["loss", "attenuation"] = Field(
+            description="A loss [dB], or one in proportion to the distance [dB/km].")
+        frequency_hz: float | None = Field(
+            None, gt=0, le=1e12, description="Of the radio [Hz]; None: unknown, no bound.")
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if np.isfinite(links.time_s).sum() < MIN_LINKS:
+            return "there is no time_s"
+        if len(np.unique(links.flight)) < 2:
+            return "there is one flight, and no other to compare with at the same places"
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        links, found = view.links, []
+        rest_db, known = compared_where_possible_db(view)
+        receivers: list[int | None] = list(frequent_labels(links.receiver, MIN_LINKS))
+        flights = [str(links.flight_names[number]) for number in np.unique(links.flight)] \
+            if links.time_restarts else [None]
+        for receiver in receivers if len(receivers) < 2 else [None, *receivers]:
+            for flight in flights:
+                params = self._proposed(view, rest_db, known, receiver, flight)
+                if params is not None:
+                    found.append(params)
+        return [each for _, each in sorted(found, key=lambda each: -each[0])[:2]]
+
+    @override
+    def propose_like(self, view: ResidualView, params: Params) -> list[Params]:
+        # The times are found anew: those of all links would be known from what is held out.
+        rest_db, _ = compared_where_possible_db(view)
+        rows = _timed_rows(view.links, params.receiver, params.flight)
+        window = _strongest(view, rest_db, rows) if len(rows) >= MIN_LINKS else None
+        if window is None or window.start_s > params.end_s or window.end_s < params.start_s:
+            return []
+        return [params.model_copy(update={key: value for key, value in window._asdict().items()
+                                          if key not in ("nats", "form")})]
+
+    def _proposed(self, view: ResidualView, rest_db: np.ndarray, known: np.ndarray,
+                  receiver: int | None, flight: str | None) -> tuple[float, Params] | None:
+        links = view.links
+        rows = _timed_rows(links, receiver, flight)
+        window = _strongest(view, rest_db, rows) if len(rows) >= MIN_LINKS else None
+        if window is None or window.nats < MIN_NATS:
+            return None
+        known_hz = float(links.frequency_hz) if np.isfinite(links.frequency_hz) else None
+        params = self.Params(receiver=receiver, flight=flight, frequency_hz=known_hz,
+                             **{key: value for key, value in window._asdict().items()
+                                if key != "nats"})
+        inside = _inside(links, params)
+        stands_out = _agrees(links, rest_db, known, rows, inside) \
+            and not _is_another(links, params, inside) and _is_alone(links, rest_db, rows, inside)
+        return (window.nats, params) if stands_out else None
+
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        loss = np.where(_inside(links, params), -1.0, 0.0)
+        if params.form == "attenuation":
+            return Term.of_columns((loss * links.distance_m / 1000)[:, None], PRIOR_SD_DB_KM)
+        return Term.of_columns(loss[:, None], PRIOR_SD_DB)
+
+    @override
+    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+        if params.form == "loss":
+            return None
+        if coefficients[0] < 0:
+            return f"it would have to amplify, by {-coefficients[0]:.1f} dB/km"
+        if params.frequency_hz is not None:
+            most_db_km = max_gas_db_km(params.frequency_hz) + max_rain_db_km(params.frequency_hz)
+            if coefficients[0] > most_db_km:
+                return (f"{coefficients[0]:.3g} dB/km are more than air and rain take at "
+                        f"{params.frequency_hz / 1e9:g} GHz: {most_db_km:.3g} dB/km (ITU-R P.676, "
+                        "P.838)")
+        return None
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        who = "all" if params.receiver is None else links.receiver_names[params.receiver]
+        member = f"[{who}]" if params.flight is None else f"[{who}, flight {params.flight}]"
+        name, unit = ("loss_db", "dB") if params.form == "loss" else \
+            ("specific_attenuation_db_km", "dB/km")
+        return {name + member: Parameter.normal(estimate.coefficients[0],
+                                                estimate.coefficients_sd[0], unit),
+                "start_s" + member: Parameter(params.start_s, *params.start_within_s, "s"),
+                "end_s" + member: Parameter(params.end_s, *params.end_within_s, "s")}
+
+
+def _inside(links: LinkData, params: Any) -> np.ndarray:
+    """Return (n,) bool, links that an episode acts on."""
+    with np.errstate(invalid="ignore"):
+        between = (links.time_s >= params.start_s) & (links.time_s <= params.end_s)
+    return between & flight_mask(links, params.receiver, params.flight)
+
+
+def _timed_rows(links: LinkData, receiver: int | None, flight: str | None) -> np.ndarray:
+    """Return the rows of a receiver on a flight (None: of all) that have a time."""
+    return np.flatnonzero(flight_mask(links, receiver, flight) & np.isfinite(links.time_s))
+
+
+def _strongest(view: ResidualView, every_db: np.ndarray, rows: np.ndarray) -> _Window | None:
+    """Return the window in which a loss, or an attenuation, explains most.
+
+    Twice: over the whole time, then over finer ends around what was found.
+
+    Args:
+        view: the training links.
+        every_db: (n,) compared residuals [dB].
+        rows: (r,) links that it may be among.
+    """
+    time_s, rest_db = view.links.time_s[rows], every_db[rows]
+    distance_km = view.links.distance_m[rows] / 1000
+    # Others' errors are in a comparison, too.
+    scatter = MAD_SD * np.median(np.abs(rest_db - np.median(rest_db))) / view.scale_db[rows]
+    weight = view.weight[rows] / np.maximum(scatter, 1.0) ** 2
+    times_s = np.unique(time_s)
+    ends = times_s[np.unique(np.linspace(0, len(times_s) - 1, BINS).round().astype(int))]
+    best = _best_window(ends, time_s, rest_db, weight, distance_km)
+    if best is None or len(ends) == len(times_s):
+        return best
+    coarse = np.max(np.diff(np.searchsorted(times_s, ends)))
+    near = [np.abs(np.arange(len(times_s)) - np.searchsorted(times_s, each)) <= coarse
+            for each in (best.start_s, best.end_s)]
+    ends = times_s[near[0] | near[1]]
+    return _best_window(np.unique(np.r_[times_s[0], ends, times_s[-1]]), time_s, rest_db, weight,
+                        distance_km) or best
+
+
+def _best_window(ends_s: np.ndarray, time_s: np.ndarray, rest_db: np.ndarray, weight: np.ndarray,
+                 distance_km: np.ndarray) -> _Window | None:
+    """Return the best window from one of some times to just before another."""
+    cell = np.searchsorted(ends_s, time_s, side="right") - 1
+    count = _sums(cell, np.ones(len(cell)), len(ends_s))
+    inside = count[None, :] - count[:, None]
+    allowed = (inside >= MIN_INSIDE) & (inside <= MAX_INSIDE * len(time_s))
+    if not allowed.any():
+        return None
+    centred, total = rest_db - weight @ rest_db / weight.sum(), weight.sum()
+    best = None
+    for form, shape in (("loss", np.ones(len(cell))), ("attenuation", distance_km)):
+        wx, wxx, wxd = (_sums(cell, weight * value, len(ends_s)) for value in
+                        (shape, shape**2, shape * centred))
+        x, xx, xd = (each[None, :] - each[:, None] for each in (wx, wxx, wxd))
+        prior = PRIOR_SD_DB if form == "loss" else PRIOR_SD_DB_KM
+        power = np.maximum(xx - x**2 / total, 0) + prior**-2
+        # The logarithm pays for the choice among the windows.
+        nats = np.where(allowed & (xx > 0), 0.5 * xd**2 / power, -np.inf) - np.log(allowed.sum())
+        if form == "attenuation":
+            nats = np.where(xd < 0, nats, -np.inf)
+        start, end = np.unravel_index(int(nats.argmax()), nats.shape)
+        if best is None or nats[start, end] > best.nats:
+            likely = nats > nats[start, end] - INTERVAL_NATS
+            starts, stops = np.flatnonzero(likely[:, end]), np.flatnonzero(likely[start])
+            last_s = np.r_[-np.inf, np.maximum.accumulate(_last_s(cell, time_s, len(ends_s)))]
+            # It began after the reading before its first one, and ended before the next one.
+            best = _Window(
+                float(nats[start, end]), float(ends_s[start]), float(last_s[end]),
+                (float(last_s[starts[0]] if starts[0] else ends_s[0]), float(ends_s[starts[-1]])),
+                (float(last_s[stops[0]]), float(ends_s[min(stops[-1], len(ends_s) - 1)])), form)
+    return best
+
+
+def _sums(cell: np.ndarray, value: np.ndarray, cells: int) -> np.ndarray:
+    """Return sums (cells + 1,) of the values (n,) in the cells before each."""
+    return np.r_[0.0, np.cumsum(np.bincount(cell, weights=value, minlength=cells))]
+
+
+def _last_s(cell: np.ndarray, time_s: np.ndarray, cells: int) -> np.ndarray:
+    """Return the last time (cells,) in each cell [s]; -inf in an empty one."""
+    last_s = np.full(cells, -np.inf)
+    np.maximum.at(last_s, cell, time_s)
+    return last_s
+
+
+def _agrees(links: LinkData, rest_db: np.ndarray, known: np.ndarray, rows: np.ndarray,
+            inside: np.ndarray) -> bool:
+    """Return whether most devices, and most receivers, show the change.
+
+    Where no other flight was, there must be several: what a map lacks hides few at once.
+    """
+    mine = rows[inside[rows]]
+    if known[mine].mean() < MIN_KNOWN and len(
+            frequent_labels(links.device[mine], MIN_MEMBER_LINKS)) < MIN_DEVICES:
+        return False
+    outside_db = float(np.median(rest_db[rows[~inside[rows]]]))
+    change_db = float(np.median(rest_db[mine])) - outside_db
+    if abs(change_db) < MIN_DB:
+        return False
+    return all(share_alike(label[mine], rest_db[mine] - outside_db, MIN_MEMBER_LINKS,
+                           0.3 * change_db) >= MIN_MEMBERS
+               for label in (links.device, links.receiver)
+               if np.bincount(label[mine]).max() >= MIN_MEMBER_LINKS)
+
+
+def _is_another(links: LinkData, params: Any, inside: np.ndarray) -> bool:
+    """Return whether it is a step in time of one receiver, or all of one of its flights."""
+    if params.receiver is None:
+        return False
+    mine = links.receiver == params.receiver
+    if params.flight is None:
+        timed_s = links.time_s[mine & np.isfinite(links.time_s)]
+        if params.start_s <= timed_s.min() or params.end_s >= timed_s.max():
+            return True
+    covered = np.unique(links.flight[inside])
+    whole = [inside[mine & (links.flight == each)].mean() > SAME_SHARE for each in covered]
+    return len(covered) == 1 and whole[0]
+
+
+def _is_alone(links: LinkData, rest_db: np.ndarray, rows: np.ndarray, inside: np.ndarray) -> bool:
+    """Return whether no other window of the same length differs as much (Student's t)."""
+    order = rows[np.lexsort((links.time_s[rows], links.flight[rows] * links.time_restarts))]
+    own = inside[order]
+    others = order[~own]
+    windows = int(len(others) // own.sum())
+    if windows < MIN_WINDOWS:
+        windows = min(MIN_WINDOWS, len(others) // MIN_INSIDE)
+    if windows < 3:
+        return False
+    levels_db = np.array([np.median(rest_db[each]) for each in np.array_split(others, windows)])
+    change_db = abs(float(np.median(rest_db[order[own]])) - float(levels_db.mean()))
+    sd_db = max(float(levels_db.std(ddof=1)), 0.1) * np.sqrt(1 + 1 / windows)
+    return bool(2 * t.sf(change_db / sd_db, windows - 1) * (windows + 1) <= MAX_P_VALUE)
