@@ -29,7 +29,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
     kept = [score for score in selection.scores if score.kept]
     effects = [{"name": score.name, "variant": each.effect.variant, "rank": rank,
                 "params": each.params.model_dump(mode="json"),
-                "parameters": {name: vars(parameter) for name, parameter in parameters.items()},
+                "parameters": {name: parameter.record() for name, parameter in parameters.items()},
                 "confused_with": list(each.effect.confused_with), "indistinguishable_from": rivals,
                 "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value}}
                for rank, (score, each, parameters, rivals) in enumerate(

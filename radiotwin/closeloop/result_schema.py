@@ -47,6 +47,7 @@ class ParameterRecord(Record):
     low: Number | None
     high: Number | None
     unit: str
+    determined: bool = True
 
 
 class EvidenceRecord(Record):

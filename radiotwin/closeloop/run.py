@@ -21,6 +21,7 @@ from radiotwin.closeloop.cross_validation import (
     training_parts,
 )
 from radiotwin.closeloop.folds import Folds, make_folds
+from radiotwin.closeloop.intervals import effect_parameters
 from radiotwin.closeloop.residual_tests import ResidualDependence, residual_dependences
 from radiotwin.closeloop.selection import SelectionResult, add_shadowing, forward_selection
 from radiotwin.closeloop.thinning import thin_links
@@ -86,11 +87,8 @@ class Loop:
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:
-        """Of each kept effect; their intervals take a fit for each end."""
-        whole = self.after.whole
-        estimates = whole.estimates(self.after.fits[0])
-        return [each.effect.parameters(whole.links, each.params, estimate)
-                for each, estimate in zip(whole.effects, estimates, strict=True)]
+        """Of each kept effect, see `effect_parameters`."""
+        return effect_parameters(self.after)
 
 
 def significant(dependences: list[ResidualDependence],
