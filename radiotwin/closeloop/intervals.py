@@ -49,7 +49,7 @@ def _with_fold_values(model: CrossValidatedModel, number: int, estimate: Estimat
 
 def _values(fold: FoldModel, fit: FitResult, whole: FoldModel, number: int) -> dict[str, float]:
     """Return the values of an effect's parameters in one fold; empty where it was not found."""
-    place = _same_effects(whole, fold)[number]
+    place = same_effects(whole, fold)[number]
     if place is None:
         return {}
     applied, effect = fold.effects[place], whole.effects[number].effect
@@ -63,7 +63,7 @@ def _values(fold: FoldModel, fit: FitResult, whole: FoldModel, number: int) -> d
             for name, each in effect.parameters(fold.links, params, certain).items()}
 
 
-def _same_effects(whole: FoldModel, fold: FoldModel) -> list[int | None]:
+def same_effects(whole: FoldModel, fold: FoldModel) -> list[int | None]:
     """Return the place in a fold of each effect of the whole; None for what it has not found."""
     places: list[int | None] = []
     place = 0
@@ -98,7 +98,9 @@ def _checked(parameter: Parameter, found: int, folds: int) -> Parameter:
     allowed = parameter.allowed
     if not np.isfinite([parameter.low, parameter.high]).all():
         return parameter
-    low, high = np.clip([parameter.low, parameter.high], allowed.low, allowed.high).tolist()
+    # A value beyond its bounds stays: effects that cannot be are refused elsewhere.
+    low = max(parameter.low, min(allowed.low, parameter.value))
+    high = min(parameter.high, max(allowed.high, parameter.value))
     ends, bounds = np.array([low, high]), np.array([allowed.low, allowed.high])
     if allowed.is_log:
         with np.errstate(divide="ignore"):

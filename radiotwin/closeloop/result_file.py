@@ -30,11 +30,12 @@ def make_report(loop: Loop) -> dict[str, Any]:
     effects = [{"name": score.name, "variant": each.effect.variant, "rank": rank,
                 "params": each.params.model_dump(mode="json"),
                 "parameters": {name: parameter.record() for name, parameter in parameters.items()},
+                "size_db": size.record(),
                 "confused_with": list(each.effect.confused_with), "indistinguishable_from": rivals,
                 "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value}}
-               for rank, (score, each, parameters, rivals) in enumerate(
-                   zip(kept, loop.after.whole.effects, loop.parameters, selection.rivals,
-                       strict=False), start=1)]
+               for rank, (score, each, parameters, size, rivals) in enumerate(
+                   zip(kept, loop.after.whole.effects, loop.parameters, loop.sizes_db,
+                       selection.rivals, strict=False), start=1)]
     if loop.after.shadowing:
         effects.append(_shadowing(kept[-1], loop.after, len(effects) + 1))
     candidates = [{"name": score.name, "step": score.step + 1, "heldout_rmse_db": score.rmse_db,

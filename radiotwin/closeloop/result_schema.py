@@ -65,6 +65,7 @@ class EffectRecord(Record):
     rank: Whole
     params: dict[str, Any] = Field(default_factory=dict)
     parameters: dict[str, ParameterRecord]
+    size_db: ParameterRecord | None = None
     confused_with: list[str] = Field(default_factory=list)
     indistinguishable_from: list[str] = Field(default_factory=list)
     evidence: EvidenceRecord

@@ -20,6 +20,7 @@ from radiotwin.closeloop.cross_validation import (
     cross_validate,
     training_parts,
 )
+from radiotwin.closeloop.effect_size import effect_size_db
 from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.intervals import effect_parameters
 from radiotwin.closeloop.residual_tests import ResidualDependence, residual_dependences
@@ -89,6 +90,12 @@ class Loop:
     def parameters(self) -> list[dict[str, Parameter]]:
         """Of each kept effect, see `effect_parameters`."""
         return effect_parameters(self.after)
+
+    @cached_property
+    def sizes_db(self) -> list[Parameter]:
+        """Of each kept effect, see `effect_size_db`."""
+        return [effect_size_db(self.after, number)
+                for number in range(len(self.after.whole.effects))]
 
 
 def significant(dependences: list[ResidualDependence],

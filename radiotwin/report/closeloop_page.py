@@ -143,7 +143,9 @@ def _effects(report: dict, folder: Path) -> dict[str, list[dict]]:
     for effect in report["effects"][:MAX_EFFECTS]:
         name, label = effect["name"], name_label(effect["name"])
         heading = "Interpolated, not explained" if name in INTERPOLATIONS else "Effects found"
-        rows = [[parameter_label(key), _number(p["value"]), _interval(p), p["unit"]]
+        rows = [[parameter_label(key),
+                 _number(p["value"]) if p.get("determined", True) else "not determined", _interval(p),
+                 p["unit"]]
                 for key, p in effect["parameters"].items()]
         sections.setdefault(heading, []).append({
             "rank": effect["rank"], "name": name, "label": label, "evidence": _evidence(effect),
