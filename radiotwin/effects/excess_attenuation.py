@@ -85,11 +85,9 @@ class ExcessAttenuation(GainEffect):
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
-        most_db_km = np.inf if params.frequency_hz is None else max_at_ground_db_km(
-            params.frequency_hz, params.scale_height_m)
         return {"specific_attenuation_db_km": Parameter.normal(
                     estimate.coefficients[0], estimate.coefficients_sd[0], "dB/km",
-                    Allowed(0.0, most_db_km)),
+                    Allowed(low=0.0)),
                 "scale_height_m": Parameter.log_normal(
                     params.scale_height_m, estimate.params_sd[0], "m",
                     Allowed(MIN_HEIGHT_M, MAX_HEIGHT_M, is_log=True))}

@@ -176,24 +176,24 @@ def _scores(model: FoldModel, result: FitResult, secants: list[_Secant],
     law = problem.law_columns
     if predicted.law_slope is not None:
         law = law * predicted.law_slope[:, None]
-    n, stack = len(law), hstack if issparse(problem.gain_columns) else np.hstack
+    n = len(law)
     mean, log_scale, score = (
         np.reshape([getattr(each, name) for each in secants], (len(secants), n)).T
         for name in ("mean_db", "log_scale", "score"))
     growth = np.broadcast_to(predicted.growth, n)[:, None]
     passed = np.broadcast_to(predicted.slope, n)[:, None]
-    arriving = _stacked(stack, [law, problem.gain_columns])
+    arriving = _beside([law, problem.gain_columns])
     zeros = np.zeros(arriving.shape)
     slope, scale_slope, curvature, scale_curvature = (
         each[:, None] for each in _curvatures(problem, predicted))
-    columns = _stacked(stack, [arriving * passed, mean])
+    columns = _beside([arriving * passed, mean])
     scored, roots = columns * slope, [columns * np.sqrt(curvature)]
     if predicted.growth.any() or log_scale.any():
-        columns = _stacked(stack, [arriving * growth, log_scale])
+        columns = _beside([arriving * growth, log_scale])
         scored = scored + columns * scale_slope
         roots.append(columns * np.sqrt(scale_curvature))
     if score.any():
-        columns = _stacked(stack, [zeros, score])
+        columns = _beside([zeros, score])
         scored = scored + columns
         roots.append(columns)
     coefficient_precision = 1.0 / np.square(problem.prior_sd_db)
@@ -203,6 +203,8 @@ def _scores(model: FoldModel, result: FitResult, secants: list[_Secant],
                   np.concatenate([coefficient_precision, design_effect * precision]))
 
 
-def _stacked(stack, parts) -> np.ndarray | csr_array:  # type: ignore[no-untyped-def]
-    stacked = stack(parts)
-    return csr_array(stacked) if issparse(stacked) else stacked
+def _beside(parts: list[np.ndarray | csr_array]) -> np.ndarray | csr_array:
+    """Return columns side by side; sparse if any of them is."""
+    if any(issparse(each) for each in parts):
+        return csr_array(hstack(parts))
+    return np.hstack(parts)

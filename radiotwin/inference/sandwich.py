@@ -49,8 +49,8 @@ class Scores:
         Args:
             clusterings: (n,) integer labels of rows that err alike, such as places, or flights.
         """
-        bread = self.bread
-        best = bread @ (_dense(self.root.T @ self.root) + np.diag(self.prior_score_variance)) @ bread
+        bread, information = self.bread, _dense(self.root.T @ self.root)
+        best = bread @ (information + np.diag(self.prior_score_variance)) @ bread
         sd = np.sqrt(np.diag(best))
         shape = best / np.outer(sd, sd)
         for label in clusterings:

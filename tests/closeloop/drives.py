@@ -3,7 +3,6 @@
 No code of radiotwin makes their levels: laws, antennas and errors are written out here.
 """
 
-from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
