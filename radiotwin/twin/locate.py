@@ -84,9 +84,9 @@ def locate_file(measurements: Measurements, twin: Twin, scene: Scene | None,
     widening = _widening(model, links, found)
     if widening > 1.0:
         notes.append("all positions are uncertain: where devices are located, residuals are "
-                     f"{widening:.1f} times as large as those of the measurements that the twin was "
-                     "learnt from, so receivers or surroundings have changed since; radii are that "
-                     "much wider")
+                     f"{widening:.1f} times as large as in the measurements that the twin was "
+                     "learnt from, so receivers or surroundings have changed since; radii are "
+                     "that much wider")
         found = [replace(each, radius_m=widening * each.radius_m) for each in found]
     table = pd.DataFrame({"device": [links.device_names[each.device] for each in found],
                           "x_m": [each.x_m for each in found], "y_m": [each.y_m for each in found],
