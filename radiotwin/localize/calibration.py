@@ -28,7 +28,7 @@ from radiotwin.localize.without_map import (
 
 POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08)  # of the likelihood, that are tried
 MAX_TRIALS, MAX_TRIALS_WITH_MAP = 100, 24  # positions; over a map each takes seconds
-MAX_LINKS_WITH_MAP = 300  # of a trial
+MAX_LINKS_WITH_MAP = 200  # of a trial
 MIN_DEVICES = 50  # fewer do not tell the power apart from chance
 PRIOR_TRIALS = 2  # that the radii of the likelihood are worth, where trials are few
 MAX_Z = 6.0  # an outlier counts as this many scales
