@@ -17,7 +17,7 @@ from radiotwin import BadInput, Loop, Measurements, close_loop, make_report, rea
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.sector_antenna import SectorAntenna
-from radiotwin.localize import calibrated_power, locate, whole_area
+from radiotwin.localize import calibrate_radii, locate, whole_area
 from studies.closeloop import counted, summary
 from studies.runner import Study
 from studies.tables import markdown, number
@@ -112,10 +112,10 @@ def locate_held_out(loop: Loop, model: CrossValidatedModel) -> dict[str, dict]:
     area_m, rng, rows = whole_area(models[0], loop.links), np.random.default_rng(0), []
     for index, (learnt, fold) in enumerate(zip(models, folds)):
         others, elsewhere = ([*each[:index], *each[index + 1:]] for each in (models, folds))
-        power = calibrated_power(others, elsewhere, area_m, 0)  # type: ignore[arg-type]
+        known = calibrate_radii(others, elsewhere, area_m, 0)  # type: ignore[arg-type]
         chosen = rng.permutation(np.unique(fold.device))[:DEVICES_A_FOLD]
         asked = fold.select(np.isin(fold.device, chosen))
-        for found in locate(replace(learnt, likelihood_power=power), asked, area_m):
+        for found in locate(replace(learnt, **vars(known)), asked, area_m):
             away_m = loop.links.device_m[found.device, :2] - (found.x_m, found.y_m)
             rows.append((fold.flight_names[fold.flight[0]], np.hypot(*away_m), found.radius_m))
     located = pd.DataFrame(rows, columns=["flight", "error_m", "radius_m"])

@@ -94,8 +94,9 @@ def _print(report: dict[str, Any]) -> None:
     print_rows(
         f"Error on held-out links (by {report['heldout']['by']}) [dB], base {report['base']}",
         {"links": "left", "": "left", "RMSE": "right", "MAE": "right", "bias": "right"}, rows)
-    rows = [[effect["name"], name, *(_number(estimate[key]) for key in ("value", "low", "high")),
-             estimate["unit"]]
+    rows = [[effect["name"], name,
+             _number(estimate["value"]) if estimate["determined"] else "not determined",
+             *(_number(estimate[key]) for key in ("low", "high")), estimate["unit"]]
             for effect in report["effects"] for name, estimate in effect["parameters"].items()]
     print_rows("Effects found", {"effect": "left", "parameter": "left", "value": "right",
                                  "low": "right", "high": "right", "unit": "left"}, rows)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import radiotwin
 from radiotwin.closeloop.run import Loop
 from radiotwin.effects.effect_model import EffectModel
-from radiotwin.localize import calibrated_power, whole_area
+from radiotwin.localize import RadiusCalibration, calibrate_radii, whole_area
 from radiotwin.scene import Scene
 from radiotwin.twin.twin import Twin
 
@@ -24,7 +24,7 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     """
     model = loop.after
     fitted = replace(EffectModel.of(model.whole, model.fits[0], causes_only=True),
-                     likelihood_power=_likelihood_power(loop),
+                     **vars(_calibration(loop)),
                      shadowing=model.shadowing[0] if model.shadowing else None)
     provenance = {"links": len(model.links), "radiotwin_version": radiotwin.__version__}
     if scene is not None:
@@ -33,15 +33,12 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     return replace(model.twin, provenance=provenance, fitted=fitted)
 
 
-def _likelihood_power(loop: Loop) -> float:
-    """Return how much the likelihood of positions is to be believed where there is no map.
-
-    With one, `radiotwin fit` locates devices.
-    """
+def _calibration(loop: Loop) -> RadiusCalibration:
+    """Return how far positions that the loop's models locate are to be believed."""
     model, links = loop.after, loop.links
-    if links.city is not None:
-        return 1.0
+    if model.whole.channel.follows_paths:  # which locates nothing: `check_can_locate`
+        return RadiusCalibration()
     models = [EffectModel.of(fold, fit)
               for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
     held_out = [links.select(model.index == number) for number in range(len(models))]
-    return calibrated_power(models, held_out, whole_area(models[0], links), 0)
+    return calibrate_radii(models, held_out, whole_area(models[0], links), 0)

@@ -30,14 +30,15 @@ def make_report(loop: Loop) -> dict[str, Any]:
     kept = [score for score in selection.scores if score.kept]
     effects = [{"name": score.name, "variant": each.effect.variant, "rank": rank,
                 "params": each.params.model_dump(mode="json"),
-                "parameters": {name: vars(parameter) for name, parameter in parameters.items()},
+                "parameters": {name: parameter.record() for name, parameter in parameters.items()},
+                "size_db": size.record(),
                 "confused_with": list(each.effect.confused_with), "indistinguishable_from": rivals,
                 "probability": score.probability,
                 "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value,
                              "evidence_nats": score.evidence_nats}}
-               for rank, (score, each, parameters, rivals) in enumerate(
-                   zip(kept, loop.after.whole.effects, loop.parameters, selection.rivals,
-                       strict=False), start=1)]
+               for rank, (score, each, parameters, size, rivals) in enumerate(
+                   zip(kept, loop.after.whole.effects, loop.parameters, loop.sizes_db,
+                       selection.rivals, strict=False), start=1)]
     if loop.after.shadowing:
         effects.append(_shadowing(kept[-1], loop.after, len(effects) + 1))
     candidates = [{"name": score.name, "step": score.step + 1, "heldout_rmse_db": score.rmse_db,
@@ -165,7 +166,8 @@ def _from_version_1(report: dict[str, Any]) -> dict[str, Any]:
     new_names = {"remarks": "notes", "structure_before": "dependences_before"}
     new = {new_names.get(name, name): value for name, value in report.items()}
     new["effects"] = [{("params" if name == "setting" else name): value
-                       for name, value in effect.items()} for effect in report["effects"]]
+                       for name, value in effect.items()} | {"size_db": None}
+                      for effect in report["effects"]]
     new["error"] = _with_new_bias(report["error"])
     new["baselines"] = _with_new_bias(report["baselines"])
     return new | {"schema": SCHEMA, "criteria": {}, "posterior": []}

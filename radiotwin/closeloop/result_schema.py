@@ -47,6 +47,7 @@ class ParameterRecord(Record):
     low: Number | None
     high: Number | None
     unit: str
+    determined: bool = True
 
 
 class EvidenceRecord(Record):
@@ -65,6 +66,7 @@ class EffectRecord(Record):
     rank: Whole
     params: dict[str, Any] = Field(default_factory=dict)
     parameters: dict[str, ParameterRecord]
+    size_db: ParameterRecord | None = None
     confused_with: list[str] = Field(default_factory=list)
     indistinguishable_from: list[str] = Field(default_factory=list)
     probability: Number | None = None

@@ -20,8 +20,10 @@ from radiotwin.closeloop.cross_validation import (
     cross_validate,
     training_parts,
 )
+from radiotwin.closeloop.effect_size import effect_size_db
 from radiotwin.closeloop.faults import select_faults
 from radiotwin.closeloop.folds import Folds, make_folds
+from radiotwin.closeloop.intervals import effect_parameters
 from radiotwin.closeloop.posterior import NONE, OTHER
 from radiotwin.closeloop.residual_tests import ResidualDependence, residual_dependences
 from radiotwin.closeloop.selection import SelectionResult, add_shadowing, forward_selection
@@ -98,11 +100,14 @@ class Loop:
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:
-        """Of each kept effect; their intervals take a fit for each end."""
-        whole = self.after.whole
-        estimates = whole.estimates(self.after.fits[0])
-        return [each.effect.parameters(whole.links, each.params, estimate)
-                for each, estimate in zip(whole.effects, estimates, strict=True)]
+        """Of each kept effect, see `effect_parameters`."""
+        return effect_parameters(self.after)
+
+    @cached_property
+    def sizes_db(self) -> list[Parameter]:
+        """Of each kept effect, see `effect_size_db`."""
+        return [effect_size_db(self.after, number)
+                for number in range(len(self.after.whole.effects))]
 
 
 def significant(dependences: list[ResidualDependence],

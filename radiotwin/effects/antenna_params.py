@@ -6,7 +6,13 @@ from typing import Any, TypeVar
 import numpy as np
 from pydantic import model_validator
 
-from radiotwin.effects.params import EffectParams, Parameter, Variation, quantities
+from radiotwin.effects.params import (
+    Allowed,
+    EffectParams,
+    Parameter,
+    Variation,
+    quantities,
+)
 
 
 class AntennaParams(EffectParams):
@@ -51,6 +57,13 @@ def vary_patterns(patterns: dict[int, Pattern],
                      list(np.arange(values.size).reshape(members, -1)))
 
 
+def allowed_of(name: str, field: dict[str, Any]) -> Allowed:
+    """Return the allowed values of a field of `quantities`; azimuths repeat."""
+    if name.endswith("azimuth_deg"):
+        return Allowed(period=360.0)
+    return Allowed(field["low"], field["high"])
+
+
 def report_pattern(pattern: AntennaParams, sd: np.ndarray, name: str,
                    with_map: bool) -> dict[str, Parameter]:
     """Return a pattern's parameters, by name; without a map, the last is not reported.
@@ -65,7 +78,8 @@ def report_pattern(pattern: AntennaParams, sd: np.ndarray, name: str,
     for (field, each), field_sd in zip(quantities(pattern).items(), sd, strict=True):
         value = getattr(pattern, field)
         value = value % 360 if field.endswith("azimuth_deg") else value
-        reported[f"{field}[{name}]"] = Parameter.normal(value, field_sd, each["unit"])
+        reported[f"{field}[{name}]"] = Parameter.normal(value, field_sd, each["unit"],
+                                                        allowed_of(field, each))
     if not with_map:
         reported.popitem()
     return reported

@@ -19,7 +19,14 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation, quantities
+from radiotwin.effects.params import (
+    Allowed,
+    EffectParams,
+    Estimate,
+    Parameter,
+    Variation,
+    quantities,
+)
 from radiotwin.links import LinkData
 
 if TYPE_CHECKING:
@@ -169,9 +176,17 @@ class Effect(ABC):
 
     def parameters(self, links: LinkData, params: Any, estimate: Estimate) -> dict[str, Parameter]:
         """Return what was found, by name; by default every parameter made with `quantity`."""
-        return {name: Parameter.normal(getattr(params, name), sd, each["unit"])
+        return {name: Parameter.normal(getattr(params, name), sd, each["unit"],
+                                       Allowed(each["low"], each["high"]))
                 for (name, each), sd in zip(quantities(self.Params).items(), estimate.params_sd,
                                             strict=True)}
+
+    def like(self, params: Any, other: Any) -> Any:
+        """Return the same cause in the form closest to other parameters of this effect.
+
+        For parameters of which several forms mean the same, such as a box turned by 90°.
+        """
+        return params
 
 
 class GainEffect(Effect):

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
-from radiotwin.effects.antenna_params import vary_patterns
+from radiotwin.effects.antenna_params import allowed_of, vary_patterns
 from radiotwin.effects.arrays import frequent_labels
 from radiotwin.effects.base import GainEffect
 from radiotwin.effects.params import (
@@ -102,7 +102,7 @@ class BodyShadowing(GainEffect):
                 value = getattr(body, field)
                 value = value % 360 if field == "azimuth_deg" else value
                 reported[f"body_{field}[{links.receiver_names[receiver]}]"] = Parameter.normal(
-                    value, field_sd, each["unit"])
+                    value, field_sd, each["unit"], allowed_of(field, each))
         return reported
 
 

@@ -33,6 +33,14 @@ class Box(NamedTuple):
     turn_deg: Annotated[float, Field(ge=-3600, le=3600)]
 
 
+    def like(self, other: "Box") -> "Box":
+        """Return the same box with the turn that is closest to that of another one."""
+        quarters = round((other.turn_deg - self.turn_deg) / 90.0)
+        sides = (self.length_m, self.width_m)[::-1 if quarters % 2 else 1]
+        return self._replace(length_m=sides[0], width_m=sides[1],
+                             turn_deg=self.turn_deg + 90.0 * quarters)
+
+
 class Crossing(NamedTuple):
     """How n links cross a box; NaN where a link's ground track does not.
 

@@ -15,6 +15,7 @@ from typing_extensions import override
 from radiotwin.effects.arrays import frequent_labels, subsample
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.params import (
+    Allowed,
     EffectParams,
     Estimate,
     Parameter,
@@ -108,7 +109,9 @@ class ReceiverClockOffset(GainEffect):
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         name = f"positions_late_by_s[{links.receiver_names[params.receiver]}]"
-        return {name: Parameter.normal(params.offset_s, estimate.params_sd[0], "s")}
+        max_s = MAX_M / params.speed_m_s
+        return {name: Parameter.normal(params.offset_s, estimate.params_sd[0], "s",
+                                       Allowed(-max_s, max_s))}
 
 
 def _speeds_m_s(links: LinkData) -> dict[int, float]:

@@ -35,8 +35,11 @@ class EffectModel:
         first_s: time of the first measurement that it was fitted to [s]; NaN without times.
         device_sd_db: standard deviation of what all links of a device have in common [dB].
         likelihood_power: power of the likelihood in localisation, see
-            `radiotwin.localize.without_map.calibrated_power`.
+            `radiotwin.localize.calibration`.
         shadowing: what is interpolated over the ground; None = nothing.
+        radius_factor: by which 90 % radii of located devices are wider than by the likelihood.
+        typical_misfit: of the links of located devices where it was learnt; NaN = not known.
+            Both are of `radiotwin.localize.calibration`.
     """
 
     channel: ChannelModel
@@ -50,6 +53,8 @@ class EffectModel:
     device_sd_db: float
     likelihood_power: float = 1.0
     shadowing: CorrelatedShadowing | None = None
+    radius_factor: float = 1.0
+    typical_misfit: float = np.nan
 
     @classmethod
     def of(cls, model: FoldModel, result: FitResult, causes_only: bool = False) -> EffectModel:

@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from radiotwin.effects.atmosphere import max_gas_db_km, max_rain_db_km
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, Variation
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.effects.vegetation import specific_db_m
 from radiotwin.links import LinkData
@@ -86,9 +86,11 @@ class ExcessAttenuation(GainEffect):
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         return {"specific_attenuation_db_km": Parameter.normal(
-                    estimate.coefficients[0], estimate.coefficients_sd[0], "dB/km"),
-                "scale_height_m": Parameter.log_normal(params.scale_height_m,
-                                                       estimate.params_sd[0], "m")}
+                    estimate.coefficients[0], estimate.coefficients_sd[0], "dB/km",
+                    Allowed(low=0.0)),
+                "scale_height_m": Parameter.log_normal(
+                    params.scale_height_m, estimate.params_sd[0], "m",
+                    Allowed(MIN_HEIGHT_M, MAX_HEIGHT_M, is_log=True))}
 
 
 def max_at_ground_db_km(frequency_hz: float, scale_height_m: float) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 
 from radiotwin.channel import ChannelModel
 from radiotwin.effects.base import DetectionEffect, Effect, LimitEffect, Term
-from radiotwin.effects.params import EffectParams, Estimate
+from radiotwin.effects.params import EffectParams
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.inference import censored_regression
 from radiotwin.inference.censored_regression import (
@@ -23,11 +23,8 @@ from radiotwin.inference.censored_regression import (
     FitResult,
     Linearisation,
     Response,
-    covariance,
 )
 from radiotwin.links import LinkData
-
-MIN_RISE_NATS = 1e-3  # of a profile likelihood: a flatter one says nothing of a parameter
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,36 +176,6 @@ class FoldModel:
         """Return the effects with their coefficients, without their terms on these links."""
         return tuple(FittedEffect(each.effect, each.params, result.coefficients[own])
                      for each, own in zip(self.effects, self.coefficient_slices, strict=True))
-
-    def estimates(self, result: FitResult) -> list[Estimate]:
-        """Return the uncertainty of each effect, in view of how many links count as one."""
-        design_effect = self.view(result).design_effect
-        sd = design_effect * covariance(self.training, result)
-        return [Estimate(result.coefficients[own], sd[own, own],
-                         np.sqrt(design_effect) * self._profile_widths(number, result))
-                for number, own in enumerate(self.coefficient_slices)]
-
-    def _profile_widths(self, number: int, result: FitResult) -> np.ndarray:
-        """Return (2, r) as `Estimate.profile_widths`, for links that count one each."""
-        applied = self.effects[number]
-        variation = applied.effect.variation(applied.params)
-        if variation is None:
-            return np.zeros((2, 0))
-        widths = np.empty((2, len(variation.values)))
-
-        def objective(numbers: np.ndarray) -> float:
-            effects = list(self.effects)
-            effects[number] = self.apply(applied.effect, variation.params(numbers))
-            return self.with_effects(effects).fit(result).objective
-
-        best = objective(variation.values)
-        for i, step in enumerate(variation.steps):
-            for row, sign in enumerate((-1.0, 1.0)):
-                numbers = variation.values.copy()
-                numbers[i] = np.clip(numbers[i] + sign * step, variation.low[i], variation.high[i])
-                rise = max(objective(numbers) - best, MIN_RISE_NATS)
-                widths[row, i] = step / np.sqrt(2 * rise)
-        return widths
 
     def _dropout_probability(self, rows: np.ndarray | slice) -> np.ndarray | float:
         """Return (n,) the probability of a blank whatever the level; 0 without such effects."""

@@ -22,7 +22,7 @@ from radiotwin.effects.boxes import (
     cross,
     obstruction_nats,
 )
-from radiotwin.effects.params import EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, Variation
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.effects.vegetation import max_loss_db
 from radiotwin.links import LinkData
@@ -103,9 +103,19 @@ class Foliage(GainEffect):
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
-        box_sd, law_sd = estimate.params_sd[:6], estimate.params_sd[6:]
-        reported = {name: Parameter.normal(value, sd, "deg" if name == "turn_deg" else "m")
-                    for name, value, sd in zip(Box._fields, params.box, box_sd, strict=True)}
+        variation = self.variation(params)
+        low, high = variation.low.tolist(), variation.high.tolist()
+        reported = {name: Parameter.normal(value, sd, "deg" if name == "turn_deg" else "m",
+                                           Allowed(least, most))
+                    for name, value, sd, least, most in zip(Box._fields, params.box,
+                                                            estimate.params_sd, low, high)}
         names = {"specific_attenuation_db_m": "dB/m", "greatest_loss_db": "dB"}
-        return reported | {name: Parameter.log_normal(value, sd, unit) for (name, unit), value, sd
-                           in zip(names.items(), params.law, law_sd, strict=True)}
+        return reported | {
+            name: Parameter.log_normal(value, sd, unit, Allowed(least, most, is_log=True))
+            for (name, unit), value, sd, least, most in zip(
+                names.items(), params.law, estimate.params_sd[6:], np.exp(low[6:]).tolist(),
+                np.exp(high[6:]).tolist(), strict=True)}
+
+    @override
+    def like(self, params: Params, other: Params) -> Params:
+        return params.model_copy(update={"box": params.box.like(other.box)})

@@ -16,6 +16,7 @@ from typing_extensions import override
 from radiotwin.effects.arrays import frequent_labels
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.params import (
+    Allowed,
     DeviceIndex,
     EffectParams,
     Estimate,
@@ -35,6 +36,7 @@ MIN_SIDE = 20  # links before and after a step
 MIN_GAP_SD = 3.0  # of a step's size, in standard deviations from flight to flight
 MAX_PROPOSALS = 2  # members: how much a drift explains shows once all else is fitted again
 PRIOR_SD_DB = 10.0
+MAX_LOG_S = 9.0  # natural logarithm of the longest time constant [s]
 TIME_CONSTANTS_S = (5.0, 10.0, 20.0, 40.0, 80.0, 160.0, 320.0, 640.0, 1280.0)
 MIN_CONSTANT_S = 1e-3  # of a warm-up that is read
 WARM_UPS = ("warm_up", "warm_up_each_flight")
@@ -151,7 +153,8 @@ class _GainDrift(GainEffect):
                    for member, number in zip(warming, numbers)}
             return params.model_copy(update={f"{self.end}s": drifts | new})
 
-        return Variation(values, np.full(n, 0.3), np.full(n, 0.0), np.full(n, 9.0), changed)
+        return Variation(values, np.full(n, 0.3), np.full(n, 0.0), np.full(n, MAX_LOG_S),
+                         changed)
 
     @override
     def parameters(self, links: LinkData, params: _DriftParams,
@@ -163,7 +166,8 @@ class _GainDrift(GainEffect):
             result[f"{form}_db[{name}]"] = Parameter.normal(
                 estimate.coefficients[2 * number], estimate.coefficients_sd[2 * number], "dB")
             if form in WARM_UPS:
-                result[f"time_constant_s[{name}]"] = Parameter.log_normal(value, next(log_sd), "s")
+                result[f"time_constant_s[{name}]"] = Parameter.log_normal(
+                    value, next(log_sd), "s", Allowed(1.0, float(np.exp(MAX_LOG_S)), is_log=True))
             elif form == "step":
                 result[f"step_time_s[{name}]"] = Parameter(value, value, value, "s")
         return result

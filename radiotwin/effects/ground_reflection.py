@@ -15,7 +15,14 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import LinkCache, subsample
 from radiotwin.effects.base import GainEffect
-from radiotwin.effects.params import EffectParams, Estimate, Metres, Parameter, Variation
+from radiotwin.effects.params import (
+    Allowed,
+    EffectParams,
+    Estimate,
+    Metres,
+    Parameter,
+    Variation,
+)
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
 from radiotwin.scene.materials import permittivity
@@ -110,8 +117,11 @@ class GroundReflection(GainEffect):
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         units = {"strength": "of medium dry ground", "roughness_m": "m", "ground_m": "m"}
-        return {name: Parameter.normal(getattr(params, name), sd, unit)
-                for (name, unit), sd in zip(units.items(), estimate.params_sd, strict=True)}
+        of = self.variation(params)
+        return {name: Parameter.normal(getattr(params, name), sd, unit,
+                                       Allowed(float(low), float(high)))
+                for (name, unit), sd, low, high in zip(units.items(), estimate.params_sd, of.low,
+                                                       of.high, strict=True)}
 
 
 def _has_bounce(links: LinkData) -> np.ndarray:

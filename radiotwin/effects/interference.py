@@ -15,7 +15,15 @@ from typing_extensions import override
 from radiotwin.channel.segmented_log_distance import NLOS_LOSS_DB, NLOS_LOSS_SD_DB
 from radiotwin.effects.arrays import subsample
 from radiotwin.effects.base import ReceiverEffect
-from radiotwin.effects.params import Decibels, EffectParams, Estimate, Metres, Parameter, Variation
+from radiotwin.effects.params import (
+    Allowed,
+    Decibels,
+    EffectParams,
+    Estimate,
+    Metres,
+    Parameter,
+    Variation,
+)
 from radiotwin.effects.power import NEPERS, add_power
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
@@ -129,9 +137,10 @@ class Interference(ReceiverEffect):
                    estimate: Estimate) -> dict[str, Parameter]:
         names = "x_m", "y_m", f"level_at_{REFERENCE_M:.0f}_m", "hidden_loss_db"
         units = "m", "m", "dB" if links.is_gain else "dBm", "dB"
-        values = self.variation(params).values.tolist()
-        return {name: Parameter.normal(value, sd, unit)
-                for name, value, sd, unit in zip(names, values, estimate.params_sd, units)}
+        of = self.variation(params)
+        return {name: Parameter.normal(value, sd, unit, Allowed(float(low), float(high)))
+                for name, value, sd, unit, low, high in zip(
+                    names, of.values.tolist(), estimate.params_sd, units, of.low, of.high)}
 
 
 def interference_db(receiver_m: np.ndarray, position_m: Sequence[float] | np.ndarray,

@@ -30,6 +30,7 @@ from radiotwin.effects.boxes import (
 )
 from radiotwin.effects.params import (
     QUANTILE_90,
+    Allowed,
     Decibels,
     EffectParams,
     Estimate,
@@ -134,13 +135,17 @@ class MissingObstacle(GainEffect):
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         variation = self.variation(params)
-        below, above = QUANTILE_90 * estimate.profile_widths
-        low = np.maximum(variation.values - below, variation.low)
-        high = np.minimum(variation.values + above, variation.high)
+        reach = variation.values + QUANTILE_90 * estimate.sides_sd * np.array([[-1.0], [1.0]])
         units = {"turn_deg": "deg", "scattered_db": "dB"}
-        return {name: Parameter(float(value), float(least), float(most), units.get(name, "m"))
-                for name, value, least, most in zip((*Box._fields, "scattered_db"),
-                                                    variation.values, low, high, strict=True)}
+        return {name: Parameter(float(value), float(low), float(high), units.get(name, "m"),
+                                allowed=Allowed(float(least), float(most)))
+                for name, value, low, high, least, most in zip(
+                    (*Box._fields, "scattered_db"), variation.values, *reach, variation.low,
+                    variation.high, strict=True)}
+
+    @override
+    def like(self, params: Params, other: Params) -> Params:
+        return params.model_copy(update={"box": params.box.like(other.box)})
 
 
 def _gain_db(crossing: Crossing, scattered: np.ndarray | float,

@@ -66,6 +66,25 @@ def quantity(default: Any, *, unit: str, low: float, high: float, step: float,
 
 
 @dataclass(frozen=True)
+class Allowed:
+    """Values that a reported parameter may have.
+
+    Attributes:
+        low, high: bounds; infinite where there are none.
+        period: of an angle, after which values repeat; inf = they do not.
+        is_log: whether the parameter is positive and its ratios count, not its differences.
+    """
+
+    low: float = -np.inf
+    high: float = np.inf
+    period: float = np.inf
+    is_log: bool = False
+
+
+ANY_VALUE, POSITIVE = Allowed(), Allowed(low=0.0, is_log=True)
+
+
+@dataclass(frozen=True)
 class Parameter:
     """A fitted parameter as it is reported.
 
@@ -73,41 +92,55 @@ class Parameter:
         value: estimate.
         low, high: 90 % interval.
         unit: of all three.
+        determined: whether the interval is clearly narrower than what is allowed; False: the data
+            do not tell the value.
+        allowed: values that it may have.
     """
 
     value: float
     low: float
     high: float
     unit: str
+    determined: bool = True
+    allowed: Allowed = ANY_VALUE
 
     @classmethod
-    def normal(cls, value: float, sd: float, unit: str) -> "Parameter":
+    def normal(cls, value: float, sd: float, unit: str, allowed: Allowed = ANY_VALUE
+               ) -> "Parameter":
         """Return a parameter from an estimate and its standard deviation."""
         reach = QUANTILE_90 * sd
-        return cls(float(value), float(value - reach), float(value + reach), unit)
+        return cls(float(value), float(value - reach), float(value + reach), unit, allowed=allowed)
 
     @classmethod
-    def log_normal(cls, value: float, log_sd: float, unit: str) -> "Parameter":
+    def log_normal(cls, value: float, log_sd: float, unit: str, allowed: Allowed = POSITIVE
+                   ) -> "Parameter":
         """Return a positive parameter from an estimate and the sd of its natural logarithm."""
         low, high = value * np.exp([-QUANTILE_90 * log_sd, QUANTILE_90 * log_sd])
-        return cls(float(value), float(low), float(high), unit)
+        return cls(float(value), float(low), float(high), unit, allowed=allowed)
+
+    def record(self) -> dict[str, Any]:
+        """Return what `closeloop.json` has of it."""
+        return {"value": self.value, "low": self.low, "high": self.high, "unit": self.unit,
+                "determined": self.determined}
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Uncertainty of a fitted effect, in view of how many links count as one.
+    """Uncertainty of a fitted effect, in view of links that err alike.
+
+    Standard deviations are widened where few independent pieces of evidence stand behind them, so
+    that `QUANTILE_90` of them to each side are a 90 % interval.
 
     Attributes:
         coefficients: (q,) of the columns of its term.
         covariance: (q, q) of them.
-        profile_widths: (2, r) of the r numbers of its `variation`: how far below and above them the
-            likelihood, all coefficients fitted again, has fallen by half a nat if it falls as a
-            parabola on that side; very far where it does not fall.
+        sides_sd: (2, r) standard deviations of the r numbers of its `variation`, below and above
+            them, all other numbers and coefficients unknown, too.
     """
 
     coefficients: np.ndarray
     covariance: np.ndarray
-    profile_widths: np.ndarray
+    sides_sd: np.ndarray
 
     @property
     def coefficients_sd(self) -> np.ndarray:
@@ -116,8 +149,8 @@ class Estimate:
 
     @property
     def params_sd(self) -> np.ndarray:
-        """(r,) standard deviations of the numbers of its `variation`, of both sides' fall."""
-        return 1 / np.sqrt((1 / self.profile_widths**2).mean(axis=0))
+        """(r,) standard deviations of the numbers of its `variation`, the greater of both sides."""
+        return self.sides_sd.max(axis=0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,13 +15,14 @@ from typing_extensions import override
 from radiotwin.channel.followed_paths import paths_of
 from radiotwin.effects.arrays import city_of
 from radiotwin.effects.base import PathEffect
-from radiotwin.effects.params import Decibels, EffectParams, Estimate, Parameter, Variation
+from radiotwin.effects.params import Allowed, Decibels, EffectParams, Estimate, Parameter, Variation
 from radiotwin.effects.power import NEPERS, add_power
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
 
 STRENGTHS_DB = (0.0, -4.0, -8.0)  # to begin with, relative to theory
 MAX_LINKS = 60_000  # bounds the time of following paths
+BELOW_DB, ABOVE_DB = 30.0, 15.0  # theory, within which strengths are searched
 MIN_CLEAR = 20  # links with line of sight, for a median level
 
 
@@ -71,15 +72,16 @@ class _Paths(PathEffect):
     def variation(self, params: Params) -> Variation:
         level_db = params.level_db
         return Variation(
-            np.array([params.strength_db]), np.array([2.0]), np.array([level_db - 30.0]),
-            np.array([level_db + 15.0]),
+            np.array([params.strength_db]), np.array([2.0]), np.array([level_db - BELOW_DB]),
+            np.array([level_db + ABOVE_DB]),
             lambda numbers: params.model_copy(update={"strength_db": float(numbers[0])}))
 
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         return {"strength_db": Parameter.normal(params.strength_db - params.level_db,
-                                                estimate.params_sd[0], "dB")}
+                                                estimate.params_sd[0], "dB",
+                                                Allowed(-BELOW_DB, ABOVE_DB))}
 
 
 class WallReflection(_Paths):

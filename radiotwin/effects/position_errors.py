@@ -12,6 +12,7 @@ from typing_extensions import override
 from radiotwin.effects.arrays import frequent_labels, subsample
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.params import (
+    Allowed,
     DeviceIndex,
     EffectParams,
     Estimate,
@@ -33,6 +34,7 @@ DIRECTIONS = 12
 RECEIVER_MOVES_M = (5.0, 10.0, 20.0)
 RECEIVER_AXES = ((1, 0, 0), (0, 1, 0), (0.7, 0.7, 0), (0.7, -0.7, 0), (0, 0, 1))
 MAX_MOVE_M = 120.0  # east and north, of a device
+MAX_RECEIVER_MOVE_M = 60.0  # along each axis
 
 
 class DevicePositionError(GainEffect):
@@ -109,7 +111,8 @@ class DevicePositionError(GainEffect):
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         declared_m = links.device_m[params.device, :2]
-        return {f"{axis}_m[{links.device_names[device]}]": Parameter.normal(old_m + move_m, sd, "m")
+        return {f"{axis}_m[{links.device_names[device]}]": Parameter.normal(
+                    old_m + move_m, sd, "m", Allowed(old_m - MAX_MOVE_M, old_m + MAX_MOVE_M))
                 for device in site_of(links, params.device)
                 for axis, old_m, move_m, sd in zip("xy", declared_m, params.move_m,
                                                    estimate.params_sd, strict=True)}
@@ -169,14 +172,16 @@ class ReceiverPositionError(GainEffect):
     @override
     def variation(self, params: Params) -> Variation:
         return Variation(
-            np.array(params.move_m), np.full(3, 3.0), np.full(3, -60.0), np.full(3, 60.0),
+            np.array(params.move_m), np.full(3, 3.0), np.full(3, -MAX_RECEIVER_MOVE_M),
+            np.full(3, MAX_RECEIVER_MOVE_M),
             lambda move_m: params.model_copy(update={"move_m": tuple(move_m.tolist())}))
 
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         name = links.receiver_names[params.receiver]
-        return {f"true_minus_given_{axis}_m[{name}]": Parameter.normal(move_m, sd, "m")
+        return {f"true_minus_given_{axis}_m[{name}]": Parameter.normal(
+                    move_m, sd, "m", Allowed(-MAX_RECEIVER_MOVE_M, MAX_RECEIVER_MOVE_M))
                 for axis, move_m, sd in zip("xyz", params.move_m, estimate.params_sd, strict=True)}
 
 

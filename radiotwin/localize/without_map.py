@@ -6,6 +6,8 @@ battery), which is integrated out (Gauss-Hermite). The prior is flat over the ar
 first, then a finer one where the probability is.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -20,9 +22,6 @@ HELD = 0.999  # of the probability, by the coarse cells that are split
 NODES = 7  # of the quadrature over the device's own level
 CREDIBLE = 0.9
 MIN_LINKS = 3
-POWERS = (1.0, 0.7, 0.5, 0.35, 0.25, 0.18, 0.12, 0.08)  # of the likelihood, that are tried
-MAX_TRIALS = 100  # devices that the power is calibrated on
-MIN_DEVICES = 50  # fewer do not tell a share of nine in ten
 MARGIN_M = 300.0  # of the area around all ends that are known
 LINKS_AT_ONCE = 400_000  # of all cells together: bounds memory, 260 bytes each without a map
 
@@ -48,6 +47,47 @@ class PositionEstimate:
     links: int
 
 
+@dataclass(frozen=True, eq=False)
+class PositionPosterior:
+    """Likelihood of the links of one device over the cells where nearly all probability is.
+
+    Attributes:
+        device: row of the links' devices.
+        cells_m: (c, 2) their centres [m].
+        width_m: their width [m].
+        log_likelihood: (c,) of the links.
+        apart_m: (c, c) distance between cells [m].
+        links: that were used.
+    """
+
+    device: int
+    cells_m: np.ndarray
+    width_m: float
+    log_likelihood: np.ndarray
+    apart_m: np.ndarray
+    links: int
+
+    @classmethod
+    def of(cls, model: EffectModel, own: LinkData, area_m: Area, power: float
+           ) -> PositionPosterior:
+        """Return that of the links of one device; the cells hold the likelihood to a power."""
+        coarse_m, width_m = _grid(area_m)
+        coarse = position_log_likelihood(model, own, coarse_m)
+        cells_m, width_m = _finer(coarse, power, coarse_m, width_m)
+        return cls(int(own.device[0]), cells_m, width_m,
+                   position_log_likelihood(model, own, cells_m), cdist(cells_m, cells_m), len(own))
+
+    def estimate(self, power: float) -> PositionEstimate:
+        """Return the position by the likelihood as it is, and the radius by its power."""
+        best = int((self.apart_m @ _share(self.log_likelihood)).argmin())
+        order = np.argsort(self.apart_m[best])
+        cumulated = np.cumsum(_share(power * self.log_likelihood)[order])
+        reached = int(np.searchsorted(cumulated, CREDIBLE))
+        radius_m = self.apart_m[best][order[min(reached, len(order) - 1)]] + self.width_m / 2
+        return PositionEstimate(self.device, float(self.cells_m[best, 0]),
+                                float(self.cells_m[best, 1]), float(radius_m), self.links)
+
+
 def locate(model: EffectModel, links: LinkData, area_m: Area,
            on_progress: Callable[[], None] = lambda: None) -> Iterator[PositionEstimate]:
     """Locate the devices of some links, whatever position the links have them at but for height.
@@ -61,17 +101,12 @@ def locate(model: EffectModel, links: LinkData, area_m: Area,
     Yields:
         an estimate of each device with at least `MIN_LINKS` links.
     """
-    coarse_m, width_m = _grid(area_m)
     for device in np.unique(links.device):
         own = links.select(links.device == device)
-        if len(own) < MIN_LINKS:
-            on_progress()
-            continue
-        power = model.likelihood_power
-        fine_m, fine_width_m = _finer(_log_likelihood(model, own, coarse_m), power, coarse_m,
-                                      width_m)
-        yield _estimate(int(device), fine_m, _log_likelihood(model, own, fine_m), power,
-                        fine_width_m, len(own), cdist(fine_m, fine_m))
+        if len(own) >= MIN_LINKS:
+            power = model.likelihood_power
+            found = PositionPosterior.of(model, own, area_m, power).estimate(power)
+            yield replace(found, radius_m=model.radius_factor * found.radius_m)
         on_progress()
 
 
@@ -82,47 +117,15 @@ def whole_area(model: EffectModel, links: LinkData) -> Area:
     return west, east, south, north
 
 
-def calibrated_power(models: list[EffectModel], held_out: list[LinkData], area_m: Area,
-                     seed: int) -> float:
-    """Return the power of the likelihood with which 90 % radii hold 90 % of positions.
-
-    Links of one device err alike, and what was learnt on other days is not all that holds today; so
-    the likelihood alone is too certain. Tried on devices of known position with models that have
-    not seen their links (Holmes and Walker 2017, 'Assigning a value to a power likelihood in a
-    general Bayesian model', Biometrika 104).
+def position_log_likelihood(model: EffectModel, own: LinkData,
+                            positions_m: np.ndarray) -> np.ndarray:
+    """Return the log-likelihood (c,) of the links of one device, if it were elsewhere.
 
     Args:
-        models: one a fold, each learnt without it.
-        held_out: links of each fold, devices at their true positions.
-        area_m: as of `locate`.
-        seed: of which devices are taken.
-
-    Returns:
-        the power; 1 where devices are too few to tell.
+        model: counts receivers as the links do.
+        own: links of one device.
+        positions_m: (c, 2) where it might be, at the height that the links have it [m].
     """
-    if len(np.unique(np.concatenate([links.device for links in held_out]))) < MIN_DEVICES:
-        return 1.0
-    coarse_m, width_m = _grid(area_m)
-    trials = [(model, links, device) for model, links in zip(models, held_out, strict=True)
-              for device in np.flatnonzero(np.bincount(links.device) >= MIN_LINKS)]
-    chosen = np.random.default_rng(seed).permutation(len(trials))[:MAX_TRIALS]
-    inside = np.zeros(len(POWERS))
-    for number in chosen:
-        model, links, device = trials[number]
-        own = links.select(links.device == device)
-        fine_m, fine_width_m = _finer(_log_likelihood(model, own, coarse_m), POWERS[-1], coarse_m,
-                                      width_m)
-        log_likelihood, apart_m = _log_likelihood(model, own, fine_m), cdist(fine_m, fine_m)
-        for i, power in enumerate(POWERS):
-            found = _estimate(int(device), fine_m, log_likelihood, power, fine_width_m, 0, apart_m)
-            off_m = np.hypot(*(links.device_m[device, :2] - (found.x_m, found.y_m)))
-            inside[i] += off_m <= found.radius_m
-    enough = np.flatnonzero(inside >= CREDIBLE * len(chosen))
-    return float(POWERS[enough[0]] if len(enough) else POWERS[-1])
-
-
-def _log_likelihood(model: EffectModel, own: LinkData, positions_m: np.ndarray) -> np.ndarray:
-    """Return (c,) of the links of one device, if it were at positions (c, 2)."""
     cells = max(LINKS_AT_ONCE // len(own), 1)
     return np.concatenate([_log_likelihood_at(model, own, positions_m[first:first + cells])
                            for first in range(0, len(positions_m), cells)])
@@ -167,21 +170,6 @@ def _finer(log_likelihood: np.ndarray, power: float, coarse_m: np.ndarray,
 def _share(log_likelihood: np.ndarray) -> np.ndarray:
     share = np.exp(log_likelihood - log_likelihood.max())
     return share / share.sum()
-
-
-def _estimate(device: int, positions_m: np.ndarray, log_likelihood: np.ndarray, power: float,
-              width_m: float, links: int, apart_m: np.ndarray) -> PositionEstimate:
-    """Return the estimate from positions (c, 2) with a likelihood (c,), apart (c, c) [m].
-
-    The likelihood as it is decides the position, its power the radius.
-    """
-    best = int((apart_m @ _share(log_likelihood)).argmin())
-    order = np.argsort(apart_m[best])
-    cumulated = np.cumsum(_share(power * log_likelihood)[order])
-    reached = int(np.searchsorted(cumulated, CREDIBLE))
-    radius_m = apart_m[best][order[min(reached, len(order) - 1)]] + width_m / 2
-    return PositionEstimate(device, float(positions_m[best, 0]), float(positions_m[best, 1]),
-                            float(radius_m), links)
 
 
 def _grid(area_m: Area) -> tuple[np.ndarray, float]:

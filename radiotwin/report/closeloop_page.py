@@ -143,7 +143,7 @@ def _effects(report: dict, folder: Path) -> dict[str, list[dict]]:
     for effect in report["effects"][:MAX_EFFECTS]:
         name, label = effect["name"], name_label(effect["name"])
         heading = "Interpolated, not explained" if name in INTERPOLATIONS else "Effects found"
-        rows = [[parameter_label(key), _number(p["value"]), _interval(p), p["unit"]]
+        rows = [[parameter_label(key), _value(p), _interval(p), p["unit"]]
                 for key, p in effect["parameters"].items()]
         sections.setdefault(heading, []).append({
             "rank": effect["rank"], "name": name, "label": label, "evidence": _evidence(effect),
@@ -234,6 +234,10 @@ def _number(value: float | None) -> str:
     else:
         text = f"{value:.2f}" if abs(value) < 1000 else f"{value:,.0f}"
     return text.replace("-", "−")
+
+
+def _value(parameter: dict) -> str:
+    return _number(parameter["value"]) if parameter.get("determined", True) else "not determined"
 
 
 def _interval(parameter: dict) -> str:

@@ -133,10 +133,11 @@ def histogram_figure(effect: EffectData, _: MapBackground) -> Figure:
 
 
 def interval_figure(effect: EffectData, background: MapBackground) -> Figure:
-    """Draw the value of each member with its 90 % interval."""
-    if not effect.parameters:
+    """Draw the value of each member that the data determine, with its 90 % interval."""
+    known = {name: each for name, each in effect.parameters.items() if each.determined}
+    if not known:
         return dependence_figure(effect, background)
-    chosen = sorted(effect.parameters.items(), key=lambda item: -abs(item[1].value))[:MAX_BARS]
+    chosen = sorted(known.items(), key=lambda item: -abs(item[1].value))[:MAX_BARS]
     chosen.sort(key=lambda item: item[1].value)
     value = np.array([p.value for _, p in chosen])
     errors = np.abs(np.array([(p.value - p.low, p.high - p.value) for _, p in chosen]).T)

@@ -6,14 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
+from radiotwin.effects.effect_model import EffectModel
 from radiotwin.errors import BadInput
-from radiotwin.links import prepare_links
-from radiotwin.localize import locate, whole_area
+from radiotwin.links import LinkData, prepare_links
+from radiotwin.localize import PositionEstimate, locate, misfit, whole_area
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 from radiotwin.twin.twin import Twin
 
 MAX_NAMED = 5  # receivers in a note
+MIN_WIDENING = 1.2  # of residuals, from which a file's links are unlike those learnt from
 
 
 def check_can_locate(twin: Twin, scene: Scene | None) -> None:
@@ -80,11 +82,27 @@ def locate_file(measurements: Measurements, twin: Twin, scene: Scene | None,
                     np.full(len(links), twin.limit_db))
     area_m = scene.config.extent.bounds if scene is not None else whole_area(model, links)
     found = list(locate(model, links, area_m, on_progress))
+    widening = _widening(model, links, found)
+    if widening > 1.0:
+        notes.append("all positions are uncertain: where devices are located, residuals are "
+                     f"{widening:.1f} times as large as in the measurements that the twin was "
+                     "learnt from, so receivers or surroundings have changed since; radii are "
+                     "that much wider")
+        found = [replace(each, radius_m=widening * each.radius_m) for each in found]
     table = pd.DataFrame({"device": [links.device_names[each.device] for each in found],
                           "x_m": [each.x_m for each in found], "y_m": [each.y_m for each in found],
                           "radius_m": [each.radius_m for each in found],
                           "links": [each.links for each in found]})
     return table.round(1), notes
+
+
+def _widening(model: EffectModel, links: LinkData, found: list[PositionEstimate]) -> float:
+    """Return how much larger residuals are than they were at home; 1 where they are much alike."""
+    if np.isnan(model.typical_misfit) or not found:
+        return 1.0
+    misfits = [misfit(model, links.select(links.device == each.device), each) for each in found]
+    ratio = float(np.sqrt(np.nanmedian(misfits) / model.typical_misfit))
+    return ratio if ratio > MIN_WIDENING else 1.0
 
 
 def position_errors(positions: pd.DataFrame, truth: pd.DataFrame) -> dict[str, float]:

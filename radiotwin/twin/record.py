@@ -58,6 +58,8 @@ class FittedRecord(_Strict):
     device_sd_db: Annotated[float, Field(ge=0, le=MAX_SD_DB)]
     likelihood_power: Annotated[float, Field(gt=0, le=1)]
     shadowing: dict[str, Any] | None
+    radius_factor: Annotated[float, Field(ge=1, le=1e6)] = 1.0
+    typical_misfit: Annotated[float, Field(ge=0, le=1e6)] | None = None
 
     @field_validator("receivers")
     @classmethod

@@ -155,7 +155,9 @@ def _fitted_record(fitted: EffectModel) -> dict[str, Any]:
             "receivers": list(fitted.receivers),
             "first_s": None if np.isnan(fitted.first_s) else fitted.first_s,
             "device_sd_db": fitted.device_sd_db, "likelihood_power": fitted.likelihood_power,
-            "shadowing": fitted.shadowing.state() if fitted.shadowing else None}
+            "shadowing": fitted.shadowing.state() if fitted.shadowing else None,
+            "radius_factor": fitted.radius_factor,
+            "typical_misfit": None if np.isnan(fitted.typical_misfit) else fitted.typical_misfit}
 
 
 def _fitted(record: FittedRecord, channel: ChannelModel,
@@ -178,7 +180,9 @@ def _fitted(record: FittedRecord, channel: ChannelModel,
                        np.array(record.scale_db), record.dof, np.nan_to_num(device_m),
                        tuple(record.receivers),
                        np.nan if record.first_s is None else record.first_s,
-                       record.device_sd_db, record.likelihood_power, shadowing)
+                       record.device_sd_db, record.likelihood_power, shadowing,
+                       record.radius_factor,
+                       np.nan if record.typical_misfit is None else record.typical_misfit)
 
 
 def _check_terms(effects: list[FittedEffect], devices: list[str], receivers: list[str]) -> None:

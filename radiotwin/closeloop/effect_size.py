@@ -1,0 +1,107 @@
+"""How much of an effect is there, in decibels, as links say that took no part in finding it.
+
+Of each held-out link: what the effect changes in the prediction, once all else has been fitted
+again without it, against what the link lacks without it. The slope of that regression is 1 where
+the effect is as it was fitted, and 0 where there is no such thing (the calibration slope of Cox
+1958, 'Two further applications of a model for binary regression', Biometrika 45).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import t
+
+from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.closeloop.intervals import QUANTILE, same_effects
+from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.params import Parameter
+from radiotwin.inference.censored_regression import FitResult
+from radiotwin.links import evidence_blocks
+
+MIN_CHANGE_DB = 1e-6  # of a reading that an effect acts on
+MIN_CLUSTERS = 3  # effective ones, of which a spread can be told
+DOF = 4.0  # degrees of freedom of the errors, by which outliers count less
+
+
+def effect_size_db(model: CrossValidatedModel, number: int) -> Parameter:
+    """Return the size of an effect: the RMS of what it changes in the readings that it acts on.
+
+    Args:
+        model: with its effects.
+        number: which of them.
+
+    Returns:
+        The size that held-out links bear out [dB]. Its 90 % interval is of a regression over
+        places, flights and folds that err alike, whichever is widest: where it includes 0, there
+        may be no such effect. NaN where the effect changes no level (only which links are blank).
+    """
+    change_db, lacking_db, scale_db, acts = _held_out(model, number)
+    rows = np.flatnonzero(acts & np.isfinite(lacking_db) & np.isfinite(change_db))
+    if not len(rows) or not (change_db[rows]**2).sum():
+        return Parameter(np.nan, np.nan, np.nan, "dB")
+    change_db, lacking_db, scale_db = change_db[rows], lacking_db[rows], scale_db[rows]
+    z = (lacking_db - change_db) / scale_db
+    weight = (DOF + 1) / (DOF + z * z) / scale_db**2
+    total = weight @ change_db**2
+    slope = weight @ (change_db * lacking_db) / total
+    links = model.links.select(rows)
+    pull = weight * change_db * (lacking_db - slope * change_db) / total
+    share = weight * change_db**2 / total
+    reach = max((_reach(pull, share, label) for label in
+                 (np.arange(len(rows)), evidence_blocks(links), links.flight, model.index[rows])),
+                default=0.0)
+    rms_db = float(np.sqrt(np.mean(change_db**2)))
+    low, value, high = rms_db * (slope + reach * np.array([-1.0, 0.0, 1.0]))
+    return Parameter(float(value), float(low), float(high), "dB")
+
+
+def _held_out(model: CrossValidatedModel, number: int
+              ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return of each link (n,), as its fold has it, what `effect_size_db` is a regression of.
+
+    Returns:
+        what the effect changes, what is lacking without it, the error scale [dB], and whether the
+        effect acts on the link.
+    """
+    change_db, lacking_db, scale_db = np.full((3, len(model.index)), np.nan)
+    acts = np.zeros(len(model.index), dtype=bool)
+    for fold, (each, fit) in enumerate(zip(model.folds, model.fits[1:], strict=True)):
+        own = (model.index == fold) & each.usable
+        place = same_effects(model.whole, each)[number]
+        with_it = each.predict(fit)
+        rest = each if place is None else each.with_effects(
+            [*each.effects[:place], *each.effects[place + 1:]])
+        without = rest.predict(fit if place is None else rest.fit())
+        change_db[own] = (with_it.mean_db - without.mean_db)[own]
+        lacking_db[own] = (each.links.level_db - without.mean_db)[own]
+        scale_db[own] = with_it.scale_db[own]
+        if place is not None:
+            acts[own] = _acts(each, fit, place)[own]
+    return change_db, lacking_db, scale_db, acts
+
+
+def _acts(model: FoldModel, fit: FitResult, place: int) -> np.ndarray:
+    """Return whether (n,) readings change when an effect is taken away and nothing else is."""
+    coefficients = np.delete(fit.coefficients, model.coefficient_slices[place])
+    rest = model.with_effects([*model.effects[:place], *model.effects[place + 1:]])
+    without = rest.predict(replace(fit, coefficients=coefficients))
+    return np.abs(model.predict(fit).mean_db - without.mean_db) > MIN_CHANGE_DB
+
+
+def _reach(pull: np.ndarray, share: np.ndarray, label: np.ndarray) -> float:
+    """Return half the width of the slope's 90 % interval, where links (n,) of a label err alike.
+
+    Args:
+        pull: (n,) what each link moves the slope by.
+        share: (n,) of the information on it.
+        label: (n,) cluster of each link.
+    """
+    own = np.unique(label, return_inverse=True)[1].ravel()
+    shares = np.bincount(own, weights=share)
+    clusters = shares.sum()**2 / (shares**2).sum()
+    if clusters < MIN_CLUSTERS:
+        return 0.0
+    sd = np.sqrt((np.bincount(own, weights=pull)**2).sum() * clusters / (clusters - 1))
+    return float(sd * t.ppf(QUANTILE, clusters - 1))

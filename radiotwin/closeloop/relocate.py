@@ -1,0 +1,76 @@
+"""Unknown devices where a corrected model puts them.
+
+The base has located them without the effects, so each position has taken up part of what an effect
+explains, and the effect was found with that part missing.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.effects.arrays import subsample
+from radiotwin.effects.effect_model import EffectModel
+from radiotwin.effects.fold_model import FoldModel
+from radiotwin.inference.censored_regression import FitResult
+from radiotwin.links import LinkData
+from radiotwin.localize import position_log_likelihood
+
+RADII_M = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0)  # of circles around a position, that are tried
+DIRECTIONS = 12
+ROUNDS = 3  # of moves
+MAX_LINKS = 300  # of a device
+MIN_LINKS = 10
+
+
+def relocate_devices(model: CrossValidatedModel) -> CrossValidatedModel:
+    """Return the model with unknown devices moved to where its effects make their links likeliest.
+
+    Each fold moves them by its own training links, then its levels are fitted again.
+
+    Args:
+        model: base and effects.
+
+    Returns:
+        the moved one where that makes held-out links likelier, else the same. The same, too, where
+        all devices are known, or where paths would have to be followed from every position.
+    """
+    links = model.links
+    unknown = [device for device in range(len(links.device_names)) if device not in links.anchors]
+    if not unknown or not model.whole.effects or model.whole.channel.follows_paths:
+        return model
+    moved = [_relocated(each, fit, unknown)
+             for each, fit in zip(model.models, model.fits, strict=True)]
+    found = model.extended(moved, [each.fit() for each in moved])
+    gain = model.held_out_nll - found.held_out_nll
+    return found if np.nansum(gain) > 0 else model
+
+
+def _relocated(model: FoldModel, fit: FitResult, unknown: list[int]) -> FoldModel:
+    """Return one model with its devices moved, by its training links."""
+    learnt = EffectModel.of(model, fit)
+    device_m = model.links.device_m.copy()
+    for device in unknown:
+        rows = np.flatnonzero(model.train & (model.links.device == device))
+        if len(rows) >= MIN_LINKS:
+            own = model.links.select(subsample(rows, MAX_LINKS))
+            device_m[device, :2] = _likeliest(learnt, own, device_m[device, :2])
+    # Where the base could not locate a device, its links are not looked at here, either.
+    nowhere = np.setdiff1d(model.links.device, model.links.device[model.usable])
+    placed_m = device_m.copy()
+    placed_m[nowhere] = np.nan
+    moved = FoldModel.build(model.links, model.channel, model.dof, device_m=placed_m,
+                            train=model.train)
+    return moved.with_effects([moved.apply(each.effect, each.params) for each in model.effects])
+
+
+def _likeliest(model: EffectModel, own: LinkData, start_m: np.ndarray) -> np.ndarray:
+    """Return the likeliest position (2,) of a device on circles around the best so far [m]."""
+    angles = np.arange(DIRECTIONS) * 2 * np.pi / DIRECTIONS
+    circle = np.column_stack([np.sin(angles), np.cos(angles)])
+    circles_m = np.vstack([np.zeros(2), *(radius_m * circle for radius_m in RADII_M)])
+    best_m = start_m
+    for _ in range(ROUNDS):
+        tried_m = best_m + circles_m
+        best_m = tried_m[position_log_likelihood(model, own, tried_m).argmax()]
+    return best_m

@@ -1,0 +1,41 @@
+"""Unknown devices move to where an effect, once it is known, puts them."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from radiotwin.closeloop.relocate import relocate_devices
+from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.gain_offsets import ReceiverGainOffset
+from tests.closeloop.drives import MASTS_M, drive, fitted
+
+WRONG_M = np.array([25.0, -30.0])
+
+
+def misplaced(seed, device=1):
+    """Return a model with a receiver's offset whose base has put a device `WRONG_M` off."""
+    table = drive(seed, sd_db=1.5)
+    model = fitted(table.assign(gain_db=table["gain_db"] + 8.0 * (table["receiver"] == "north")), ReceiverGainOffset())
+
+    def moved(each):
+        unknown = replace(each.links, anchors=each.links.anchors - {device})
+        device_m = unknown.device_m.copy()
+        device_m[device, :2] += WRONG_M
+        built = FoldModel.build(unknown, each.channel, each.dof, device_m=device_m, train=each.train)
+        return built.with_effects([built.apply(effect.effect, effect.params) for effect in each.effects])
+    models = [moved(each) for each in model.models]
+    return model.extended(models, [each.fit() for each in models])
+
+
+def test_a_device_moves_to_where_it_is_in_every_fold():
+    before = misplaced(3)
+    after = relocate_devices(before)
+    for each in after.models:
+        assert np.hypot(*(each.links.device_m[1, :2] - MASTS_M[1, :2])) < 0.5 * np.hypot(*WRONG_M)
+    assert after.rmse_db() < before.rmse_db()
+    assert (after.links.device_m[[0, 2]] == before.links.device_m[[0, 2]]).all()
+
+
+def test_known_devices_stay():
+    model = fitted(drive(3), ReceiverGainOffset())
+    assert relocate_devices(model) is model
