@@ -105,7 +105,8 @@ class Forest:
         """Return what `state` described.
 
         Args:
-            arrays, settings: of `state`.
+            arrays: of `state`.
+            settings: of `state`.
             width: number of columns p that it may ask for.
 
         Raises:

@@ -21,7 +21,7 @@ from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import mean_if_detected
 from radiotwin.links import LinkData
-from radiotwin.links.features import link_features
+from radiotwin.links.features import feature_count, link_features
 from radiotwin.pieces import kept
 
 LAWS: tuple[type[ChannelModel], ...] = (LogDistance, SegmentedLogDistance, RegressionKriging)
@@ -40,14 +40,25 @@ class Part:
 
     Attributes:
         links: n links.
+        known: (n, p) `features` where they are known already.
     """
 
     links: LinkData
+    known: np.ndarray | None = None
 
     @cached_property
     def features(self) -> np.ndarray:
         """(n, p) of `link_features`."""
-        return link_features(self.links)
+        return link_features(self.links) if self.known is None else self.known
+
+    @property
+    def common(self) -> np.ndarray:
+        """(n, q) of them, without those that say which receiver it is."""
+        return self.features[:, :feature_count(len(self.links.device_names))]
+
+    def select(self, rows: np.ndarray) -> Part:
+        """Return the links of an index array."""
+        return Part(self.links.select(rows), self.features[rows])
 
 
 def grow_trees(kind: str, features: np.ndarray, target: np.ndarray, seed: int,
@@ -69,7 +80,8 @@ def grow_trees(kind: str, features: np.ndarray, target: np.ndarray, seed: int,
         features, target = features[rows], target[rows]
     if kind == EXTRA_TREES:
         return Forest.of_extra_trees(ExtraTreesRegressor(
-            trees, min_samples_leaf=MIN_LEAF, max_features=MAX_FEATURES, random_state=seed, n_jobs=1).fit(features, target))
+            trees, min_samples_leaf=MIN_LEAF, max_features=MAX_FEATURES, random_state=seed,
+            n_jobs=1).fit(features, target))
     return Forest.of_boosting(HistGradientBoostingRegressor(
         max_iter=BOOSTING_STEPS, early_stopping=False, random_state=seed).fit(features, target))
 
@@ -86,7 +98,8 @@ def trees_db(kind: str, part: Part, train: np.ndarray, test: np.ndarray, seed: i
         part: n links.
         train: (n,) bool or rows, to learn from.
         test: (m,) rows.
-        seed, trees: as of `grow_trees`.
+        seed: as of `grow_trees`.
+        trees: as of `grow_trees`.
     """
     rows = np.arange(len(part.links))[train]
     rows = rows[np.isfinite(part.links.level_db[rows])]
@@ -119,7 +132,7 @@ def law_db(kind: type[ChannelModel], links: LinkData, train: np.ndarray, test: n
 
 def fitted_law(kind: type[ChannelModel], links: LinkData, train: np.ndarray,
                like: RegressionKriging | None = None) -> ChannelModel:
-    """Return a channel model of some links, as of `law_db`; from an earlier run where there is one."""
+    """Return a channel model of some links, as of `law_db`."""
     geometry, level_db = links.geometry.select(train), links.level_db[train]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of classes with few links

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from radiotwin.channel import ChannelModel
+from radiotwin.effects.blend import Blend
 from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
 from radiotwin.effects.fold_model import FittedEffect, FoldModel
 from radiotwin.errors import BadInput
@@ -37,6 +38,7 @@ class EffectModel:
         likelihood_power: power of the likelihood in localisation, see
             `radiotwin.localize.without_map.calibrated_power`.
         shadowing: what is interpolated over the ground; None = nothing.
+        blend: what predicts together with it, by weights; None = named effects and shadowing alone.
     """
 
     channel: ChannelModel
@@ -50,6 +52,7 @@ class EffectModel:
     device_sd_db: float
     likelihood_power: float = 1.0
     shadowing: CorrelatedShadowing | None = None
+    blend: Blend | None = None
 
     @classmethod
     def of(cls, model: FoldModel, result: FitResult, causes_only: bool = False) -> EffectModel:
@@ -91,8 +94,12 @@ class EffectModel:
         regression = model.regression()
         reading = regression.predict(result)
         mean_db, scale_db = reading.mean_db, reading.scale_db
+        shift, left = np.zeros(len(links)), np.ones(len(links))
         if self.shadowing is not None and self.shadowing.receivers_move:
             shift, left = self.shadowing.at(links)
+        if self.blend is not None:
+            mean_db, scale_db = self.blend.apply(model.links, mean_db, scale_db, shift)
+        else:
             mean_db = mean_db + shift * self.scale_db[model.group]
             scale_db = scale_db * left
         return Prediction(

@@ -58,6 +58,7 @@ class FittedRecord(_Strict):
     device_sd_db: Annotated[float, Field(ge=0, le=MAX_SD_DB)]
     likelihood_power: Annotated[float, Field(gt=0, le=1)]
     shadowing: dict[str, Any] | None
+    blend: dict[str, Any] | None = None
 
     @field_validator("receivers")
     @classmethod
