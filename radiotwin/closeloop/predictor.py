@@ -15,8 +15,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from radiotwin.channel.forest import Forest
+from radiotwin.channel.log_distance import LogDistance
 from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.closeloop.baselines import (
+    BOOSTING,
     EXTRA_TREES,
     LAWS,
     TREES,
@@ -25,11 +27,10 @@ from radiotwin.closeloop.baselines import (
     held_out_baselines,
     law_db,
     laws_for,
-    trees_db,
 )
 from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
-from radiotwin.effects.blend import LEARNT, NAMED, REST, far_share
+from radiotwin.effects.blend import FORESTS, NAMED, REST, far_share
 from radiotwin.effects.correlated_shadowing import (
     CorrelatedShadowing,
     receivers_move,
@@ -43,7 +44,7 @@ from radiotwin.links import LinkData
 
 HALF_M = 50.0  # distance to the nearest measurement at which near and far count the same
 PULL = 0.01  # towards the best single member, see `convex_weights`: 2 % of the RMSE
-INNER_FOLDS = 3  # that are held out within the links outside a fold
+INNER_FOLDS = 2  # that are held out within the links outside a fold
 MAX_INNER_LINKS = 12_000  # that they are a sample of
 INNER_TREES = 20
 MIN_LEARNT = 60  # detected links that anything is learnt from
@@ -119,20 +120,18 @@ class _Learnt:
 
     def members_db(self, test: np.ndarray, seed: int) -> np.ndarray:
         """Return what members (m, k) predict of rows (m,), by few trees and known correlations."""
-        laws = {kind.name: kind for kind in LAWS}
         physics = physics_db(self.model, self.fit, self.rest, self.part, test, seed, INNER_TREES)
-        others = [law_db(laws[name], self.part.links, self.model.train, test, self.kriging)
-                  if name in laws else
-                  trees_db(name, self.part, self.model.train, test, seed, INNER_TREES)
-                  for name in self.names[physics.shape[1]:]]
-        return np.column_stack([physics, *others])
+        laws = [law_db(kind, self.part.links, self.model.train, test, self.kriging)
+                for kind in LAWS if kind.name in self.names]
+        return np.column_stack([physics, *laws])
 
 
 def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: SelectionCriteria,
                         seed: int) -> CombinedPrediction:
     """Return the held-out prediction by all that was learnt.
 
-    Boosting is no member: trees upon the physics predict as well.
+    Trees upon the physics are members, and trees alone are not: where physics is of no use to
+    them, it does no harm either.
 
     Args:
         model: with all effects that have a name.
@@ -143,8 +142,8 @@ def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: S
     links, count = model.links, len(model.folds)
     parts = [Part(each.links) for each in model.folds]
     baselines, kriging = held_out_baselines(model, parts, criteria, seed)
-    of_links = [kind.name for kind in laws_for(links, criteria)[1:]] + [EXTRA_TREES]
-    names = [NAMED, LEARNT, *([REST] if with_rest or model.shadowing else []), *of_links]
+    laws = [kind.name for kind in laws_for(links, criteria) if kind is not LogDistance]
+    names = [NAMED, *FORESTS, *([REST] if with_rest or model.shadowing else []), *laws]
     members, share = np.full((len(links), len(names)), np.nan), np.ones(len(links))
     mean_db = np.full(len(links), np.nan)
     learnt: _Learnt | None = None
@@ -159,7 +158,7 @@ def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: S
         share[test] = shares_of(part.links, fold.train, test)
         members[test] = np.column_stack([
             physics_db(fold, fit, rest, part, test, seed),
-            *(baselines[name][test] for name in of_links)])
+            *(baselines[name][test] for name in laws)])
         others = [(number + step) % count for step in range(1, count)][:INNER_FOLDS]
         mean_db[test] = combine(members[test], share[test], _weights(
             *learnt.held_out(model.index, others, seed), names))
@@ -212,15 +211,16 @@ def _weights(error_db: np.ndarray, share: np.ndarray, names: list[str]) -> np.nd
     return convex_weights(error_db[known], share[known], PULL)
 
 
-def residual_trees(model: FoldModel, fit: FitResult, part: Part, seed: int,
-                   trees: int = TREES) -> Forest:
-    """Grow trees on the standardised residual of a model's training links.
+def residual_forests(model: FoldModel, fit: FitResult, part: Part, seed: int,
+                     trees: int = TREES) -> dict[str, Forest]:
+    """Grow trees, by the names in `FORESTS`, on the standardised residual of training links.
 
     They are not told which receiver it is: its effects have names, and a map has none.
     """
     rows = np.flatnonzero(model.train)
-    return grow_trees(EXTRA_TREES, part.common[rows], standardised_residual(model, fit), seed,
-                      trees)
+    z = standardised_residual(model, fit)
+    return {name: grow_trees(kind, part.common[rows], z, seed, trees)
+            for name, kind in zip(FORESTS, (EXTRA_TREES, BOOSTING), strict=True)}
 
 
 def physics_db(model: FoldModel, fit: FitResult, rest: CorrelatedShadowing | None, part: Part,
@@ -237,13 +237,14 @@ def physics_db(model: FoldModel, fit: FitResult, rest: CorrelatedShadowing | Non
         trees: number of them.
 
     Returns:
-        (m, 2), or (m, 3) with the rest, level of a link that is detected.
+        (m, 3), or (m, 4) with the rest, level of a link that is detected.
     """
     reading = model.predict(fit)
     mean_db, scale_db, limit_db = (each[test] for each in (
         reading.mean_db, reading.scale_db, model.limit_db))
-    forest = residual_trees(model, fit, part, seed, trees)
-    added: list[tuple] = [(0.0, 1.0), (forest.predict(part.common[test]), 1.0)]
+    forests = residual_forests(model, fit, part, seed, trees)
+    added: list[tuple] = [(0.0, 1.0), *((forest.predict(part.common[test]), 1.0)
+                                        for forest in forests.values())]
     if rest is not None:
         added.append(rest.at(model.links.select(test)))
     return np.column_stack([

@@ -61,6 +61,11 @@ class Loop:
         return self.selection.model
 
     @property
+    def explained(self) -> CrossValidatedModel:
+        """Base and what has a name, with the rest if it was interpolated of that alone."""
+        return self.selection.named
+
+    @property
     def criteria(self) -> SelectionCriteria:
         """Thresholds that decided."""
         return self.selection.criteria
@@ -153,7 +158,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         on_progress("correlated_shadowing")
         add_shadowing(selection, seed)
     on_progress("other models, and the combination of all")
-    prediction = combined_prediction(_explained(selection), bool(left), criteria, seed)
+    prediction = combined_prediction(selection.named, bool(left), criteria, seed)
     return Loop(best, links, folds, before, selection, dependences_before, dependences_after,
                 prediction, _noise_floor_db(all_links, criteria))
 
@@ -162,13 +167,6 @@ def _dependences(model: CrossValidatedModel, seed: int) -> list[ResidualDependen
     mean_db = model.held_out_mean_db
     return residual_dependences(model.links, model.links.level_db - mean_db,
                                 model.held_out_reading[1], mean_db, seed)
-
-
-def _explained(selection: SelectionResult) -> CrossValidatedModel:
-    """Return the model of what has a name, with the rest if it was interpolated of that alone."""
-    named = selection.explained or selection.model
-    same = len(named.whole.effects) == len(selection.model.whole.effects)
-    return selection.model if same else named
 
 
 def _noise_floor_db(links: LinkData, criteria: SelectionCriteria) -> float:

@@ -12,17 +12,23 @@ from typing import Any, Self
 import numpy as np
 from scipy.spatial import cKDTree
 
+from radiotwin.channel.base import ChannelModel
 from radiotwin.channel.forest import Forest
 from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.channel.stored import MAX_POSITION_M, require_array, require_number
+from radiotwin.channel.stored import (
+    MAX_POSITION_M,
+    require_array,
+    require_names,
+    require_number,
+)
 from radiotwin.inference.stacking import combine
 from radiotwin.links import LinkData
 from radiotwin.links.features import link_features
 
-NAMED, REST, LEARNT = "named", "named_and_rest", "named_and_trees"
-KRIGING, LAW = RegressionKriging.name, SegmentedLogDistance.name
-MEMBERS = (NAMED, LEARNT, REST, LAW, KRIGING)
+NAMED, REST = "named", "named_and_rest"
+FORESTS = ("named_and_trees", "named_and_boosting")  # members, learnt of what named effects leave
+LAWS = {each.name: each for each in (SegmentedLogDistance, RegressionKriging)}
 MAX_SD_RATIO = 100.0
 
 
@@ -46,8 +52,8 @@ class Blend:
         sd_ratio: standard deviation of the error over that of named effects, near and far.
         measured_m: (p, 3) receivers' positions [m], and
         measured_device: (p,) the device that was measured there.
-        forest: of the standardised residual of named effects; None: not used.
-        kriging, law: fitted to the levels; None: not used.
+        forests: of the standardised residual of named effects, by name (`FORESTS`).
+        laws: fitted to the levels, by name.
     """
 
     weights: dict[str, tuple[float, float]]
@@ -55,9 +61,8 @@ class Blend:
     sd_ratio: tuple[float, float]
     measured_m: np.ndarray
     measured_device: np.ndarray
-    forest: Forest | None = None
-    kriging: RegressionKriging | None = None
-    law: SegmentedLogDistance | None = None
+    forests: dict[str, Forest]
+    laws: dict[str, ChannelModel]
 
     def far_share(self, links: LinkData) -> np.ndarray:
         """Return how far the receivers of links are from where their device was measured (n,)."""
@@ -81,12 +86,12 @@ class Blend:
         """
         geometry, share = links.geometry, self.far_share(links)
         members = {NAMED: mean_db, REST: mean_db + rest * scale_db}
-        if self.forest is not None:
-            learnt = self.forest.predict(link_features(links, receivers=False))
-            members[LEARNT] = mean_db + learnt * scale_db
-        for name, model in ((KRIGING, self.kriging), (LAW, self.law)):
-            if model is not None:
-                members[name] = model.predict(geometry)[0]
+        if self.forests:
+            features = link_features(links, receivers=False)
+            for name, forest in self.forests.items():
+                members[name] = mean_db + forest.predict(features) * scale_db
+        for name, law in self.laws.items():
+            members[name] = law.predict(geometry)[0]
         names = list(self.weights)
         blended_db = combine(np.column_stack([members[name] for name in names]), share,
                              np.transpose([self.weights[name] for name in names]))
@@ -97,13 +102,12 @@ class Blend:
         """Return arrays by name, and settings that JSON can hold, for `from_state`."""
         arrays = {"measured_m": self.measured_m.astype(np.float32),
                   "measured_device": self.measured_device.astype(np.int32)}
-        settings: dict[str, Any] = {"weights": self.weights, "half_m": self.half_m,
-                                    "sd_ratio": list(self.sd_ratio)}
-        for name in ("forest", "kriging", "law"):
-            model = getattr(self, name)
-            if model is not None:
-                own, settings[name] = model.state()
-                arrays |= {f"{name}/{each}": array for each, array in own.items()}
+        settings: dict[str, Any] = {
+            "weights": {name: list(each) for name, each in self.weights.items()},
+            "half_m": self.half_m, "sd_ratio": list(self.sd_ratio), "models": {}}
+        for name, model in (*self.forests.items(), *self.laws.items()):
+            own, settings["models"][name] = model.state()
+            arrays |= {f"{name}/{each}": array for each, array in own.items()}
         return arrays, settings
 
     @classmethod
@@ -121,24 +125,22 @@ class Blend:
             ValueError: it is damaged.
             KeyError: a part is missing.
         """
-        models: dict[str, Any] = {}
-        for name in ("forest", "kriging", "law"):
-            own = {each.removeprefix(f"{name}/"): array for each, array in arrays.items()
-                   if each.startswith(f"{name}/")}
-            if name in settings:
-                models[name] = Forest.from_state(own, settings[name], width) \
-                    if name == "forest" else \
-                    (RegressionKriging if name == "kriging" else SegmentedLogDistance
-                     ).from_state(own, settings[name])
-            elif own:
-                raise ValueError(f"{name} has arrays and no settings")
+        require_names("settings", settings, ["weights", "half_m", "sd_ratio", "models"])
+        forests, laws, own = {}, {}, {"measured_m", "measured_device"}
+        for name, given in settings["models"].items():
+            parts = {each.removeprefix(f"{name}/"): array for each, array in arrays.items()
+                     if each.startswith(f"{name}/")}
+            own |= {f"{name}/{each}" for each in parts}
+            if name in FORESTS:
+                forests[name] = Forest.from_state(parts, given, width)
+            else:
+                laws[name] = LAWS[name].from_state(
+                    {each: array.copy() for each, array in parts.items()}, given)
+        require_names("arrays", arrays, own)
         weights = {name: (require_number({name: near}, name, 0, 1),
                           require_number({name: far}, name, 0, 1))
                    for name, (near, far) in settings["weights"].items()}
-        needed = {LEARNT: "forest", KRIGING: "kriging", LAW: "law"}
-        for name in weights:
-            if name not in MEMBERS or needed.get(name, "") not in (*models, ""):
-                raise ValueError(f"the member {name[:60]} is unknown, or missing")
+        require_names("weights", set(weights) | {NAMED, REST}, {NAMED, REST, *forests, *laws})
         if not np.allclose(np.sum(list(weights.values()), axis=0), 1.0, atol=1e-6):
             raise ValueError("weights do not sum to one")
         near, far = settings["sd_ratio"]
@@ -147,4 +149,5 @@ class Blend:
         device = require_array(arrays, "measured_device", (len(points),), 0, 2**31 - 1)
         return cls(weights, require_number(settings, "half_m", 1e-3, MAX_POSITION_M),
                    (require_number(ratios, "near", 0.01, MAX_SD_RATIO),
-                    require_number(ratios, "far", 0.01, MAX_SD_RATIO)), points, device, **models)
+                    require_number(ratios, "far", 0.01, MAX_SD_RATIO)), points, device,
+                   forests, laws)
