@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.baselines import BOOSTING, EXTRA_TREES, Part, grow_trees, published_laws
 from radiotwin.closeloop.advice import compare_with_baselines
+from radiotwin.closeloop.baselines import BOOSTING, EXTRA_TREES, Part, grow_trees, published_laws
 from radiotwin.links import prepare_links
 from radiotwin.links.features import feature_count, link_features
 
