@@ -125,6 +125,7 @@ PICTURE_PIXELS = Budget("PICTURE_PIXELS", 50_000_000, "pixels", "a figure in a p
 # Twins and learners
 FIELD_PAIRS = Budget("FIELD_PAIRS", 200_000_000, "pairs of points",
                      "a residual field: 8 bytes each")
+TREE_NODES = Budget("TREE_NODES", 20_000_000, "nodes", "all regression trees of a twin")
 TRAINING_BYTES = Budget("TRAINING_BYTES", 64 * 2**30, "bytes of memory", "a learner")
 CHECKPOINT_BYTES = Budget("CHECKPOINT_BYTES", 64 * 2**30, "bytes", "a checkpoint")
 # Cache

@@ -126,14 +126,8 @@ class PublishedLaw(ChannelModel):
 
     def outside(self, links: LinkGeometry) -> list[str]:
         """Return a sentence on each quantity that lies outside the law's validity."""
-        high_m, low_m = ends_m(links)
         found = []
-        for what, value, (least, most), unit in (
-                ("frequency", np.atleast_1d(self.frequency_hz / 1e9),
-                 np.array(self.validity.frequency_hz) / 1e9, "GHz"),
-                ("distance", links.distance_m, self.validity.distance_m, "m"),
-                ("height of the higher end", high_m, self.validity.high_m, "m"),
-                ("height of the lower end", low_m, self.validity.low_m, "m")):
+        for what, value, (least, most), unit in self._quantities(links):
             odd = (value < least) | (value > most)
             if odd.any():
                 ends = sorted({f"{value[odd].min():.3g}", f"{value[odd].max():.3g}"}, key=float)
@@ -142,6 +136,24 @@ class PublishedLaw(ChannelModel):
                              f"the {what} is {' to '.join(ends)} {unit}{share}, published is "
                              f"{least:g} to {most:g} {unit}")
         return found
+
+    def inside(self, links: LinkGeometry) -> np.ndarray:
+        """Return whether all quantities of each link lie within the law's validity (n,)."""
+        result = np.ones(len(links), dtype=bool)
+        for _, value, (least, most), _ in self._quantities(links):
+            result &= (value >= least) & (value <= most)
+        return result
+
+    def _quantities(self, links: LinkGeometry,
+                    ) -> list[tuple[str, np.ndarray, tuple[float, float], str]]:
+        """Return name, values (n,) or (1,), published range and unit of what validity bounds."""
+        high_m, low_m = ends_m(links)
+        least_hz, most_hz = self.validity.frequency_hz
+        return [("frequency", np.atleast_1d(self.frequency_hz / 1e9),
+                 (least_hz / 1e9, most_hz / 1e9), "GHz"),
+                ("distance", links.distance_m, self.validity.distance_m, "m"),
+                ("height of the higher end", high_m, self.validity.high_m, "m"),
+                ("height of the lower end", low_m, self.validity.low_m, "m")]
 
     @override
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -36,12 +36,22 @@ class RegressionKriging(ChannelModel):
     @override
     def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
             seed: int = 0) -> Self:
+        self.field.fit(*self._residual(links, level_db, limit_db), seed)
+        return self
+
+    def refit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit) -> Self:
+        """Return a model of the same correlation that is fitted to other links, as of `fit`."""
+        model = type(self)()
+        model.field = self.field.with_points(*model._residual(links, level_db, limit_db))
+        return model
+
+    def _residual(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
+                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Fit the law; return series, positions and residual of the links that a fit can use."""
         links, level_db, limit_db = drop_uninformative(links, level_db, limit_db)
         self.law.fit(links, level_db, limit_db)
         mean_db, sd_db = self.law.predict(links)
-        residual = standardised(level_db, mean_db, sd_db, limit_db)
-        self.field.fit(links.device, links.receiver_m, residual, seed)
-        return self
+        return links.device, links.receiver_m, standardised(level_db, mean_db, sd_db, limit_db)
 
     @override
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:

@@ -91,12 +91,13 @@ class ResidualField:
         self._factor()
         return self
 
-    def with_points(self, series: np.ndarray, position_m: np.ndarray,
-                    residual: np.ndarray) -> Self:
+    def with_points(self, series: np.ndarray, position_m: np.ndarray, residual: np.ndarray,
+                    kind: np.ndarray | None = None) -> Self:
         """Return a field of the same correlation with other points, as of `fit`."""
+        kind = np.zeros(len(series), dtype=int) if kind is None else kind
         field = type(self)()
         field.share, field.kind_share, field.length_m = self.share, self.kind_share, self.length_m
-        field._store(series, position_m, residual, np.zeros(len(series), dtype=int))
+        field._store(series, position_m, residual, kind)
         field._factor()
         return field
 

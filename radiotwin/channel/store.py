@@ -18,6 +18,7 @@ from radiotwin.inputs import parse_json, read_bytes
 from radiotwin.links import LinkGeometry
 from radiotwin.pieces import kept
 
+BESIDE = "beside/"  # begins the names of arrays that are not the model's
 # Distances and heights [m] at which a model that is read must predict numbers.
 _TRIED_M = np.array([(1.0, 0.0), (30.0, 10.0), (300.0, -50.0), (3e3, 100.0), (1e5, 3e3)])
 
@@ -67,16 +68,27 @@ def load_channel(path: str | Path) -> ChannelModel:
     return decode_channel(read_bytes(path, "channel model"), path)
 
 
-def encode_channel(model: ChannelModel) -> bytes:
-    """Return a fitted model as the content of a safetensors file."""
+def encode_channel(model: ChannelModel, beside: dict[str, np.ndarray] | None = None) -> bytes:
+    """Return a fitted model as the content of a safetensors file.
+
+    Args:
+        model: fitted.
+        beside: arrays of something else that the file is to hold, by name.
+    """
     arrays, settings = model.state()
+    arrays = arrays | {f"{BESIDE}{name}": array for name, array in (beside or {}).items()}
     # One key, because safetensors writes several in an order that changes from run to run.
     header = {"channel": json.dumps({"model": model.name, "settings": settings}, sort_keys=True)}
     return save({name: np.ascontiguousarray(array) for name, array in arrays.items()}, header)
 
 
 def decode_channel(data: bytes, source: object) -> ChannelModel:
-    """Return the model that `encode_channel` described.
+    """Return the model that `encode_channel` described; arguments as of `decode_both`."""
+    return decode_both(data, source)[0]
+
+
+def decode_both(data: bytes, source: object) -> tuple[ChannelModel, dict[str, np.ndarray]]:
+    """Return the model that `encode_channel` described, and the arrays beside it.
 
     Args:
         data: content of the file.
@@ -92,12 +104,15 @@ def decode_channel(data: bytes, source: object) -> ChannelModel:
         bad = [name for name, array in arrays.items() if not np.isfinite(array).all()]
         if bad:
             raise ValueError(f"{', '.join(bad)} holds values that are not finite")
+        beside = {name.removeprefix(BESIDE): array for name, array in arrays.items()
+                  if name.startswith(BESIDE)}
         # A model may keep its arrays and change them.
         model = models[header["model"]].from_state(
-            {name: array.copy() for name, array in arrays.items()}, header["settings"])
+            {name: array.copy() for name, array in arrays.items() if not name.startswith(BESIDE)},
+            header["settings"])
         if type(model) in BUILT_IN:  # one of a package's own may need a map
             _try_to_predict(model)
-        return model
+        return model, beside
     except (BadInput, LookupError, ValueError, TypeError, AttributeError, ArithmeticError,
             RuntimeError) as error:
         raise BadInput(f"{source}: not a whole channel model of one of {', '.join(models)} "

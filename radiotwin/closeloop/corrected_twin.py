@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import radiotwin
+from radiotwin.closeloop.blending import make_blend, needs_rest
 from radiotwin.closeloop.run import Loop
+from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.localize import RadiusCalibration, calibrate_radii, whole_area
 from radiotwin.scene import Scene
@@ -13,7 +15,7 @@ from radiotwin.twin.twin import Twin
 
 
 def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
-    """Return the twin of a loop.
+    """Return the twin of a loop; it predicts by the loop's combination.
 
     What belongs to a receiver (its offset, drift, antenna, …) is part of it, too; but a map is of
     what arrives at a faultless receiver.
@@ -22,10 +24,13 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
         loop: what was found.
         scene: that it was found in, if there was one.
     """
-    model = loop.after
+    model = loop.explained
+    shadowing = model.shadowing[0] if model.shadowing else None
+    if shadowing is None and needs_rest(loop.prediction):
+        shadowing = CorrelatedShadowing.fit(model.whole, model.fits[0], 0)
     fitted = replace(EffectModel.of(model.whole, model.fits[0], causes_only=True),
-                     **vars(_calibration(loop)),
-                     shadowing=model.shadowing[0] if model.shadowing else None)
+                     **vars(_calibration(loop)), shadowing=shadowing,
+                     blend=make_blend(model, loop.prediction, 0))
     provenance = {"links": len(model.links), "radiotwin_version": radiotwin.__version__}
     if scene is not None:
         provenance |= {"scene": scene.config.name, "scene_hash": scene.content_hash()}

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from radiotwin import __version__
+from radiotwin.closeloop.advice import compare_with_baselines
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.closeloop.posterior import Step
 from radiotwin.closeloop.result_schema import ReportRecord
@@ -53,14 +54,20 @@ def make_report(loop: Loop) -> dict[str, Any]:
         error[f"by_{name}"] = {label: {"before": scores(loop.before, rows),
                                        "after": scores(loop.after, rows)}
                                for label, rows in groups.items()}
-    baselines = {name: errors(links.level_db, mean_db) for name, mean_db in loop.baselines.items()}
+    predicted = loop.prediction
+    error["combined"] = errors(links.level_db, predicted.mean_db)
+    baselines = {name: errors(links.level_db, mean_db)
+                 for name, mean_db in predicted.baselines.items()}
+    combination = [{"name": name, "weight_near": near, "weight_far": far} for name, near, far in
+                   zip(predicted.names, *predicted.weights, strict=True)]
     return _for_json({
         "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base,
         "verdict": loop.verdict, "effects": effects, "candidates": candidates,
         "posterior": [_step(each) for each in selection.steps],
         "heldout": {"by": loop.folds.by, "folds": loop.folds.count,
                     "n": int(np.isfinite(loop.after.held_out_nll).sum())},
-        "error": error, "baselines": baselines,
+        "error": error, "baselines": baselines, "combination": combination,
+        "prediction": compare_with_baselines(error, baselines),
         "dependences_before": [vars(each) for each in loop.dependences_before],
         "remaining": {"structured": bool(loop.remaining),
                       "drivers": [vars(each) for each in loop.remaining]},

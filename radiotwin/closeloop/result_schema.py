@@ -33,6 +33,7 @@ class BothRecord(Record):
 class ErrorRecord(BothRecord):
     """Errors of all links and of groups of them, by the groups' names."""
 
+    combined: ScoresRecord | None = None
     noise_floor_db: Number | None
     by_los: dict[Literal["los", "nlos"], BothRecord] = Field(default_factory=dict)
     by_device: dict[str, BothRecord] = Field(default_factory=dict)
@@ -86,6 +87,23 @@ class CandidateRecord(Record):
     evidence_nats: Number | None = None
     lead_nats: list[Number | None] = Field(default_factory=list)
     probability: Number | None = None
+
+
+class WeightRecord(Record):
+    """Weights of a member of the combination, near measurements and far from them."""
+
+    name: str
+    weight_near: Number
+    weight_far: Number
+
+
+class PredictionRecord(Record):
+    """How good the combination is beside the best of the other models."""
+
+    best_baseline: str
+    best_baseline_rmse_db: Number
+    combined_rmse_db: Number
+    advice: str
 
 
 class DependenceRecord(Record):
@@ -148,6 +166,8 @@ class ReportRecord(Record):
     heldout: FoldsRecord
     error: ErrorRecord
     baselines: dict[str, BaselineRecord]
+    combination: list[WeightRecord] = Field(default_factory=list)
+    prediction: PredictionRecord | None = None
     dependences_before: list[DependenceRecord] = Field(default_factory=list)
     remaining: RemainingRecord
     criteria: dict[str, Number] = Field(default_factory=dict)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from radiotwin.channel import ChannelModel
-from radiotwin.channel.log_distance import LogDistance
-from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.closeloop.bases import BASES, make_bases
 from radiotwin.closeloop.change_points import select_change_points
 from radiotwin.closeloop.criteria import SelectionCriteria
@@ -25,6 +21,7 @@ from radiotwin.closeloop.faults import select_faults
 from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.intervals import effect_parameters
 from radiotwin.closeloop.posterior import NONE, OTHER
+from radiotwin.closeloop.predictor import CombinedPrediction, combined_prediction
 from radiotwin.closeloop.residual_tests import ResidualDependence, residual_dependences
 from radiotwin.closeloop.selection import SelectionResult, add_shadowing, forward_selection
 from radiotwin.closeloop.thinning import thin_links
@@ -32,11 +29,9 @@ from radiotwin.effects.params import Parameter
 from radiotwin.effects.registry import catalogue
 from radiotwin.effects.unexplained_trend import UnexplainedTrend
 from radiotwin.errors import BadInput
-from radiotwin.inference.gaussian import mean_if_detected
-from radiotwin.links import LinkData, LinkGeometry, prepare_links, residual_variables
+from radiotwin.links import LinkData, prepare_links, residual_variables
 from radiotwin.links.limits import limits_to_explain
 from radiotwin.measurements import Measurements
-from radiotwin.pieces import kept
 from radiotwin.scene import Scene
 
 
@@ -51,7 +46,7 @@ class Loop:
         before: the base alone.
         selection: base and effects.
         dependences_before, dependences_after: of the held-out residual.
-        baselines: (n,) held-out prediction of other models for each link [dB].
+        prediction: held-out, by all that was learnt, and by other models alone.
         noise_floor_db: from links measured twice at one position; NaN where there are none.
     """
 
@@ -62,13 +57,18 @@ class Loop:
     selection: SelectionResult
     dependences_before: list[ResidualDependence]
     dependences_after: list[ResidualDependence]
-    baselines: dict[str, np.ndarray] = field(default_factory=dict)
+    prediction: CombinedPrediction
     noise_floor_db: float = np.nan
 
     @property
     def after(self) -> CrossValidatedModel:
         """Base and effects."""
         return self.selection.model
+
+    @property
+    def explained(self) -> CrossValidatedModel:
+        """Base and what has a name, with the rest if it was interpolated of that alone."""
+        return self.selection.named
 
     @property
     def criteria(self) -> SelectionCriteria:
@@ -177,51 +177,16 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         forward_selection(selection, [*trends[:criteria.max_trends]], seed, on_progress)
         on_progress("correlated_shadowing")
         add_shadowing(selection, seed)
-    on_progress("other models")
+    on_progress("other models, and the combination of all")
+    prediction = combined_prediction(selection.named, bool(left), criteria, seed)
     return Loop(best, links, folds, before, selection, dependences_before, dependences_after,
-                _baselines(before, criteria), _noise_floor_db(all_links, criteria))
+                prediction, _noise_floor_db(all_links, criteria))
 
 
 def _dependences(model: CrossValidatedModel, seed: int) -> list[ResidualDependence]:
     mean_db = model.held_out_mean_db
     return residual_dependences(model.links, model.links.level_db - mean_db,
                                 model.held_out_reading[1], mean_db, seed)
-
-
-def _baselines(model: CrossValidatedModel, criteria: SelectionCriteria) -> dict[str, np.ndarray]:
-    """Return the held-out prediction (n,) of other models [dB].
-
-    The devices are where the base has them.
-    """
-    kinds: list[type[ChannelModel]] = [LogDistance]
-    if len(model.links) <= criteria.max_links_for_kriging:
-        kinds.append(RegressionKriging)
-    result = {}
-    for kind in kinds:
-        mean_db = np.full(len(model.links), np.nan)
-        for number, fold in enumerate(model.folds):
-            test, train, links = (model.index == number) & fold.usable, fold.train, fold.links
-            own_db, sd_db = _learnt_and_predicted(
-                kind, links.geometry.select(train), links.level_db[train], links.limit_db[train],
-                links.geometry.select(test))
-            mean_db[test] = mean_if_detected(own_db, sd_db, links.limit_db[test])
-        result[kind.name] = mean_db
-    return result
-
-
-def _learnt_and_predicted(kind: type[ChannelModel], train: LinkGeometry, level_db: np.ndarray,
-                          limit_db: np.ndarray, test: LinkGeometry,
-                          ) -> tuple[np.ndarray, np.ndarray]:
-    """Return mean and standard deviation of n links by a model that is fitted to others [dB]."""
-    def predict() -> tuple[np.ndarray, np.ndarray]:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of classes with few links
-            fitted = kind().fit(train, level_db, limit_db, 0)
-        return fitted.predict(test)
-
-    return kept("baseline", (kind, train, level_db, limit_db, test), predict,
-                lambda found: ({"mean_db": found[0], "sd_db": found[1]}, None),
-                lambda arrays, _: (arrays["mean_db"], arrays["sd_db"]))
 
 
 def _noise_floor_db(links: LinkData, criteria: SelectionCriteria) -> float:

@@ -55,6 +55,13 @@ class SelectionResult:
         """Whether no more effects may be added."""
         return len(self.model.whole.effects) >= self.criteria.max_effects
 
+    @property
+    def named(self) -> CrossValidatedModel:
+        """Base and what has a name, with the rest if it was interpolated of that alone."""
+        named = self.explained or self.model
+        same = len(named.whole.effects) == len(self.model.whole.effects)
+        return self.model if same else named
+
     def keep(self, score: CandidateScore, model: CrossValidatedModel) -> None:
         """Take over a model with one more effect."""
         self.model = model

@@ -56,8 +56,7 @@ class CorrelatedShadowing:
     @classmethod
     def fit(cls, model: FoldModel, result: FitResult, seed: int) -> CorrelatedShadowing:
         """Learn from the training links of a model what its channel and effects leave over."""
-        residual_db = model.training.residual_db(result)
-        z = np.clip(residual_db / model.training.predict(result).scale_db, -MAX_Z, MAX_Z)
+        z = standardised_residual(model, result)
         relative_sd = max(float(z.std()), 1e-6)
         shadowing = cls(ResidualField(), relative_sd, receivers_move(model.links))
         series, position_m, kind = shadowing._points(model.links.select(model.train))
@@ -65,6 +64,13 @@ class CorrelatedShadowing:
         field = kept("shadowing", points, lambda: shadowing.field.fit(*points),
                      ResidualField.state, ResidualField.from_state)
         return replace(shadowing, field=field)
+
+    def refit(self, model: FoldModel, result: FitResult) -> CorrelatedShadowing:
+        """Return the same correlation with the residual of a model's training links."""
+        z = standardised_residual(model, result)
+        series, position_m, kind = self._points(model.links.select(model.train))
+        field = self.field.with_points(series, position_m, (z - z.mean()) / self.relative_sd, kind)
+        return replace(self, field=field)
 
     def at(self, links: LinkData) -> tuple[np.ndarray, np.ndarray]:
         """Return what it adds (n,) [error scales], and the share (n,) left of the error scale."""
@@ -100,6 +106,12 @@ class CorrelatedShadowing:
         if self.receivers_move:
             return links.device, links.receiver_m, links.receiver
         return links.receiver, links.device_m[links.device], None
+
+
+def standardised_residual(model: FoldModel, result: FitResult) -> np.ndarray:
+    """Return the residuals of a model's training links (n,) [error scales]; outliers clipped."""
+    residual_db = model.training.residual_db(result)
+    return np.clip(residual_db / model.training.predict(result).scale_db, -MAX_Z, MAX_Z)
 
 
 def receivers_move(links: LinkData) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from radiotwin.channel import ChannelModel
+from radiotwin.effects.blend import Blend
 from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
 from radiotwin.effects.fold_model import FittedEffect, FoldModel
 from radiotwin.errors import BadInput
@@ -40,6 +41,7 @@ class EffectModel:
         radius_factor: by which 90 % radii of located devices are wider than by the likelihood.
         typical_misfit: of the links of located devices where it was learnt; NaN = not known.
             Both are of `radiotwin.localize.calibration`.
+        blend: what predicts together with it, by weights; None = named effects and shadowing alone.
     """
 
     channel: ChannelModel
@@ -55,6 +57,7 @@ class EffectModel:
     shadowing: CorrelatedShadowing | None = None
     radius_factor: float = 1.0
     typical_misfit: float = np.nan
+    blend: Blend | None = None
 
     @classmethod
     def of(cls, model: FoldModel, result: FitResult, causes_only: bool = False) -> EffectModel:
@@ -99,8 +102,12 @@ class EffectModel:
         regression = model.regression()
         reading = regression.predict(result)
         mean_db, scale_db = reading.mean_db, reading.scale_db
+        shift, left = np.zeros(len(links)), np.ones(len(links))
         if self.shadowing is not None and self.shadowing.receivers_move:
             shift, left = self.shadowing.at(links)
+        if self.blend is not None:
+            mean_db, scale_db = self.blend.apply(model.links, mean_db, scale_db, shift)
+        else:
             mean_db = mean_db + shift * self.scale_db[model.group]
             scale_db = scale_db * left
         return Prediction(

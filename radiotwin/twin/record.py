@@ -60,6 +60,7 @@ class FittedRecord(_Strict):
     shadowing: dict[str, Any] | None
     radius_factor: Annotated[float, Field(ge=1, le=1e6)] = 1.0
     typical_misfit: Annotated[float, Field(ge=0, le=1e6)] | None = None
+    blend: dict[str, Any] | None = None
 
     @field_validator("receivers")
     @classmethod

@@ -12,7 +12,8 @@ from radiotwin.channel import ChannelModel
 from radiotwin.channel.image_paths import ImagePaths, stored_diffuse
 from radiotwin.channel.registry import BUILT_IN
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.channel.store import decode_channel, encode_channel
+from radiotwin.channel.store import decode_both, encode_channel
+from radiotwin.effects.blend import Blend
 from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.fold_model import FittedEffect
@@ -21,6 +22,7 @@ from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, require_writable
 from radiotwin.inputs import parse_json, read_bytes, read_text, require_within
 from radiotwin.links import LinkData
+from radiotwin.links.features import feature_count
 from radiotwin.localize import TwinDevice
 from radiotwin.twin.record import (
     CHANNEL_FILE,
@@ -70,11 +72,12 @@ def encode_twin(channel: ChannelModel, devices: list[TwinDevice], level: str,
 
     The arguments are those of `write_twin`.
     """
+    beside = fitted.blend.state()[0] if fitted and fitted.blend else None
     record = {"schema": SCHEMA, "channel": {"model": channel.name, "file": CHANNEL_FILE},
               "level": level, "limit_db": limit_db,
               "devices": [_device_record(device) for device in devices],
               "fitted": _fitted_record(fitted) if fitted else None, "provenance": provenance}
-    return json.dumps(record, indent=1, allow_nan=False), encode_channel(channel)
+    return json.dumps(record, indent=1, allow_nan=False), encode_channel(channel, beside)
 
 
 def read_twin(folder: Path | str) -> dict[str, Any]:
@@ -116,7 +119,7 @@ def decode_twin(record: str, channel: bytes, source: object) -> dict[str, Any]:
         if schema not in (SCHEMA, SCHEMA_1):
             raise BadInput(f"{source}: schema is {str(schema)[:60]!r}, this version reads "
                            f"{SCHEMA!r} and {SCHEMA_1!r}")
-        model = decode_channel(channel, f"the channel of {source}")
+        model, beside = decode_both(channel, f"the channel of {source}")
         name = model.name
         if schema == SCHEMA_1:
             given, model = _from_version_1(given, model)
@@ -124,7 +127,8 @@ def decode_twin(record: str, channel: bytes, source: object) -> dict[str, Any]:
         if content.channel.model != name:
             raise ValueError(f"the channel is {name}, not {content.channel.model[:60]}")
         devices = [_device(device) for device in content.devices]
-        fitted = None if content.fitted is None else _fitted(content.fitted, model, devices)
+        fitted = None if content.fitted is None else _fitted(
+            content.fitted, model, devices, beside)
         return {"channel": model, "devices": devices, "level": content.level,
                 "limit_db": content.limit_db, "provenance": content.provenance, "fitted": fitted}
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
@@ -157,11 +161,12 @@ def _fitted_record(fitted: EffectModel) -> dict[str, Any]:
             "device_sd_db": fitted.device_sd_db, "likelihood_power": fitted.likelihood_power,
             "shadowing": fitted.shadowing.state() if fitted.shadowing else None,
             "radius_factor": fitted.radius_factor,
-            "typical_misfit": None if np.isnan(fitted.typical_misfit) else fitted.typical_misfit}
+            "typical_misfit": None if np.isnan(fitted.typical_misfit) else fitted.typical_misfit,
+            "blend": fitted.blend.state()[1] if fitted.blend else None}
 
 
-def _fitted(record: FittedRecord, channel: ChannelModel,
-            devices: list[TwinDevice]) -> EffectModel:
+def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevice],
+            beside: dict[str, np.ndarray]) -> EffectModel:
     _check_levels(record, channel)
     device_m = np.array([(each.x_m, each.y_m, each.z_m) for each in devices])
     known = {"device": len(devices), "receiver": len(record.receivers)}
@@ -175,6 +180,11 @@ def _fitted(record: FittedRecord, channel: ChannelModel,
     shadowing = None
     if record.shadowing is not None:
         shadowing = CorrelatedShadowing.from_state(record.shadowing)
+    blend = None
+    if beside and record.blend is None:
+        raise ValueError("arrays beside the channel belong to nothing")
+    if record.blend is not None:
+        blend = Blend.from_state(beside, record.blend, feature_count(len(devices)))
     _check_terms(effects, [each.device for each in devices], record.receivers)
     return EffectModel(channel, tuple(effects), np.array(record.level_coefficients),
                        np.array(record.scale_db), record.dof, np.nan_to_num(device_m),
@@ -182,7 +192,7 @@ def _fitted(record: FittedRecord, channel: ChannelModel,
                        np.nan if record.first_s is None else record.first_s,
                        record.device_sd_db, record.likelihood_power, shadowing,
                        record.radius_factor,
-                       np.nan if record.typical_misfit is None else record.typical_misfit)
+                       np.nan if record.typical_misfit is None else record.typical_misfit, blend)
 
 
 def _check_terms(effects: list[FittedEffect], devices: list[str], receivers: list[str]) -> None:

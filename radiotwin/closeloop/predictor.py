@@ -1,0 +1,252 @@
+"""The final prediction: named physics, an interpolated rest and regressions, by weights.
+
+Near measured places interpolation and trees know most, and far from them physics does. So each
+member of the combination has a weight near measurements and one far from them, with a smooth
+transition. The weights are those with the least held-out error, and no reading has a part in the
+weights, the rest or the trees by which it is predicted: within the links outside a fold, other
+folds are held out in turn (nested cross-validation).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from radiotwin.channel.forest import Forest
+from radiotwin.channel.log_distance import LogDistance
+from radiotwin.channel.regression_kriging import RegressionKriging
+from radiotwin.closeloop.baselines import (
+    BOOSTING,
+    EXTRA_TREES,
+    LAWS,
+    TREES,
+    Part,
+    grow_trees,
+    held_out_baselines,
+    law_db,
+    laws_for,
+)
+from radiotwin.closeloop.criteria import SelectionCriteria
+from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.effects.blend import FORESTS, NAMED, REST, far_share
+from radiotwin.effects.correlated_shadowing import (
+    CorrelatedShadowing,
+    receivers_move,
+    standardised_residual,
+)
+from radiotwin.effects.fold_model import FoldModel
+from radiotwin.inference.censored_regression import FitResult
+from radiotwin.inference.stacking import combine, convex_weights
+from radiotwin.inference.student import mean_if_detected
+from radiotwin.links import LinkData
+
+HALF_M = 50.0  # distance to the nearest measurement at which near and far count the same
+PULL = 0.01  # towards the best single member, see `convex_weights`: 2 % of the RMSE
+INNER_FOLDS = 2  # that are held out within the links outside a fold
+MAX_INNER_LINKS = 12_000  # that they are a sample of
+INNER_TREES = 20
+MIN_LEARNT = 60  # detected links that anything is learnt from
+
+
+@dataclass(frozen=True, eq=False)
+class CombinedPrediction:
+    """Held-out prediction by all that was learnt, and by other models alone.
+
+    Attributes:
+        mean_db: (n,) level of a link that is detected [dB]; NaN where there is none.
+        names: of the k members.
+        weights: (2, k) near measurements, and far from them; from all links.
+        members: (n, k) held-out prediction of each member [dB].
+        share: (n,) how far a link is from the measurements that it was predicted by.
+        baselines: (n,) held-out prediction of other models [dB], by name.
+    """
+
+    mean_db: np.ndarray
+    names: list[str]
+    weights: np.ndarray
+    members: np.ndarray
+    share: np.ndarray
+    baselines: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class _Learnt:
+    """A model of some links, with all that is learnt beside it, and which members count."""
+
+    model: FoldModel
+    fit: FitResult
+    rest: CorrelatedShadowing | None
+    kriging: RegressionKriging | None
+    part: Part
+    names: list[str]
+
+    def held_out(self, group: np.ndarray, groups: list[int],
+                 seed: int) -> tuple[np.ndarray, np.ndarray]:
+        """Hold out groups of its training links, fit to the others, and predict.
+
+        Of the physics the coefficients are fitted again, and of rest and kriging the values. What
+        the links that are held out still decide is, of a few numbers for all: the place of a box,
+        the length of a correlation.
+
+        Args:
+            group: (n,) of each link.
+            groups: to be held out, one after the other.
+            seed: of trees and samples.
+
+        Returns:
+            (r, k) measured minus predicted by each member [dB], and (r,) far shares.
+        """
+        rows = np.flatnonzero(self.model.train)
+        if len(rows) > MAX_INNER_LINKS:
+            rng = np.random.default_rng(seed)
+            rows = np.sort(rng.choice(rows, MAX_INNER_LINKS, replace=False))
+        part = self.part.select(rows)
+        whole = self.model.restrict(rows, self.model.effects)
+        errors, shares = [np.zeros((0, len(self.names)))], [np.zeros(0)]
+        for each in groups:
+            out = group[rows] == each
+            test = np.flatnonzero(out & np.isfinite(part.links.level_db))
+            if not len(test) or np.isfinite(part.links.level_db[~out]).sum() < MIN_LEARNT:
+                continue
+            model = replace(whole, train=~out)
+            fit = model.fit(self.fit)
+            rest = self.rest and self.rest.refit(model, fit)
+            inner = _Learnt(model, fit, rest, self.kriging, part, self.names)
+            errors.append(part.links.level_db[test, None] - inner.members_db(test, seed))
+            shares.append(shares_of(part.links, ~out, test))
+        return np.concatenate(errors), np.concatenate(shares)
+
+    def members_db(self, test: np.ndarray, seed: int) -> np.ndarray:
+        """Return what members (m, k) predict of rows (m,), by few trees and known correlations."""
+        physics = physics_db(self.model, self.fit, self.rest, self.part, test, seed, INNER_TREES)
+        laws = [law_db(kind, self.part.links, self.model.train, test, self.kriging)
+                for kind in LAWS if kind.name in self.names]
+        return np.column_stack([physics, *laws])
+
+
+def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: SelectionCriteria,
+                        seed: int) -> CombinedPrediction:
+    """Return the held-out prediction by all that was learnt.
+
+    Trees upon the physics are members, and trees alone are not: where physics is of no use to
+    them, it does no harm either.
+
+    Args:
+        model: with all effects that have a name.
+        with_rest: whether to interpolate the rest, too, where the model does not yet.
+        criteria: when kriging takes too long.
+        seed: of trees and samples.
+    """
+    links, count = model.links, len(model.folds)
+    parts = [Part(each.links) for each in model.folds]
+    baselines, kriging = held_out_baselines(model, parts, criteria, seed)
+    laws = [kind.name for kind in laws_for(links, criteria) if kind is not LogDistance]
+    names = [NAMED, *FORESTS, *([REST] if with_rest or model.shadowing else []), *laws]
+    members, share = np.full((len(links), len(names)), np.nan), np.ones(len(links))
+    mean_db = np.full(len(links), np.nan)
+    learnt: _Learnt | None = None
+    for number, (fold, fit, part) in enumerate(zip(model.folds, model.fits[1:], parts,
+                                                   strict=True)):
+        rest = None
+        if REST in names:
+            rest = model.shadowing[number + 1] if model.shadowing else CorrelatedShadowing.fit(
+                fold, fit, seed)
+        learnt = _Learnt(fold, fit, rest, kriging[number] if kriging else None, part, names)
+        test = np.flatnonzero((model.index == number) & fold.usable)
+        share[test] = shares_of(part.links, fold.train, test)
+        members[test] = np.column_stack([
+            physics_db(fold, fit, rest, part, test, seed),
+            *(baselines[name][test] for name in laws)])
+        others = [(number + step) % count for step in range(1, count)][:INNER_FOLDS]
+        mean_db[test] = combine(members[test], share[test], _weights(
+            *learnt.held_out(model.index, others, seed), names))
+    error_db = links.level_db[:, None] - members
+    far = learnt.held_out(_quadrant(links), [0, 1, 2, 3], seed) if learnt else (
+        error_db[:0], share[:0])
+    weights = _weights(np.vstack([error_db, far[0]]), np.concatenate([share, far[1]]), names)
+    return CombinedPrediction(mean_db, names, weights, members, share, baselines)
+
+
+def _quadrant(links: LinkData) -> np.ndarray:
+    """Return the quadrant (n,) of the area that the end that moves is in.
+
+    With one left out, as much is extrapolated as by a map of more than was measured.
+    """
+    moving_m = links.receiver_m if receivers_move(links) else links.device_m[links.device]
+    above = moving_m[:, :2] > np.median(moving_m[:, :2], axis=0)
+    return above @ np.array([1, 2])
+
+
+def shares_of(links: LinkData, train: np.ndarray, test: np.ndarray) -> np.ndarray:
+    """Return how far some links are from all measured ones, in 0..1, see `far_share`.
+
+    By the end that moves, from where it was measured with the same other end.
+
+    Args:
+        links: n links.
+        train: (n,) bool or rows, measured.
+        test: (m,) rows.
+
+    Returns:
+        (m,)
+    """
+    moving_m, other = (links.receiver_m, links.device) if receivers_move(links) else (
+        links.device_m[links.device], links.receiver)
+    away_m = np.full(len(test), np.inf)
+    learnt = np.arange(len(links))[train]
+    for label in np.unique(other[test]):
+        mine = np.flatnonzero(other[test] == label)
+        known = learnt[other[learnt] == label]
+        if len(known):
+            away_m[mine] = cKDTree(moving_m[known]).query(moving_m[test[mine]])[0]
+    return far_share(away_m, HALF_M)
+
+
+def _weights(error_db: np.ndarray, share: np.ndarray, names: list[str]) -> np.ndarray:
+    known = np.isfinite(error_db).all(axis=1)
+    if not known.any():  # nothing could be held out
+        return np.tile(np.array(names) == NAMED, (2, 1)).astype(float)
+    return convex_weights(error_db[known], share[known], PULL)
+
+
+def residual_forests(model: FoldModel, fit: FitResult, part: Part, seed: int,
+                     trees: int = TREES) -> dict[str, Forest]:
+    """Grow trees, by the names in `FORESTS`, on the standardised residual of training links.
+
+    They are not told which receiver it is: its effects have names, and a map has none.
+    """
+    rows = np.flatnonzero(model.train)
+    z = standardised_residual(model, fit)
+    return {name: grow_trees(kind, part.common[rows], z, seed, trees)
+            for name, kind in zip(FORESTS, (EXTRA_TREES, BOOSTING), strict=True)}
+
+
+def physics_db(model: FoldModel, fit: FitResult, rest: CorrelatedShadowing | None, part: Part,
+               test: np.ndarray, seed: int, trees: int = TREES) -> np.ndarray:
+    """Return what named effects predict, alone, with trees upon them, and with the rest [dB].
+
+    Args:
+        model: n links, of which some are learnt from.
+        fit: to these.
+        rest: interpolated, of these; None: not asked for.
+        part: the links as trees are told of them.
+        test: (m,) rows.
+        seed: of the trees.
+        trees: number of them.
+
+    Returns:
+        (m, 3), or (m, 4) with the rest, level of a link that is detected.
+    """
+    reading = model.predict(fit)
+    mean_db, scale_db, limit_db = (each[test] for each in (
+        reading.mean_db, reading.scale_db, model.limit_db))
+    forests = residual_forests(model, fit, part, seed, trees)
+    added: list[tuple] = [(0.0, 1.0), *((forest.predict(part.common[test]), 1.0)
+                                        for forest in forests.values())]
+    if rest is not None:
+        added.append(rest.at(model.links.select(test)))
+    return np.column_stack([
+        mean_if_detected(mean_db + shift * scale_db, scale_db * left, limit_db, model.dof)
+        for shift, left in added])

@@ -1,0 +1,153 @@
+"""What interpolation and regression add to named effects, by weights that depend on the place.
+
+Near measured places they know most, far from them physics does: each member has a weight near
+measurements and one far from them, found on held-out links by `radiotwin.closeloop.predictor`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from radiotwin.channel.base import ChannelModel
+from radiotwin.channel.forest import Forest
+from radiotwin.channel.regression_kriging import RegressionKriging
+from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
+from radiotwin.channel.stored import (
+    MAX_POSITION_M,
+    require_array,
+    require_names,
+    require_number,
+)
+from radiotwin.inference.stacking import combine
+from radiotwin.links import LinkData
+from radiotwin.links.features import link_features
+
+NAMED, REST = "named", "named_and_rest"
+FORESTS = ("named_and_trees", "named_and_boosting")  # members, learnt of what named effects leave
+LAWS = {each.name: each for each in (SegmentedLogDistance, RegressionKriging)}
+MAX_SD_RATIO = 100.0
+
+
+def far_share(away_m: np.ndarray, half_m: float) -> np.ndarray:
+    """Return how far places are from all measured ones, in 0..1: d / (d + half).
+
+    Args:
+        away_m: (n,) distance d to the nearest measurement [m]; inf = there is none.
+        half_m: distance at which near and far count the same [m].
+    """
+    return 1 - half_m / (away_m + half_m)
+
+
+@dataclass(frozen=True, eq=False)
+class Blend:
+    """Members beside named effects, and the weights of all; devices stand still, receivers move.
+
+    Attributes:
+        weights: of each member, near measurements and far from them; both sum to one.
+        half_m: as of `far_share` [m].
+        sd_ratio: standard deviation of the error over that of named effects, near and far.
+        measured_m: (p, 3) receivers' positions [m], and
+        measured_device: (p,) the device that was measured there.
+        forests: of the standardised residual of named effects, by name (`FORESTS`).
+        laws: fitted to the levels, by name.
+    """
+
+    weights: dict[str, tuple[float, float]]
+    half_m: float
+    sd_ratio: tuple[float, float]
+    measured_m: np.ndarray
+    measured_device: np.ndarray
+    forests: dict[str, Forest]
+    laws: dict[str, ChannelModel]
+
+    def far_share(self, links: LinkData) -> np.ndarray:
+        """Return how far the receivers of links are from where their device was measured (n,)."""
+        away_m = np.full(len(links), np.inf)
+        for device in np.unique(links.device):
+            known_m = self.measured_m[self.measured_device == device]
+            mine = links.device == device
+            if len(known_m):
+                away_m[mine] = cKDTree(known_m).query(links.receiver_m[mine])[0]
+        return far_share(away_m, self.half_m)
+
+    def apply(self, links: LinkData, mean_db: np.ndarray, scale_db: np.ndarray,
+              rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return mean and error scale (n,) of the combination [dB], before any limit of detection.
+
+        Args:
+            links: n links.
+            mean_db: (n,) by named effects [dB].
+            scale_db: (n,) of their errors [dB].
+            rest: (n,) what is interpolated [error scales]; 0 without it.
+        """
+        geometry, share = links.geometry, self.far_share(links)
+        members = {NAMED: mean_db, REST: mean_db + rest * scale_db}
+        if self.forests:
+            features = link_features(links, receivers=False)
+            for name, forest in self.forests.items():
+                members[name] = mean_db + forest.predict(features) * scale_db
+        for name, law in self.laws.items():
+            members[name] = law.predict(geometry)[0]
+        names = list(self.weights)
+        blended_db = combine(np.column_stack([members[name] for name in names]), share,
+                             np.transpose([self.weights[name] for name in names]))
+        near, far = np.square(self.sd_ratio)
+        return blended_db, scale_db * np.sqrt((1 - share) * near + share * far)
+
+    def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Return arrays by name, and settings that JSON can hold, for `from_state`."""
+        arrays = {"measured_m": self.measured_m.astype(np.float32),
+                  "measured_device": self.measured_device.astype(np.int32)}
+        settings: dict[str, Any] = {
+            "weights": {name: list(each) for name, each in self.weights.items()},
+            "half_m": self.half_m, "sd_ratio": list(self.sd_ratio), "models": {}}
+        for name, model in (*self.forests.items(), *self.laws.items()):
+            own, settings["models"][name] = model.state()
+            arrays |= {f"{name}/{each}": array for each, array in own.items()}
+        return arrays, settings
+
+    @classmethod
+    def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any],
+                   width: int) -> Self:
+        """Return what `state` described.
+
+        Args:
+            arrays: of `state`.
+            settings: of `state`.
+            width: number of columns of `link_features` with the twin's devices.
+
+        Raises:
+            BadInput: too large.
+            ValueError: it is damaged.
+            KeyError: a part is missing.
+        """
+        require_names("settings", settings, ["weights", "half_m", "sd_ratio", "models"])
+        forests, laws, own = {}, {}, {"measured_m", "measured_device"}
+        for name, given in settings["models"].items():
+            parts = {each.removeprefix(f"{name}/"): array for each, array in arrays.items()
+                     if each.startswith(f"{name}/")}
+            own |= {f"{name}/{each}" for each in parts}
+            if name in FORESTS:
+                forests[name] = Forest.from_state(parts, given, width)
+            else:
+                laws[name] = LAWS[name].from_state(
+                    {each: array.copy() for each, array in parts.items()}, given)
+        require_names("arrays", arrays, own)
+        weights = {name: (require_number({name: near}, name, 0, 1),
+                          require_number({name: far}, name, 0, 1))
+                   for name, (near, far) in settings["weights"].items()}
+        require_names("weights", set(weights) | {NAMED, REST}, {NAMED, REST, *forests, *laws})
+        if not np.allclose(np.sum(list(weights.values()), axis=0), 1.0, atol=1e-6):
+            raise ValueError("weights do not sum to one")
+        near, far = settings["sd_ratio"]
+        ratios = {"near": near, "far": far}
+        points = require_array(arrays, "measured_m", (None, 3), -MAX_POSITION_M, MAX_POSITION_M)
+        device = require_array(arrays, "measured_device", (len(points),), 0, 2**31 - 1)
+        return cls(weights, require_number(settings, "half_m", 1e-3, MAX_POSITION_M),
+                   (require_number(ratios, "near", 0.01, MAX_SD_RATIO),
+                    require_number(ratios, "far", 0.01, MAX_SD_RATIO)), points, device,
+                   forests, laws)

@@ -1,0 +1,49 @@
+"""Convex combination of predictions: weights that are not negative and sum to one.
+
+Breiman 1996, 'Stacked regressions', Machine Learning 24; van der Laan, Polley and Hubbard 2007,
+'Super learner', Statistical Applications in Genetics and Molecular Biology 6. The weights may pass
+from one set to another with a share that each prediction has.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import nnls
+
+TOGETHER = 1e4  # weight of the condition that weights sum to one, relative to the errors
+
+
+def convex_weights(error: np.ndarray, share: np.ndarray, pull: float) -> np.ndarray:
+    """Return the weights with the least squares, pulled towards the best single prediction.
+
+    Minimises sum((error @ w)^2) / m + pull * |w - best|^2 summed over both sets, with the mean
+    square m of the best single prediction's error: another single one must have a mean square
+    lower by 4 `pull` to be taken instead, if the share is the same for all.
+
+    Args:
+        error: (n, k) measured minus predicted, of k predictions.
+        share: (n,) in 0..1, of the second set of weights.
+        pull: as above.
+
+    Returns:
+        (2, k) weights: the first set (share 0) and the second (share 1).
+    """
+    n, k = error.shape
+    square = np.square(error).mean(axis=0)
+    best = int(square.argmin())
+    columns = np.hstack([error * (1 - share)[:, None], error * share[:, None]])
+    columns /= np.sqrt(n * max(float(square[best]), 1e-12))
+    upper = np.linalg.qr(columns, mode="r")
+    wanted = np.tile(np.arange(k) == best, 2).astype(float)
+    sums = TOGETHER * np.kron(np.eye(2), np.ones(k))
+    weights, _ = nnls(np.vstack([upper, np.sqrt(pull) * np.eye(2 * k), sums]),
+                      np.concatenate([np.zeros(len(upper)), np.sqrt(pull) * wanted,
+                                      np.full(2, TOGETHER)]))
+    weights = weights.reshape(2, k)
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def combine(predictions: np.ndarray, share: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return the combination (n,) of predictions (n, k) with shares (n,) and weights (2, k)."""
+    of_each = (1 - share)[:, None] * weights[0] + share[:, None] * weights[1]
+    return (of_each * predictions).sum(axis=1)

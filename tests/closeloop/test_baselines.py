@@ -1,0 +1,64 @@
+"""Other models on the folds of the loop."""
+
+import numpy as np
+import pytest
+
+from radiotwin.closeloop.advice import compare_with_baselines
+from radiotwin.closeloop.baselines import BOOSTING, EXTRA_TREES, Part, grow_trees, published_laws
+from radiotwin.links import prepare_links
+from radiotwin.links.features import feature_count, link_features
+
+
+@pytest.fixture
+def links(open_ground):
+    return prepare_links(open_ground.measured(open_ground.fly(0)), None)
+
+
+def test_trees_are_told_places_and_labels_but_neither_time_nor_quality(links):
+    features = link_features(links)
+    assert features.shape == (len(links), 14 + 5 + 2) and np.isfinite(features).all()
+    np.testing.assert_allclose(features[:, :3], links.receiver_m, rtol=1e-6)
+    np.testing.assert_array_equal(features[:, 14:19].argmax(axis=1), links.device)
+    np.testing.assert_array_equal(Part(links).common, link_features(links, receivers=False))
+    assert feature_count(5) == 19 and feature_count(1) == feature_count(5000) == 14
+
+
+@pytest.mark.parametrize("kind", [EXTRA_TREES, BOOSTING])
+def test_trees_learn_a_step_and_repeat_to_the_bit(links, kind):
+    features = link_features(links)[:400]
+    step_db = np.where(features[:, 0] > 250, -70.0, -90.0)
+    first, second = (grow_trees(kind, features, step_db, 3, 5).predict(features) for _ in range(2))
+    np.testing.assert_array_equal(first, second)
+    assert np.abs(first - step_db).mean() < 2.0
+
+
+def test_published_laws_are_compared_where_they_hold(links):
+    found = published_laws(links)
+    assert "tr36777_uma" in found and "p1411" not in found  # which needs a map
+    assert all(np.isfinite(mean_db).all() for mean_db in found.values())
+    links.__dict__["is_gain"] = False
+    assert not published_laws(links)
+
+
+def scores(rmse_db, n=100):
+    return {"rmse_db": rmse_db, "n": n}
+
+
+def test_the_advice_names_the_best_other_model():
+    error = {"combined": scores(3.0), "after": scores(4.0)}
+    found = compare_with_baselines(error, {"log_distance": scores(9.0), "regression_kriging": scores(3.61)})
+    assert found["best_baseline"] == "regression_kriging"
+    assert "17 % better" in found["advice"] and "kriging alone: 3.61 dB" in found["advice"]
+    assert "predicts worse than kriging: 4.00 dB" in found["advice"]
+
+
+def test_the_advice_says_where_a_plain_model_would_do():
+    error = {"combined": scores(3.6), "after": scores(3.6)}
+    assert "a plain regression would do: kriging 3.61 dB" in compare_with_baselines(
+        error, {"regression_kriging": scores(3.61)})["advice"]
+
+
+def test_a_model_of_fewer_links_is_not_compared():
+    error = {"combined": scores(3.6), "after": scores(3.6)}
+    assert compare_with_baselines(error, {"regression_kriging": scores(1.0, 50)}) is None
+    assert compare_with_baselines({"combined": scores(None, 0), "after": scores(None, 0)}, {}) is None

@@ -1,0 +1,87 @@
+"""The combination as a twin keeps it."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from radiotwin.closeloop import predictor
+from radiotwin.closeloop.bases import make_bases
+from radiotwin.closeloop.blending import make_blend
+from radiotwin.closeloop.criteria import SelectionCriteria
+from radiotwin.closeloop.cross_validation import cross_validate, training_parts
+from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.predictor import combined_prediction
+from radiotwin.effects.effect_model import EffectModel
+from radiotwin.errors import BadInput
+from radiotwin.links import prepare_links
+from radiotwin.twin.twin import Twin
+from tests.worlds import fly, measured
+
+
+@pytest.fixture(scope="module")
+def blended():
+    """A world with a pattern that no effect explains: its links, prediction, and twin with the blend."""
+    world = fly(12, noise_db=1.0)
+    keep = world.slot % 6 == 0
+    world.gain_db += 6 * np.sin(world.receiver_m[:, 0] / 40)
+    for name in ("flight", "receiver", "device", "time_s", "slot", "receiver_m", "heading_deg", "gain_db"):
+        setattr(world, name, getattr(world, name)[keep])
+    links = prepare_links(measured(world), None)
+    folds = make_folds(links, 0)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(predictor, "INNER_TREES", 5)
+        model = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
+        prediction = combined_prediction(model, False, SelectionCriteria(), 0)
+    blend = make_blend(model, prediction, 0)
+    fitted = replace(EffectModel.of(model.whole, model.fits[0]), blend=blend)
+    return SimpleNamespace(links=links, model=model, prediction=prediction, twin=replace(model.twin, fitted=fitted))
+
+
+def test_the_twin_predicts_by_the_weights_of_the_loop(blended):
+    weights = blended.twin.fitted.blend.weights
+    assert np.sum(list(weights.values()), axis=0) == pytest.approx(1.0)
+    assert any(name in weights for name in ("named_and_trees", "named_and_boosting"))
+    learnt_db = blended.twin.predict(blended.links).mean_db
+    named_db = replace(blended.twin, fitted=replace(blended.twin.fitted, blend=None)).predict(blended.links).mean_db
+    error = [np.sqrt(np.nanmean((blended.links.level_db - mean_db) ** 2)) for mean_db in (learnt_db, named_db)]
+    assert error[0] < 0.8 * error[1]
+
+
+def test_a_stored_twin_predicts_the_same(blended, tmp_path):
+    blended.twin.save(tmp_path / "twin")
+    again = Twin.load(tmp_path / "twin").predict(blended.links)
+    expected = blended.twin.predict(blended.links)
+    np.testing.assert_allclose(again.mean_db, expected.mean_db, atol=1e-3)
+    np.testing.assert_allclose(again.sd_db, expected.sd_db, rtol=1e-3)
+
+
+def test_far_from_all_measurements_it_takes_the_far_weights(blended):
+    blend, links = blended.twin.fitted.blend, blended.links
+    far = links.with_receivers(links.receiver_m + [1e5, 0, 0])
+    assert blend.far_share(far).min() > 0.99 and blend.far_share(links).max() < 0.01
+    nowhere = replace(blend, measured_device=np.full(len(blend.measured_device), 99))
+    assert (nowhere.far_share(links) == 1.0).all()
+
+
+def test_links_without_a_receiver_are_predicted_as_a_map_needs_them(blended):
+    links = blended.links
+    of_map = links.synthetic(links.device_m, links.device[:50], links.receiver_m[:50], device_names=links.device_names,
+                             limit_db=None, frequency_hz=links.frequency_hz, city=None, is_gain=True,
+                             anchors=links.anchors)
+    assert np.isfinite(blended.twin.predict(of_map).mean_db).all()
+
+
+@pytest.mark.parametrize("change", [
+    lambda blend: blend["weights"].update(named=[2.0, 0.0]), lambda blend: blend.update(half_m=-1.0),
+    lambda blend: blend.update(more=1), lambda blend: blend["models"].clear(),
+    lambda blend: blend["weights"].update(oracle=[0.0, 0.0]), lambda blend: blend.update(sd_ratio=[0.0, 1.0])])
+def test_a_damaged_combination_is_refused(blended, change):
+    import json
+
+    record, channel = blended.twin.encode()
+    given = json.loads(record)
+    change(given["fitted"]["blend"])
+    with pytest.raises(BadInput, match="damaged"):
+        Twin.decode(json.dumps(given), channel, "it")

@@ -1,0 +1,90 @@
+"""The final prediction: its weights, and that no held-out reading is in it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from radiotwin.closeloop import cross_validation, predictor
+from radiotwin.closeloop.bases import make_bases
+from radiotwin.closeloop.criteria import SelectionCriteria
+from radiotwin.closeloop.cross_validation import cross_validate, training_parts
+from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.predictor import combined_prediction
+from radiotwin.links import prepare_links
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(predictor, "INNER_TREES", 5)
+    monkeypatch.setattr(cross_validation, "best_dof", lambda *_: 5.0)  # which the base learns of all links
+
+
+def flown(open_ground, seed, part=6, **options):
+    """Fly over open ground, and keep every `part`-th slot."""
+    world = open_ground.fly(seed, **options)
+    keep = world.slot % part == 0
+    for name in ("flight", "receiver", "device", "time_s", "slot", "receiver_m", "heading_deg", "gain_db"):
+        setattr(world, name, getattr(world, name)[keep])
+    return world
+
+
+def predicted(links, with_rest=False):
+    """Return folds and the combination upon the log-distance law, without any effect."""
+    folds = make_folds(links, 0)
+    model = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
+    return model, combined_prediction(model, with_rest, SelectionCriteria(), 0)
+
+
+def rmse_db(links, mean_db):
+    return float(np.sqrt(np.nanmean((links.level_db - mean_db) ** 2)))
+
+
+def ratio(links, found):
+    """Return its error over that of the best other model."""
+    return rmse_db(links, found.mean_db) / min(rmse_db(links, each) for each in found.baselines.values())
+
+
+def test_of_levels_without_any_cause_the_mean_is_predicted(open_ground):
+    world = flown(open_ground, 3)
+    world.gain_db = np.random.default_rng(3).normal(-80.0, 6.0, len(world.gain_db))
+    links = prepare_links(open_ground.measured(world), None)
+    _, found = predicted(links)
+    assert rmse_db(links, found.mean_db) < 1.02 * float(np.nanstd(links.level_db))
+    np.testing.assert_allclose(found.weights.sum(axis=1), 1.0)
+    assert (found.weights >= 0).all()
+
+
+def test_no_reading_of_a_fold_changes_its_prediction(open_ground):
+    links = prepare_links(open_ground.measured(flown(open_ground, 4)), None)
+    model, found = predicted(links)
+    own = model.index == 2
+    level_db = links.level_db + own * np.random.default_rng(0).normal(0, 9, len(links))
+    _, other = predicted(replace(links, level_db=level_db))
+    np.testing.assert_allclose(found.mean_db[own], other.mean_db[own], atol=1e-6)
+    assert not np.allclose(found.mean_db[~own], other.mean_db[~own])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(6))
+def test_it_is_never_much_worse_than_the_best_of_the_others(open_ground, seed, monkeypatch):
+    monkeypatch.undo()
+    rng = np.random.default_rng(seed)
+    world = flown(open_ground, seed + 10, part=2, noise_db=1.5)
+    phase, length_m = rng.uniform(0, 6), rng.uniform(30, 120)
+    world.gain_db += rng.uniform(0, 6) * np.sin(world.receiver_m[:, 0] / length_m + phase)
+    world.gain_db[world.device == 2] += rng.normal(0, 5)
+    links = prepare_links(open_ground.measured(world), None)
+    assert ratio(links, predicted(links)[1]) < 1.02
+
+
+@pytest.mark.slow
+def test_near_measurements_interpolation_wins_and_far_from_them_the_law(open_ground, monkeypatch):
+    monkeypatch.undo()
+    world = flown(open_ground, 5, part=1, noise_db=0.5)
+    world.gain_db += 7.0 * np.sign(np.sin(world.receiver_m[:, 0] / 40) * np.sin(world.receiver_m[:, 1] / 40))
+    links = prepare_links(open_ground.measured(world), None)
+    _, found = predicted(links, with_rest=True)
+    law = [found.names.index(name) for name in ("named", "segmented_log_distance")]
+    near, far = found.weights[:, law].sum(axis=1)
+    assert ratio(links, found) < 1.02 and far > near
