@@ -95,7 +95,7 @@ def interference(at: Scenario, rng: np.random.Generator) -> Hidden:
 
 def duty_cycled_jammer(at: Scenario, rng: np.random.Generator) -> Hidden:
     """A device that nobody declares sends in bursts."""
-    over_db, period_s, duty = _emitter_over_db(at, rng, 0.2, 0.7), between(rng, 4, 90), rng.uniform(0.2, 0.6)
+    over_db, period_s, duty = _emitter_over_db(at, rng, 0.05, 0.4), between(rng, 4, 90), rng.uniform(0.2, 0.6)
     on = (at.of_links("time_s") / period_s + rng.random()) % 1 < duty
     return Hidden("duty_cycled_jammer", False, {"centre_m": at.where.device_m[-1].tolist(), "period_s": round(period_s, 1),
                                                 "duty": round(duty, 2)},

@@ -29,7 +29,7 @@ from tests.undeclared.foreign.scenario import Hidden, Scenario
 from tests.undeclared.foreign.store import stored
 from tests.undeclared.foreign.worlds import city_of
 
-LEAST_DB, TRIES = 0.15, 30  # of what is hidden, over the links that have a path
+LEAST_DB, TRIES = 0.15, 30  # of what is hidden, over the links that can be heard
 
 __all__ = ["ForeignCase", "families", "foreign_case", "names", "split_of"]
 
@@ -101,8 +101,9 @@ def foreign_case(name: str, hidden: bool = True) -> ForeignCase:
     at = Scenario.of(name.rpartition("-")[0])
     rng = {purpose: np.random.default_rng([zlib.crc32(f"{name}/{purpose}".encode())])
            for purpose in ("effects", "habits", "noise", "table")}
-    drawn = [_seen(family, at, rng["effects"]) for family in families(name)]
     habits = draw_habits(at, bool(TIMED & set(families(name))), bool(ATTITUDE & set(families(name))), rng["habits"])
+    audible = at.plain_db >= np.array(habits.limit_db)[at.of_links("receiver")]
+    drawn = [_seen(family, at, audible, rng["effects"]) for family in families(name)]
     if any(one.lost is not None for one in drawn):  # nobody could miss what is in no table
         habits = replace(habits, blanks=True)
     found = drawn if hidden else []
@@ -122,11 +123,11 @@ def foreign_case(name: str, hidden: bool = True) -> ForeignCase:
                        _size_db(at, found, np.isfinite(level_db)))
 
 
-def _seen(family: str, at: Scenario, rng: np.random.Generator) -> Hidden:
-    """Draw an effect that does something: a lorry that stands where no path goes is drawn again."""
+def _seen(family: str, at: Scenario, audible: np.ndarray, rng: np.random.Generator) -> Hidden:
+    """Draw an effect that does something to audible links (n,): a lorry that stands where no path goes is drawn again."""
     for _ in range(TRIES):
         found = DRAWS[family](at, rng)
-        if found.lost is not None or _size_db(at, [found], np.isfinite(at.plain_db)) >= LEAST_DB:
+        if found.lost is not None or _size_db(at, [found], audible) >= LEAST_DB:
             break
     return found
 
@@ -144,7 +145,7 @@ def _scene(at: Scenario, habits: Habits, found: list[Hidden]) -> Scene:
     atexit.register(folder.cleanup)
     limit_db = habits.declared_db if habits.declared == "silent" else habits.declared_db + (habits.sent_dbm or 0.0)
     write_map(Path(folder.name), at.where, limit_db, [index for one in found for index in one.map_lacks],
-              [index for one in found for index in one.map_shows])
+              [building for one in found for building in one.map_shows])
     return Scene.load(folder.name)
 
 
@@ -183,7 +184,7 @@ def _size_db(at: Scenario, found: list[Hidden], detected: np.ndarray) -> float:
     heard = np.isfinite(at.plain_db) & np.isfinite(reading_db)
     change_db = np.subtract(reading_db, at.plain_db, out=np.zeros(at.links), where=heard)
     lacks = [at.where.true[index] for one in found for index in one.map_lacks]
-    shows = [at.where.city.buildings[index] for one in found for index in one.map_shows]
+    shows = [building for one in found for building in one.map_shows]
     if lacks or shows or any(one.written_m is not None or one.device_m is not None for one in found):
         written_m, device_m = _written(at, found)
         mapped = [one for one in at.standing if one not in lacks] + shows

@@ -34,7 +34,7 @@ def write_truth(folder: Path, where: World) -> Path:
     return folder / "city.xml"
 
 
-def write_map(folder: Path, where: World, limit_db: float, but: Sequence[int] = (), and_also: Sequence[int] = ()) -> None:
+def write_map(folder: Path, where: World, limit_db: float, but: Sequence[int] = (), gone: Sequence[Building] = ()) -> None:
     """Write the scene folder that a user has.
 
     Args:
@@ -42,10 +42,10 @@ def write_map(folder: Path, where: World, limit_db: float, but: Sequence[int] = 
         where: the world; its map has the buildings of the plan that `where.mapped` says.
         limit_db: declared limit of detection [dB], or [dBm] where levels are in dBm.
         but: indices of buildings that stand and that this map lacks.
-        and_also: indices of buildings that are gone and that this map has.
+        gone: buildings that do not stand and that this map has.
     """
-    buildings = [one for index, one in enumerate(where.city.buildings)
-                 if (where.mapped[index] or index in and_also) and index not in but]
+    buildings = [one for index, one in enumerate(where.city.buildings) if where.mapped[index] and index not in but]
+    buildings = sorted([*buildings, *gone], key=lambda one: float(one.footprint_m[0, 0]))  # numbers tell nothing
     materials = {one.material: Material(one.material, itu=one.material) for one in buildings}
     _write(folder, where.city.side_m, [(one, materials[one.material]) for one in buildings],
            Material(GROUND, itu=GROUND))

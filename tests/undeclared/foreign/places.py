@@ -6,7 +6,7 @@ from tests.undeclared.foreign.draws import between, device
 from tests.undeclared.foreign.grounds import Grounds
 from tests.undeclared.foreign.layouts import Building
 from tests.undeclared.foreign.scenario import Hidden, Scenario, blocked
-from tests.undeclared.shapes import inside
+from tests.undeclared.shapes import corners_of, distance_m, fits, inside, turned
 
 
 def missing_obstacle(at: Scenario, rng: np.random.Generator) -> Hidden:
@@ -23,9 +23,24 @@ def missing_obstacle(at: Scenario, rng: np.random.Generator) -> Hidden:
 
 
 def removed_obstacle(at: Scenario, rng: np.random.Generator) -> Hidden:
-    """A building that was pulled down and that the map still shows."""
-    return Hidden("removed_obstacle", True, _building(at.where.city.buildings[at.where.reserve]),
-                  map_shows=(at.where.reserve,))
+    """A building that was pulled down and that the map still shows: that of the plan, or one where there is room."""
+    one = at.where.city.buildings[at.where.reserve] if rng.random() < 0.5 else _in_a_gap(at, rng)
+    return Hidden("removed_obstacle", True, _building(one), map_shows=(one,))
+
+
+def _in_a_gap(at: Scenario, rng: np.random.Generator) -> Building:
+    """Draw a building that stands on nobody's way."""
+    ends_m = np.concatenate([at.where.device_m, at.where.campaign.points_m])
+    low_m = ends_m[ends_m[:, 2] < 40, :2]
+    standing = [one.footprint_m for one in at.where.city.buildings]
+    for side_m in np.linspace(26, 7, 60):
+        centre = rng.uniform(20, at.where.city.side_m - 20, 2)
+        corners = turned(corners_of("box", side_m * rng.uniform(0.7, 1.4), side_m, rng), rng.uniform(0, np.pi)) + centre
+        if fits(corners, standing, 3.0) and distance_m(low_m, corners).min() > 4:
+            break
+    else:
+        return at.where.city.buildings[at.where.reserve]
+    return Building(corners.round(2), round(float(rng.uniform(10, 30)), 1), "brick")
 
 
 def _building(one: Building) -> dict:

@@ -29,7 +29,8 @@ class Hidden:
         lost: (n,) bool, links that come out blank.
         written_m: (p, 3) positions of the receivers as they are written down [m].
         device_m: (k, 3) positions of the devices as they are declared [m].
-        map_lacks, map_shows: indices of buildings that the map lacks, or shows although they are gone.
+        map_lacks: indices of buildings of the plan that the map lacks.
+        map_shows: buildings that the map shows although they are gone.
     """
 
     name: str
@@ -43,7 +44,7 @@ class Hidden:
     written_m: np.ndarray | None = None
     device_m: np.ndarray | None = None
     map_lacks: tuple[int, ...] = ()
-    map_shows: tuple[int, ...] = ()
+    map_shows: tuple[Building, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
