@@ -64,6 +64,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
         "schema": SCHEMA, "radiotwin_version": __version__, "base": loop.base,
         "verdict": loop.verdict, "effects": effects, "candidates": candidates,
         "posterior": [_step(each) for each in selection.steps],
+        "detectable": [vars(each) for each in loop.detectable],
         "heldout": {"by": loop.folds.by, "folds": loop.folds.count,
                     "n": int(np.isfinite(loop.after.held_out_nll).sum())},
         "error": error, "baselines": baselines, "combination": combination,
@@ -177,7 +178,7 @@ def _from_version_1(report: dict[str, Any]) -> dict[str, Any]:
                       for effect in report["effects"]]
     new["error"] = _with_new_bias(report["error"])
     new["baselines"] = _with_new_bias(report["baselines"])
-    return new | {"schema": SCHEMA, "criteria": {}, "posterior": []}
+    return new | {"schema": SCHEMA, "criteria": {}, "posterior": [], "detectable": []}
 
 
 def _with_new_bias(value: Any) -> Any:

@@ -138,6 +138,15 @@ class StepRecord(Record):
     noise_db: Number | None
 
 
+class DetectableRecord(Record):
+    """How large an effect would have had to be, to be named; no size where none would do."""
+
+    name: str
+    size: Number | None
+    unit: str
+    pattern: str
+
+
 class FoldsRecord(Record):
     """How links were held out."""
 
@@ -163,6 +172,7 @@ class ReportRecord(Record):
     effects: list[EffectRecord]
     candidates: list[CandidateRecord]
     posterior: list[StepRecord] = Field(default_factory=list)
+    detectable: list[DetectableRecord] = Field(default_factory=list)
     heldout: FoldsRecord
     error: ErrorRecord
     baselines: dict[str, BaselineRecord]

@@ -24,6 +24,7 @@ from radiotwin.closeloop.posterior import NONE, OTHER
 from radiotwin.closeloop.predictor import CombinedPrediction, combined_prediction
 from radiotwin.closeloop.residual_tests import ResidualDependence, residual_dependences
 from radiotwin.closeloop.selection import SelectionResult, add_shadowing, forward_selection
+from radiotwin.closeloop.sensitivity import Detectable, detectable
 from radiotwin.closeloop.thinning import thin_links
 from radiotwin.effects.params import Parameter
 from radiotwin.effects.registry import catalogue
@@ -97,6 +98,12 @@ class Loop:
             return "unexplained"
         sure = step.probabilities[NONE] >= self.criteria.min_probability
         return "none" if sure else "undecided"
+
+    @cached_property
+    def detectable(self) -> list[Detectable]:
+        """How large effects would have had to be, to be named."""
+        left = self.selection.hypotheses
+        return [] if left is None else detectable(left, self.criteria)
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:

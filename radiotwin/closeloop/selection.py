@@ -41,6 +41,7 @@ class SelectionResult:
         rivals: of each kept effect, names of those that the data cannot tell from it.
         steps: what each step's residual says, the first step first; the last is of what is left.
         explained: the model before any last resort.
+        hypotheses: about what is left.
     """
 
     model: CrossValidatedModel
@@ -49,6 +50,7 @@ class SelectionResult:
     rivals: list[list[str]] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
     explained: CrossValidatedModel | None = None
+    hypotheses: Hypotheses | None = None
 
     @property
     def is_full(self) -> bool:
@@ -103,6 +105,7 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
         if causes:
             on_progress(f"step {step + 1}: what the base may be wrong in")
             hypotheses = Hypotheses.of(result.model.whole, result.model.fits[0], seed)
+            result.hypotheses = hypotheses
         passed = _score_all(result, available, block, hypotheses, seed, on_progress)
         if hypotheses is not None:
             passed = _probable(result, passed, hypotheses, step)

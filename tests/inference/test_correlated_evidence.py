@@ -1,0 +1,83 @@
+"""Evidence beside a correlated rest, against closed forms and brute force."""
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+from scipy.stats import multivariate_normal
+
+from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
+
+NOTHING = Columns(np.zeros((240, 0)), np.zeros(0))
+
+
+def field(rng, sd, length_m, series=2, points=120, side_m=400.0):
+    """Return series, positions and a field of exponential correlation plus white noise of sd 1."""
+    label, position_m = np.repeat(np.arange(series), points), rng.uniform(0, side_m, (series * points, 3)) * [1, 1, 0]
+    z = rng.normal(size=series * points)
+    for number in range(series):
+        mine = label == number
+        covariance = sd**2 * np.exp(-cdist(position_m[mine], position_m[mine]) / length_m)
+        z[mine] += np.linalg.cholesky(covariance + 1e-9 * np.eye(points)) @ rng.normal(size=points)
+    return label, position_m, z
+
+
+def test_the_marginal_likelihood_is_that_of_the_normal_distribution():
+    rng = np.random.default_rng(0)
+    label, position_m, z = field(rng, 1.5, 60.0)
+    columns = Columns(rng.normal(size=(240, 3)), np.array([0.5, 2.0, 1.0]))
+    evidence = CorrelatedEvidence.fit(label, position_m, z, NOTHING, 0)
+    theta = np.array([0.3, 0.7])
+    rows = evidence.rows
+    correlation = np.exp(-cdist(position_m[rows], position_m[rows]) / evidence.length_m)
+    covariance = np.exp(0.3) * (np.eye(240) + np.exp(0.7) * correlation * (label[rows][:, None] == label[rows]))
+    covariance += columns.values[rows] * columns.prior_sd**2 @ columns.values[rows].T
+    found = evidence.at(evidence.rotated(z), evidence.rotated(columns.values), columns.prior_sd, theta)
+    assert found == pytest.approx(multivariate_normal.logpdf(z[rows], cov=covariance), abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_smooth_rest_is_no_evidence_for_a_smooth_pattern(seed):
+    """Counted link by link it would be: hundreds of nats for a ramp that is not there."""
+    rng = np.random.default_rng(seed)
+    label, position_m, z = field(rng, 3.0, 150.0)
+    ramp = Columns((position_m[:, :1] - 200) / 200, np.array([3.0]))
+    evidence = CorrelatedEvidence.fit(label, position_m, z, NOTHING, 0)
+    assert evidence.log_evidence(z, ramp) - evidence.log_evidence(z, NOTHING) < 3.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_pattern_that_no_field_has_is_evidence(seed):
+    rng = np.random.default_rng(seed)
+    label, position_m, z = field(rng, 3.0, 150.0)
+    pattern = rng.normal(size=(240, 1))
+    evidence = CorrelatedEvidence.fit(label, position_m, z, NOTHING, 0)
+    z = z + pattern[:, 0]
+    gain = evidence.log_evidence(z, Columns(pattern, np.array([3.0]))) - evidence.log_evidence(z, NOTHING)
+    assert gain > 20
+
+
+def test_information_is_twice_the_expected_log_likelihood_ratio():
+    rng = np.random.default_rng(1)
+    pattern, gains = rng.normal(size=240), []
+    label, position_m, z = field(rng, 1.0, 60.0)
+    evidence = CorrelatedEvidence.fit(label, position_m, z, NOTHING, 0)
+    own, theta, none = evidence.rotated(pattern), np.array([0.0, 0.0]), np.zeros((240, 0))
+    information = evidence.information(own, none, np.zeros(0), theta)
+    for seed in range(40):
+        _, _, z = field(np.random.default_rng(seed), 1.0, evidence.length_m)
+        without, exact = evidence.rotated(z + 0.4 * pattern), evidence.rotated(z)
+        gains.append(evidence.at(exact, none, np.zeros(0), theta) - evidence.at(without, none, np.zeros(0), theta))
+    assert np.mean(gains) == pytest.approx(0.5 * 0.4**2 * information, rel=0.25)
+
+
+def test_long_series_are_thinned_and_blank_rows_are_left_out():
+    rng = np.random.default_rng(2)
+    position_m, z = rng.uniform(0, 300, (5000, 3)), rng.normal(size=5000)
+    z[::3] = np.nan
+    evidence = CorrelatedEvidence.fit(np.zeros(5000, dtype=int), position_m, z, Columns(np.zeros((5000, 0)), np.zeros(0)), 0)
+    assert len(evidence.rows) == 500 and np.isfinite(z[evidence.rows]).all()
+
+
+def test_nothing_to_look_at_is_no_evidence():
+    evidence = CorrelatedEvidence.fit(np.zeros(240, dtype=int), np.zeros((240, 3)), np.full(240, np.nan), NOTHING, 0)
+    assert evidence.log_evidence(np.zeros(240), NOTHING) == 0.0
