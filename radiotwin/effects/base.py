@@ -86,6 +86,7 @@ class Effect(ABC):
         of_receiver: whether it belongs to a receiver, so that it is no part of a map.
         is_cause: whether it is a physical cause, not merely a description of what is left.
         always_exact: whether `exact` may be asked of every candidate, not only of what is kept.
+        uses: columns of the measurements that it reads and that no map has, such as `quality`.
     """
 
     name: ClassVar[str]
@@ -99,6 +100,7 @@ class Effect(ABC):
     of_receiver: ClassVar[bool] = False
     is_cause: ClassVar[bool] = True
     always_exact: ClassVar[bool] = False
+    uses: ClassVar[tuple[str, ...]] = ()
 
     def unavailable(self, links: LinkData) -> str | None:
         """Return why the data do not allow this effect to be looked for; None where they do."""
