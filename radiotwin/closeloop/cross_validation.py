@@ -12,7 +12,7 @@ import numpy as np
 from radiotwin.closeloop.bases import Base
 from radiotwin.closeloop.folds import Folds
 from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
-from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.fold_model import AppliedEffect, FoldModel
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.student import mean_if_detected
 from radiotwin.links import LinkData, with_evidence
@@ -105,6 +105,29 @@ class CrossValidatedModel:
             own = np.flatnonzero(self.index == number)
             shift[own], left[own] = shadowing.at(self.folds[number].links.select(own))
         return shift, left
+
+
+def without_quality(model: CrossValidatedModel) -> CrossValidatedModel:
+    """Return a model whose links do not know their own quality, as no map does.
+
+    Each has the median of its fold's training links instead; nothing is fitted again.
+    """
+    if model.links.quality is None:
+        return model
+
+    def blind(each: FoldModel) -> FoldModel:
+        quality = each.links.quality
+        assert quality is not None
+        known = quality[each.train & np.isfinite(quality)]
+        usual = float(np.median(known)) if len(known) else np.nan
+        links = replace(each.links, quality=np.full(len(quality), usual))
+        effects = [applied if "quality" not in applied.effect.uses
+                   else AppliedEffect(applied.effect, applied.params, applied.effect.term(
+                       links, applied.params, each.level_at)) for applied in each.effects]
+        return replace(each, links=links, effects=effects)
+
+    models = [blind(each) for each in model.models]
+    return model.extended(models, model.fits).with_shadowing(model.shadowing)
 
 
 def training_parts(links: LinkData, folds: Folds) -> list[LinkData]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from radiotwin import __version__
 from radiotwin.closeloop.advice import compare_with_baselines
-from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.closeloop.cross_validation import CrossValidatedModel, without_quality
 from radiotwin.closeloop.posterior import Step
 from radiotwin.closeloop.result_schema import ReportRecord
 from radiotwin.closeloop.run import Loop
@@ -30,6 +30,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
     selection = loop.selection
     kept = [score for score in selection.scores if score.kept]
     effects = [{"name": score.name, "variant": each.effect.variant, "rank": rank,
+                "uses": list(each.effect.uses),
                 "params": each.params.model_dump(mode="json"),
                 "parameters": {name: parameter.record() for name, parameter in parameters.items()},
                 "size_db": size.record(),
@@ -50,6 +51,8 @@ def make_report(loop: Loop) -> dict[str, Any]:
     links = loop.after.links
     error: dict[str, Any] = {"before": scores(loop.before), "after": scores(loop.after),
                              "noise_floor_db": loop.noise_floor_db}
+    if any("quality" in each.effect.uses for each in loop.after.whole.effects):
+        error["after_without_quality"] = scores(without_quality(loop.after))
     for name, groups in _groups(links).items():
         error[f"by_{name}"] = {label: {"before": scores(loop.before, rows),
                                        "after": scores(loop.after, rows)}

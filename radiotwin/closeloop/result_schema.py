@@ -34,6 +34,7 @@ class ErrorRecord(BothRecord):
     """Errors of all links and of groups of them, by the groups' names."""
 
     combined: ScoresRecord | None = None
+    after_without_quality: ScoresRecord | None = None
     noise_floor_db: Number | None
     by_los: dict[Literal["los", "nlos"], BothRecord] = Field(default_factory=dict)
     by_device: dict[str, BothRecord] = Field(default_factory=dict)
@@ -64,6 +65,7 @@ class EffectRecord(Record):
 
     name: str
     variant: str = ""
+    uses: list[str] = Field(default_factory=list)
     rank: Whole
     params: dict[str, Any] = Field(default_factory=dict)
     parameters: dict[str, ParameterRecord]

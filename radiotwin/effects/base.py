@@ -95,6 +95,7 @@ class Effect(ABC):
         within_flights: whether it acts at certain times only, so that other flights do not show it:
             it is scored on devices, or blocks of ground, that are held out in all flights.
         always_exact: whether `exact` may be asked of every candidate, not only of what is kept.
+        uses: columns of the measurements that it reads and that no map has, such as `quality`.
     """
 
     name: ClassVar[str]
@@ -109,6 +110,7 @@ class Effect(ABC):
     is_cause: ClassVar[bool] = True
     within_flights: ClassVar[bool] = False
     always_exact: ClassVar[bool] = False
+    uses: ClassVar[tuple[str, ...]] = ()
 
     def unavailable(self, links: LinkData) -> str | None:
         """Return why the data do not allow this effect to be looked for; None where they do."""

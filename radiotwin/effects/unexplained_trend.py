@@ -41,6 +41,7 @@ class UnexplainedTrend(GainEffect):
         """Make the effect for a variable of `residual_variables`."""
         self.variable = variable
         self.variant = f"over {variable}"  # type: ignore[misc]  # one class for every variable
+        self.uses = ("quality",) if variable == "quality" else ()  # type: ignore[misc]
         self._values = LinkCache()
 
     @override
