@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-
 from radiotwin.closeloop.bases import Base
 from radiotwin.closeloop.change_points import located_links, with_effect
 from radiotwin.closeloop.cross_validation import (

@@ -1,4 +1,4 @@
-"""Links that say nothing new left out: piles at one place, and of very many links all but a sample."""
+"""Fewer links where more say nothing new: piles at one place, and samples of very many."""
 
 from dataclasses import replace
 
@@ -34,9 +34,9 @@ def thin_piles(links: LinkData) -> LinkData:
     share = np.repeat(np.minimum(most / count, 1.0), count)
     place = np.arange(len(links)) - np.repeat(starts, count)
     kept = np.sort(order[np.floor((place + 1) * share) > np.floor(place * share)])
-    note = (f"receivers stayed at {(count > most).sum():,} places, where {len(links) - len(kept):,} "
-            f"of {len(links):,} links are left out, evenly in time: readings at one place err alike "
-            f"and count as one, and at most {most:.0f} of them are used")
+    note = (f"receivers stayed at {(count > most).sum():,} places, where "
+            f"{len(links) - len(kept):,} of {len(links):,} links are left out, evenly in time: "
+            f"readings at one place err alike and count as one; {most:.0f} of them are used")
     return replace(links.select(kept), notes=[*links.notes, note])
 
 

@@ -56,7 +56,7 @@ class FaultyFlight(GainEffect):
     """One flight of one receiver that disagrees with all others; a step finds the worst."""
 
     name = "faulty_flight"
-    figure = "intervals"
+    figure = "links"
     of_receiver = True
     repeatable = True
     within_flights = True

@@ -36,7 +36,8 @@ def _restarts(flights: list[tuple[np.ndarray, np.ndarray]]) -> bool:
     return any(_at_two_places(*pair) for pair in zip(flights, flights[1:], strict=False))
 
 
-def _at_two_places(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> bool:
+def _at_two_places(one: tuple[np.ndarray, np.ndarray],
+                   other: tuple[np.ndarray, np.ndarray]) -> bool:
     (time_s, position_m), (other_s, other_m) = one, other
     both = (time_s >= other_s[0]) & (time_s <= other_s[-1])
     if both.sum() < 2:

@@ -1,0 +1,119 @@
+"""Flights that disagree and episodes: found in worlds that are made here, and not where there is none."""
+
+import numpy as np
+import pytest
+
+from radiotwin.effects.episode import Episode
+from radiotwin.effects.faulty_flight import FaultyFlight
+
+FLIGHTS, SLOTS, DEVICES, NOISE_DB = 6, 60, 5, 2.0
+
+
+@pytest.fixture
+def flown(make_links, view):
+    """View of two receivers on six flights along neighbouring loops; `change(links, rng)` (n,) is added [dB]."""
+    def make(seed, change=lambda links, rng: 0.0, restart=False):
+        rng = np.random.default_rng(seed)
+        device_m = np.column_stack([rng.uniform(0, 300, (DEVICES, 2)), np.full(DEVICES, 1.5)])
+        slot, receiver, flight = (each.ravel() for each in np.meshgrid(
+            np.arange(SLOTS), np.arange(2), np.arange(FLIGHTS), indexing="ij"))
+        phase = 2 * np.pi * (slot / SLOTS + rng.uniform(size=(2, FLIGHTS))[receiver, flight])
+        place = 150 + 100 * np.column_stack([np.sin(phase), np.cos(phase)]) + rng.normal(0, 3, (len(slot), 2))
+        links = make_links(device_m, np.column_stack([place, 40.0 + receiver]), receiver=np.repeat(receiver, DEVICES),
+                           flight=np.repeat(flight, DEVICES),
+                           time_s=np.repeat((0.0 if restart else 200.0) * flight + slot, DEVICES))
+        mean_db = -40 - 22 * np.log10(links.distance_m)
+        links.level_db[:] = mean_db + rng.normal(0, NOISE_DB, len(links)) + change(links, rng)
+        return view(links, mean_db, NOISE_DB)
+    return make
+
+
+def on_flight(links):
+    return (links.receiver == 1) & (links.flight == 3)
+
+
+FAULTS = {
+    "offset": lambda links, rng: np.where(on_flight(links), -6.0, 0.0),
+    "noise": lambda links, rng: np.where(on_flight(links), rng.normal(0, 5.0, len(links)), 0.0),
+    "no relation": lambda links, rng: np.where(on_flight(links), 22 * np.log10(links.distance_m) - 45
+                                               + rng.normal(0, 6.0, len(links)), 0.0),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_faulty_flight_is_found(flown, fault, seed):
+    (params,) = FaultyFlight().propose(flown(seed, FAULTS[fault]))
+    assert (params.receiver, params.flight) == (1, "f3")
+    if fault == "noise":
+        assert params.noise_sd_db == pytest.approx(5.0, abs=1.5)
+
+
+def test_its_term_acts_on_that_flight_only(flown):
+    given = flown(0, FAULTS["noise"])
+    (params,) = FaultyFlight().propose(given)
+    term = FaultyFlight().term(given.links, params, lambda links, exact=False: -40 - 22 * np.log10(links.distance_m))
+    there = on_flight(given.links)
+    np.testing.assert_array_equal(term.columns[:, 0], there)
+    np.testing.assert_array_equal(term.random_effect_sd_db > 0, there)
+    elsewhere = given.links.select(~there)
+    assert FaultyFlight().propose_like(
+        flown(0).__class__(elsewhere, given.residual_db[~there], given.scale_db[~there], given.mean_db[~there], None),
+        params) == []
+
+
+OTHERS = {
+    "nothing": lambda links, rng: 0.0,
+    "receiver": lambda links, rng: np.where(links.receiver == 1, -6.0, 0.0),
+    "device": lambda links, rng: np.where(links.device == 2, -8.0, 0.0),
+    "wall": lambda links, rng: np.where((links.receiver_m[:, 0] < 90) & (links.device < 3), -12.0, 0.0),
+    "each flight": lambda links, rng: rng.normal(0, 2, (2, FLIGHTS))[links.receiver, links.flight],
+}
+
+
+@pytest.mark.parametrize("other", OTHERS)
+@pytest.mark.parametrize("seed", range(3))
+def test_what_is_no_fault_of_a_flight_is_not_called_one(flown, other, seed):
+    given = flown(seed, OTHERS[other])
+    assert FaultyFlight().propose(given) == []
+    if other != "each flight":
+        assert Episode().propose(given) == []
+
+
+def test_ten_draws_of_nothing_have_no_fault(flown):
+    found = [FaultyFlight().propose(given) + Episode().propose(given) for given in map(flown, range(10, 20))]
+    assert sum(map(bool, found)) == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wet_antenna_within_a_flight_is_found_with_its_times(flown, seed):
+    first = Episode().propose(flown(seed, lambda links, rng: np.where(
+        (links.receiver == 0) & (links.time_s >= 420) & (links.time_s < 440), -7.0, 0.0)))[0]
+    assert first.receiver == 0 and first.form == "loss"
+    assert first.start_s == pytest.approx(420, abs=3) and first.end_s == pytest.approx(439, abs=3)
+    assert first.start_within_s[0] <= 420 <= first.start_within_s[1] + 1
+    assert first.end_within_s[0] - 1 <= 439 <= first.end_within_s[1]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_rain_on_one_flight_is_an_attenuation_of_all_receivers(flown, seed):
+    first = Episode().propose(flown(seed, lambda links, rng: np.where(
+        links.flight == 2, -30.0 * links.distance_m / 1000, 0.0)))[0]
+    assert first.receiver is None
+    assert first.start_s == pytest.approx(400, abs=5) and first.end_s == pytest.approx(459, abs=5)
+
+
+def test_where_clocks_restart_an_episode_names_its_flight(flown):
+    first = Episode().propose(flown(0, lambda links, rng: np.where(
+        (links.receiver == 0) & (links.flight == 2) & (links.time_s >= 20) & (links.time_s < 40), -7.0, 0.0),
+        restart=True))[0]
+    assert (first.receiver, first.flight) == (0, "f2")
+    assert first.start_s == pytest.approx(20, abs=3) and first.end_s == pytest.approx(39, abs=3)
+
+
+def test_an_attenuation_is_held_against_rain():
+    params = Episode.Params(receiver=None, start_s=0, end_s=1, start_within_s=(0, 0), end_within_s=(1, 1),
+                            form="attenuation", frequency_hz=28e9)
+    assert Episode().implausible(params, np.array([20.0])) is None
+    assert "air and rain" in Episode().implausible(params, np.array([60.0]))
+    assert "amplify" in Episode().implausible(params, np.array([-2.0]))

@@ -1,0 +1,105 @@
+"""How far errors are alike, and the pieces of evidence that follow from it, on fields that are known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.thinning import thin_piles
+from radiotwin.links import (
+    LinkData,
+    correlation_length_m,
+    evidence_blocks,
+    residual_variables,
+    with_evidence,
+)
+from radiotwin.links.clocks import clocks_restart
+
+
+def flown(seed, length_m, noise_sd=0.5, flights=6, devices=3, slots=60, step_m=10.0, side_m=600.0, restart=False):
+    """Links of one receiver along bent tracks; errors are a Gaussian field with exp(-d / length_m), and white noise."""
+    rng = np.random.default_rng(seed)
+    tracks = []
+    for _ in range(flights):
+        heading = rng.uniform(0, 2 * np.pi) + np.cumsum(rng.normal(0, 0.3, slots))
+        track = rng.uniform(0.3, 0.7, 2) * side_m + step_m * np.cumsum(np.c_[np.sin(heading), np.cos(heading)], axis=0)
+        tracks.append(np.abs(side_m - np.abs(side_m - track)))  # reflected at the edges
+    place = np.vstack(tracks)
+    apart_m = np.linalg.norm(place[:, None] - place[None], axis=2)
+    root = np.linalg.cholesky(np.exp(-apart_m / length_m) + 1e-6 * np.eye(len(place)))
+    z = (root @ rng.normal(size=(len(place), devices))).ravel() + noise_sd * rng.normal(size=len(place) * devices)
+    n, flight = len(z), np.repeat(np.arange(flights), slots * devices)
+    time_s = np.repeat(np.tile(np.arange(slots), flights), devices) + (0 if restart else 200.0) * flight
+    device_m = np.column_stack([rng.uniform(0, side_m, (devices, 2)), np.full(devices, 1.5)])
+    receiver_m = np.repeat(np.column_stack([place, np.full(len(place), 50.0)]), devices, axis=0)
+    return LinkData(z, None, receiver_m, device_m, np.tile(np.arange(devices), len(place)), np.zeros(n, int), flight,
+                    time_s.astype(float), np.full(n, np.nan), [f"d{i}" for i in range(devices)], ["r0"],
+                    [f"f{i}" for i in range(flights)], 2.4e9, None, True, frozenset(range(devices)))
+
+
+def usual(found):
+    return float(np.exp(np.mean(np.log(found))))
+
+
+@pytest.mark.parametrize("length_m", [20.0, 40.0])
+def test_the_length_of_a_known_field_is_recovered(length_m):
+    found = [correlation_length_m(links, links.level_db) for links in (flown(seed, length_m) for seed in range(6))]
+    assert length_m / 1.6 < usual(found) < 1.6 * length_m
+    assert sum(length_m / 1.6 < each < 1.6 * length_m for each in found) >= 5
+
+
+def test_errors_that_are_not_correlated_have_the_length_of_a_step():
+    links = flown(0, 20.0)
+    z = np.random.default_rng(1).normal(size=len(links))
+    assert correlation_length_m(links, z) < 20.0
+    assert correlation_length_m(links, z) == correlation_length_m(links, z)
+
+
+def test_pieces_are_twice_as_wide_as_errors_are_alike():
+    links = flown(0, 40.0)
+    marked = with_evidence(links, links.level_db)
+    length_m = correlation_length_m(links, links.level_db)
+    block = evidence_blocks(marked)
+    widest = max(np.ptp(links.receiver_m[block == each, :2], axis=0).max() for each in np.unique(block))
+    assert widest <= 2.0 * length_m + 1e-9
+    some = marked.select(np.arange(50))
+    np.testing.assert_array_equal(evidence_blocks(some), block[:50])  # fixed once: candidates are compared on the same
+
+
+def test_a_campaign_within_100_m_is_cut_into_smaller_pieces_and_says_so():
+    links = flown(1, 40.0, flights=2, side_m=80.0, step_m=4.0)
+    marked = with_evidence(links, links.level_db)
+    places = np.unique(np.column_stack([marked.evidence, marked.flight, marked.device]), axis=0)
+    assert len(places) >= 6 and "evidence is little" in " ".join(marked.notes)
+    folds = make_folds(links, 0)
+    assert folds.by == "block" and folds.count == 6
+    assert np.bincount(folds.index).min() > 0
+
+
+def test_a_receiver_that_hovers_is_thinned_and_the_rest_stays():
+    links = flown(2, 30.0)
+    hover = np.repeat(np.flatnonzero((links.flight == 2) & (links.time_s == 430)), 400)
+    both = links.select(np.r_[np.arange(len(links)), hover])
+    thinned = thin_piles(both)
+    assert len(thinned) < len(links) + 100 and "stayed at" in thinned.notes[-1]
+    elsewhere = [(each.flight != 2).sum() for each in (links, thinned)]
+    assert elsewhere[0] == elsewhere[1]
+    assert thin_piles(links) is links
+
+
+def test_three_places_at_which_a_receiver_hovers_have_folds():
+    links = flown(3, 30.0, flights=3)
+    place_m = np.array([[100.0, 100, 50], [300, 120, 50], [180, 400, 50]])[links.flight]
+    links = replace(links, receiver_m=place_m, tracks=None, known_los=None)
+    folds = make_folds(links, 0)
+    assert folds.count == 6 and np.bincount(folds.index).min() > 20
+    assert len(np.unique(evidence_blocks(with_evidence(links, links.level_db)))) == 9  # three places, three devices
+
+
+@pytest.mark.parametrize("restart", [False, True])
+def test_clocks_that_restart_in_each_flight_are_noticed(restart):
+    links = flown(4, 30.0, restart=restart)
+    assert links.time_restarts == restart and clocks_restart(links.tracks) == restart
+    assert np.isnan(residual_variables(links, links.level_db)["time_s"]).all() == restart
+    assert links.select(links.flight < 1).time_restarts == restart  # stays that of all the data
