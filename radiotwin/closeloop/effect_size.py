@@ -70,24 +70,24 @@ def _held_out(model: CrossValidatedModel, number: int
     for fold, (each, fit) in enumerate(zip(model.folds, model.fits[1:], strict=True)):
         own = (model.index == fold) & each.usable
         place = same_effects(model.whole, each)[number]
+        if place is None:  # nothing in the other folds looks like it: no link here bears it out
+            continue
         with_it = each.predict(fit)
-        rest = each if place is None else each.with_effects(
-            [*each.effects[:place], *each.effects[place + 1:]])
-        without = rest.predict(fit if place is None else rest.fit())
-        change_db[own] = (with_it.mean_db - without.mean_db)[own]
-        lacking_db[own] = (each.links.level_db - without.mean_db)[own]
+        rest, taken_away = _without(each, fit, place)
+        without_db = rest.predict(rest.fit(taken_away)).mean_db
+        change_db[own] = (with_it.mean_db - without_db)[own]
+        lacking_db[own] = (each.links.level_db - without_db)[own]
         scale_db[own] = with_it.scale_db[own]
-        if place is not None:
-            acts[own] = _acts(each, fit, place)[own]
+        moved_db = with_it.mean_db - rest.predict(taken_away).mean_db
+        acts[own] = np.abs(moved_db[own]) > MIN_CHANGE_DB
     return change_db, lacking_db, scale_db, acts
 
 
-def _acts(model: FoldModel, fit: FitResult, place: int) -> np.ndarray:
-    """Return whether (n,) readings change when an effect is taken away and nothing else is."""
+def _without(model: FoldModel, fit: FitResult, place: int) -> tuple[FoldModel, FitResult]:
+    """Return a model from which an effect is taken away and nothing else is changed."""
     coefficients = np.delete(fit.coefficients, model.coefficient_slices[place])
     rest = model.with_effects([*model.effects[:place], *model.effects[place + 1:]])
-    without = rest.predict(replace(fit, coefficients=coefficients))
-    return np.abs(model.predict(fit).mean_db - without.mean_db) > MIN_CHANGE_DB
+    return rest, replace(fit, coefficients=coefficients)
 
 
 def _reach(pull: np.ndarray, share: np.ndarray, label: np.ndarray) -> float:

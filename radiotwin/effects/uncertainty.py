@@ -68,8 +68,8 @@ class _Secant:
     mean_db: np.ndarray
     log_scale: np.ndarray
     score: np.ndarray
-    precision: float
-    sides: tuple[float, float]
+    precision: float = 0.0
+    sides: tuple[float, float] = (1.0, 1.0)
 
 
 def _as_varied(model: FoldModel, result: FitResult,
@@ -126,15 +126,15 @@ def _secant(model: FoldModel, result: FitResult, number: int, variation: Variati
         sides.append(change / moved_by)
         priors.append(applied.effect.neg_log_prior(variation.params(numbers)) - prior)
     if not sides:
-        return _Secant(*np.zeros((3, n)), 0.0, (1.0, 1.0))
+        return _Secant(np.zeros(n), np.zeros(n), np.zeros(n))
     mean_db, log_scale, score = np.mean(sides, axis=0)
     # A normal prior rises by (step / sd)² / 2 to each side on average; bounds are a flat one.
     precision = max(2 * float(np.mean(priors)) / step**2, 0.0)
     precision += 12.0 / (variation.high[i] - variation.low[i])**2
-    secant = _Secant(mean_db, log_scale, score, precision, (1.0, 1.0))
+    secant = _Secant(mean_db, log_scale, score, precision)
     if len(sides) < 2:
         return secant
-    own = [_information(model, result, _Secant(*side, 0.0, (1.0, 1.0))) + precision
+    own = [_information(model, result, _Secant(side[0], side[1], side[2])) + precision
            for side in sides]
     below, above = (float(np.sqrt(np.mean(own) / each)) for each in own)
     return replace(secant, sides=(below, above))

@@ -213,12 +213,6 @@ def fit(problem: CensoredRegression, start: FitResult | None = None) -> FitResul
     return FitResult(beta, scale_db, objective)
 
 
-def covariance(problem: CensoredRegression, result: FitResult) -> np.ndarray:
-    """Return the covariance (p, p) of the coefficients, from the curvature at the maximum."""
-    precision = 1.0 / np.square(problem.prior_sd_db)
-    return np.linalg.inv(_slope_and_hessian(problem, problem.predict(result), precision)[1])
-
-
 def _least_squares(problem: CensoredRegression) -> np.ndarray:
     seen = np.isfinite(problem.level_db)
     first_scale_db = np.full(int(problem.group.max()) + 1, FIRST_SCALE_DB)

@@ -13,7 +13,6 @@ from radiotwin.inference.censored_regression import (
     CensoredRegression,
     FitResult,
     _slope_and_hessian,
-    covariance,
     fit,
 )
 from radiotwin.inference.student import derivatives
@@ -23,6 +22,12 @@ def problem(level_db, columns, limit_db=-np.inf, dof=5.0, split=1, paths=None, r
     n, p = columns.shape
     return CensoredRegression(level_db, np.full(n, limit_db), np.zeros(n), columns[:, :split], paths, np.zeros(n),
                               columns[:, split:], np.full(p, prior_sd_db), np.zeros(n, int), receiver, dof)
+
+
+def covariance(problem, result):
+    """Return the covariance of the coefficients from the curvature at the maximum."""
+    precision = 1.0 / np.square(problem.prior_sd_db)
+    return np.linalg.inv(_slope_and_hessian(problem, problem.predict(result), precision)[1])
 
 
 def draw(seed, dof=5.0, n=4000, scale=3.0):
