@@ -26,7 +26,7 @@ from radiotwin.pieces import kept
 
 LAWS: tuple[type[ChannelModel], ...] = (LogDistance, SegmentedLogDistance, RegressionKriging)
 EXTRA_TREES, BOOSTING = "extra_trees", "hist_gradient_boosting"
-BOOSTING_STEPS = 100
+LEARNING_RATE = 0.1  # of 2 * TREES steps of boosting; of fewer steps as much more
 MAX_TREE_LINKS = 30_000  # of more a sample: trees gain little by more, and take longer
 TREES = 50  # a hundred err less by 0.5 %
 MIN_LEAF = 3  # links in a leaf of the extremely randomised trees
@@ -71,7 +71,7 @@ def grow_trees(kind: str, features: np.ndarray, target: np.ndarray, seed: int,
         features: (n, p).
         target: (n,).
         seed: of the trees, and of the sample that is taken of very many rows.
-        trees: number of them, of the extremely randomised ones.
+        trees: number of them; boosting takes twice as many.
     """
     from sklearn.ensemble import ExtraTreesRegressor, HistGradientBoostingRegressor
 
@@ -83,7 +83,8 @@ def grow_trees(kind: str, features: np.ndarray, target: np.ndarray, seed: int,
             trees, min_samples_leaf=MIN_LEAF, max_features=MAX_FEATURES, random_state=seed,
             n_jobs=1).fit(features, target))
     return Forest.of_boosting(HistGradientBoostingRegressor(
-        max_iter=BOOSTING_STEPS, early_stopping=False, random_state=seed).fit(features, target))
+        learning_rate=LEARNING_RATE * TREES / trees, max_iter=2 * trees, early_stopping=False,
+        random_state=seed).fit(features, target))
 
 
 def trees_db(kind: str, part: Part, train: np.ndarray, test: np.ndarray, seed: int,

@@ -6,13 +6,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop import predictor
 from radiotwin.closeloop.bases import make_bases
 from radiotwin.closeloop.blending import make_blend
-from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import cross_validate, training_parts
 from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.predictor import combined_prediction
+from radiotwin.closeloop.predictor import CombinedPrediction
+from radiotwin.effects.blend import FORESTS
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.errors import BadInput
 from radiotwin.links import prepare_links
@@ -30,10 +29,11 @@ def blended():
         setattr(world, name, getattr(world, name)[keep])
     links = prepare_links(measured(world), None)
     folds = make_folds(links, 0)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(predictor, "INNER_TREES", 5)
-        model = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
-        prediction = combined_prediction(model, False, SelectionCriteria(), 0)
+    model = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
+    weights = np.array([[0.1, 0.5, 0.2, 0.0, 0.2], [0.6, 0.0, 0.0, 0.01, 0.39]])
+    prediction = CombinedPrediction(
+        model.held_out_mean_db, ["named", *FORESTS, "segmented_log_distance", "regression_kriging"], weights,
+        np.zeros((len(links), 5)), np.linspace(0, 1, len(links)))
     blend = make_blend(model, prediction, 0)
     fitted = replace(EffectModel.of(model.whole, model.fits[0]), blend=blend)
     return SimpleNamespace(links=links, model=model, prediction=prediction, twin=replace(model.twin, fitted=fitted))
@@ -42,7 +42,7 @@ def blended():
 def test_the_twin_predicts_by_the_weights_of_the_loop(blended):
     weights = blended.twin.fitted.blend.weights
     assert np.sum(list(weights.values()), axis=0) == pytest.approx(1.0)
-    assert any(name in weights for name in ("named_and_trees", "named_and_boosting"))
+    assert "segmented_log_distance" not in weights and weights["named_and_trees"][0] == pytest.approx(0.5)
     learnt_db = blended.twin.predict(blended.links).mean_db
     named_db = replace(blended.twin, fitted=replace(blended.twin.fitted, blend=None)).predict(blended.links).mean_db
     error = [np.sqrt(np.nanmean((blended.links.level_db - mean_db) ** 2)) for mean_db in (learnt_db, named_db)]
