@@ -96,7 +96,7 @@ def _patterns(links: LinkData) -> Iterator[tuple[str, str, str, np.ndarray]]:
         toward = float(np.median(links.azimuth_deg[mine]))
         off = (links.azimuth_deg - toward + 180) % 360 - 180
         yield ("antenna_pattern", "dB", f"front to back of one device, {BEAMWIDTH_DEG:.0f}° wide",
-               -mine * np.minimum(0.5 * (off / BEAMWIDTH_DEG) ** 2, 1.0))
+               mine * -np.minimum(0.5 * (off / BEAMWIDTH_DEG) ** 2, 1.0))
         hidden = mine & (np.abs(off) < SECTOR_DEG / 2)
         if hidden.sum() >= MIN_LINKS:
             for name in ("missing_obstacle", "removed_obstacle", "foliage"):

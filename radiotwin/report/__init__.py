@@ -1,7 +1,8 @@
 """Write every page and figure: of a run, of a close-loop, of a comparison, of a radio map."""
 
 from radiotwin.report.closeloop_figures import write_closeloop_figures
-from radiotwin.report.closeloop_page import closeloop_summary, write_closeloop_page
+from radiotwin.report.closeloop_page import write_closeloop_page
+from radiotwin.report.closeloop_words import closeloop_summary
 from radiotwin.report.comparison_figures import write_comparison_figures
 from radiotwin.report.map_figures import write_picture
 from radiotwin.report.run_folder import Run, read_run

@@ -1,11 +1,12 @@
 """Make the page of a close-loop, or its part of a run's page, from `closeloop.json`."""
 
-from collections import Counter
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from radiotwin.closeloop.result_file import check_report
+from radiotwin.report import closeloop_words as words
+from radiotwin.report.closeloop_words import number
 from radiotwin.report.html import Table, read_picture, write_page
 from radiotwin.report.labels import (
     INTERPOLATIONS,
@@ -31,15 +32,6 @@ FIGURES = (
      "Mean held-out residual over the variables that it depends on most, with one standard error. "
      "Dashed: contribution of the effects to the prediction."),
 )
-VERDICTS = {
-    "effect": "The model lacked {names}. With {it} the RMSE on held-out links falls from {before} "
-              "to {after} dB.",
-    "none": "Nothing is missing: the residual ({before} dB RMSE) depends on none of the variables "
-            "that were tested, and no effect of the catalogue lowers it.",
-    "unexplained": "Something is missing that no effect of the catalogue explains: the residual "
-                   "({before} dB RMSE) depends on {drivers}.",
-}
-BADGES = {"effect": "found: ", "none": "nothing is missing", "unexplained": "unexplained"}
 KINDS = {"los": "", "device": "device ", "receiver": "receiver ", "flight": "flight "}
 GROUPS = {"los": "with line of sight", "nlos": "without line of sight"}
 COLUMNS = {"n": "links", "bias_db": "bias [dB]", "std_db": "standard deviation [dB]",
@@ -72,30 +64,6 @@ def write_closeloop_page(report: dict, folder: Path | str, title: str) -> None:
         "closeloop": closeloop_context(report, folder)})
 
 
-def closeloop_summary(report: dict) -> str:
-    """Summarise the result of a close-loop in one to three sentences.
-
-    Args:
-        report: content of `closeloop.json`.
-    """
-    error, causes = report["error"], _causes(report)
-    drivers = _driver_names(report["remaining"]["drivers"])
-    before, after = (_number(error[when]["rmse_db"]) for when in ("before", "after"))
-    interpolated = len(causes) < len(report["effects"])
-    explained = [candidate["heldout_rmse_db"] for candidate in report["candidates"]
-                 if candidate["kept"] and candidate["name"] not in INTERPOLATIONS]
-    text = VERDICTS[report["verdict"]].format(
-        names=join_names(_cause_names(report)), it="it" if len(causes) == 1 else "them",
-        before=before, after=_number(explained[-1]) if interpolated and explained else after,
-        drivers=join_names(drivers or _driver_names(report.get("dependences_before", []))))
-    if report["verdict"] == "effect" and drivers:
-        text += f" The remaining residual depends on {join_names(drivers)}."
-    if interpolated:
-        text += (" Interpolation of the remaining residual, which explains nothing, brings the "
-                 f"RMSE to {after} dB.")
-    return text
-
-
 def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
     """Collect the variables of the template `closeloop_sections.html`.
 
@@ -108,22 +76,26 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
     """
     report = check_report(report, folder / "closeloop.json")
     candidates = report["candidates"]
-    verdict = BADGES[report["verdict"]]
+    verdict = words.BADGES[report["verdict"]]
     if report["verdict"] == "effect":
-        verdict += join_names(_cause_names(report))
+        verdict += join_names(words.cause_names(report))
     pictures = [read_picture(folder, name, title, text) for name, title, text in FIGURES]
     return {
-        "lead": closeloop_summary(report), "verdict": verdict, "cards": _cards(report),
+        "lead": words.closeloop_summary(report), "rivals": words.rivals(report), "verdict": verdict, "cards": _cards(report),
         "figures": [picture for picture in pictures if picture],
         "effects": _effects(report, folder),
         "more_effects": max(len(report["effects"]) - MAX_EFFECTS, 0),
         "errors": _error_table(report, ("los",)),
         "errors_by_member": _error_table(report, ("device", "receiver", "flight")),
+        "detectable": Table(
+            ("effect", "would have been named from", "what its size is"),
+            [[name_label(each["name"]), f"{number(each['size'])} {each['unit']}", each["pattern"]]
+             for each in report["detectable"]]),
         "trials": f"{len(candidates)} trials in {len({c['step'] for c in candidates})} steps",
         "candidates": _candidate_table(candidates),
         "remaining": Table(
             ("variable", "standard deviation of the mean residual over it [dB]", "p, corrected"),
-            [[variable_label(driver["variable"])[0], _number(driver.get("effect_db")),
+            [[variable_label(driver["variable"])[0], number(driver.get("effect_db")),
               _p_value(driver["p_value"])] for driver in report["remaining"]["drivers"]]),
         "notes": report["notes"]}
 
@@ -131,7 +103,7 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
 def _cards(report: dict) -> list[tuple[str, str]]:
     cards = []
     for key, label, unit in CARDS:
-        before, after = (_number(report["error"][when].get(key)) for when in ("before", "after"))
+        before, after = (number(report["error"][when].get(key)) for when in ("before", "after"))
         unchanged = before == after and not report["effects"]
         cards.append((label, (before if unchanged else f"{before} → {after}") + unit))
     return cards
@@ -152,27 +124,17 @@ def _effects(report: dict, folder: Path) -> dict[str, list[dict]]:
     return sections
 
 
-def _causes(report: dict) -> list[dict]:
-    """Return the effects that explain something, which an interpolation does not."""
-    return [effect for effect in report["effects"] if effect["name"] not in INTERPOLATIONS]
-
-
-def _cause_names(report: dict) -> list[str]:
-    """Return their names, with a count where one was found several times."""
-    counts = Counter(name_label(effect["name"]) for effect in _causes(report))
-    return [name if count == 1 else f"{name} ({count} times)" for name, count in counts.items()]
-
-
-def _driver_names(drivers: list[dict]) -> list[str]:
-    return [variable_label(driver["variable"])[0] for driver in drivers[:MAX_NAMED]]
-
-
 def _evidence(effect: dict) -> str:
     """Describe the form of an effect, its evidence, and what it may be confused with."""
     text = f"{effect['variant'].capitalize()}. " if effect.get("variant") else ""
     evidence = effect["evidence"]
-    text += (f"It raises the log-likelihood of the held-out links by "
-             f"{_number(evidence['heldout_nll_gain'])} nats (p {_p_value(evidence['p_value'])}).")
+    if effect.get("probability") is not None:
+        text += f"Probability that it is there: {words.probability(effect['probability'])}. "
+    if effect.get("size_db") is not None:
+        size = effect["size_db"]
+        text += f"It changes the links that it acts on by {number(size['value'])} dB (RMS"
+        text += f"; 90 % interval {_interval(size)}). " if _interval(size) != "–" else "). "
+    text += f"That held-out links gain by chance: p {_p_value(evidence['p_value'])}."
     same = [name_label(name) for name in effect.get("indistinguishable_from", [])]
     alike = [name_label(name) for name in effect.get("confused_with", [])
              if name_label(name) not in same]
@@ -195,10 +157,10 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
                    and (kind != "los" or both["before"]["n"] < report["error"]["before"]["n"])]
     for number, (label, both) in enumerate(groups):
         rows += [[label if when == "before" else "", when,
-                  *(_number(both[when].get(key)) for key in columns)]
+                  *(number(both[when].get(key)) for key in columns)]
                  for when in ("before", "after")]
         if number == 0:
-            rows += [["", name_label(name), *(_number(scores.get(key)) for key in columns)]
+            rows += [["", name_label(name), *(number(scores.get(key)) for key in columns)]
                      for name, scores in others.items()]
     heldout = report["heldout"]
     headings = [COLUMNS.get(key, key.replace("_", " ")) for key in columns]
@@ -208,10 +170,10 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
 
 def _candidate_table(candidates: list[dict]) -> Table:
     rows = [[c["step"], name_label(c["name"]), "kept" if c["kept"] else c["reason"],
-             _number(c["heldout_nll_gain"]), _number(c["heldout_rmse_db"]), _p_value(c["p_value"])]
-            for c in candidates]
-    return Table(("step", "effect", "kept, or why not", "held-out gain [nats]",
-                  "held-out RMSE [dB]", "p"), rows, "", 3,
+             words.probability(c.get("probability")), number(c["heldout_rmse_db"]),
+             number(c.get("evidence_nats")), number(c["heldout_nll_gain"])] for c in candidates]
+    return Table(("step", "effect", "kept, or why not", "probability", "held-out RMSE [dB]",
+                  "evidence [nats]", "held-out gain [nats]"), rows, "", 3,
                  {number for number, c in enumerate(candidates) if c["kept"]})
 
 
@@ -224,25 +186,13 @@ def _facts(report: dict) -> list[str]:
     return facts
 
 
-def _number(value: float | None) -> str:
-    if value is None:
-        return "–"
-    if isinstance(value, int):
-        text = f"{value:,}"
-    elif 0.0005 < abs(value) < 0.1:
-        text = f"{value:.2g}"
-    else:
-        text = f"{value:.2f}" if abs(value) < 1000 else f"{value:,.0f}"
-    return text.replace("-", "−")
-
-
 def _value(parameter: dict) -> str:
-    return _number(parameter["value"]) if parameter.get("determined", True) else "not determined"
+    return number(parameter["value"]) if parameter.get("determined", True) else "not determined"
 
 
 def _interval(parameter: dict) -> str:
     low, high = parameter["low"], parameter["high"]
-    return "–" if None in (low, high) or low == high else f"{_number(low)} to {_number(high)}"
+    return "–" if None in (low, high) or low == high else f"{number(low)} to {number(high)}"
 
 
 def _p_value(value: float | None) -> str:

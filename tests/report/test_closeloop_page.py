@@ -8,7 +8,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from radiotwin.errors import BadInput
-from radiotwin.report.closeloop_page import closeloop_summary, write_closeloop_page
+from radiotwin.report.closeloop_page import write_closeloop_page
+from radiotwin.report.closeloop_words import closeloop_summary
 from radiotwin.report.labels import join_names, parameter_label, variable_label
 
 SCORES = {"n": 900, "bias_db": 0.04, "std_db": 3.0, "correlation": 0.9, "rmse_db": 3.0, "mae_db": 2.2, "nll": 2.5}
@@ -40,6 +41,10 @@ def report(verdict="effect", **changes):
                       "regression_kriging": {"rmse_db": 5.5, "median_db": 1}},
         "dependences_before": drivers,
         "remaining": {"structured": verdict == "unexplained", "drivers": drivers if verdict == "unexplained" else []},
+        "posterior": [{"step": 1, "unnamed_nats": {"time": 12.0}, "rest_db": 2.5, "noise_db": 1.25, "probabilities": [
+            {"name": "none", "probability": 0.705}, {"name": "antenna_pattern", "probability": 0.29},
+            {"name": "not in the catalogue", "probability": 0.005}]}],
+        "detectable": [{"name": "excess_attenuation", "size": 4.2, "unit": "dB/km", "pattern": "on all links"}],
         "notes": ["receiver <i> has 3 only"]} | changes
 
 
@@ -51,9 +56,11 @@ def page(content, folder):
 @pytest.mark.parametrize("verdict, sentence, badge", [
     ("effect", "The model lacked receiver drift. With it the RMSE on held-out links falls from 3.00 to 2.00 dB",
      "found: receiver drift"),
-    ("none", "Nothing is missing: the residual (3.00 dB RMSE)", "nothing is missing"),
+    ("none", "No cause was found (probability 0.71).", "no cause found"),
+    ("undecided", "Undecided: these measurements do not tell. Likeliest: nothing is missing (0.71), antenna pattern (0.29). "
+     "To settle it: fly around the device at one distance and one height.", "undecided"),
     ("unexplained",
-     "no effect of the catalogue explains: the residual (3.00 dB RMSE) depends on time in flight",
+     "no effect of the catalogue explains (probability &lt; 0.01): the residual is 3.00 dB RMSE and depends on time in flight",
      "unexplained")])
 def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
     text = page(report(verdict), tmp_path)
@@ -86,10 +93,20 @@ def test_what_an_effect_may_be_taken_for_is_said(tmp_path):
     assert "nothing in the residual looks like it" in text
 
 
+def test_how_probable_it_is_and_what_would_have_been_seen_is_said(tmp_path):
+    text = page(report(effects=[DRIFT | {"probability": 0.999, "size_db": {
+        "value": 4.0, "low": 3.0, "high": 5.0, "unit": "dB", "determined": True}}]), tmp_path)
+    assert "Probability that it is there: receiver drift &gt; 0.99." in text
+    assert "What else it may be: nothing is missing 0.70 and antenna pattern 0.29." in text
+    assert "by 4.00 dB (RMS; 90 % interval 3.00 to 5.00)" in text
+    assert "would have been named from" in text and "4.20 dB/km" in text
+    assert "belong to places" in closeloop_summary(report("none"))
+
+
 def test_numbers_that_are_not_known_are_dashes(tmp_path):
     unknown = report("none", baselines={"log_distance": NOTHING}, dependences_before=[])
     unknown["error"] |= {"before": NOTHING, "after": NOTHING}
-    assert "(– dB RMSE)" in closeloop_summary(unknown)
+    assert "No cause was found" in closeloop_summary(unknown)
     assert "None" not in page(unknown, tmp_path) and "nan" not in page(unknown, tmp_path)
 
 

@@ -1,0 +1,164 @@
+"""Say in sentences what a close-loop found: how probable, what was tried, what would have been seen."""
+
+from collections import Counter
+
+from radiotwin.closeloop.posterior import NONE, OTHER
+from radiotwin.report.labels import INTERPOLATIONS, join_names, name_label, variable_label
+
+MAX_NAMED = 4  # variables or effects in a sentence
+LIKELY = 0.05  # a cause that is less probable is not worth a word
+BADGES = {"effect": "found: ", "none": "no cause found", "unexplained": "unexplained",
+          "undecided": "undecided"}
+SETTLES = {
+    "antenna_pattern": "fly around the device at one distance and one height",
+    "body_shadowing": "fly the same track in both directions",
+    "device_drift": "return to the same places at other times",
+    "device_gain_offset": "measure the device's power next to it, with line of sight",
+    "device_position_error": "fly past the device on two sides, close by, or survey it again",
+    "episode": "repeat the flight in dry weather",
+    "excess_attenuation": "measure at much longer distances with line of sight",
+    "faulty_flight": "repeat that flight with a receiver that was compared with another",
+    "foliage": "fly low on both sides of the suspected place",
+    "ground_reflection": "vary the height over open ground",
+    "interference": "listen with the devices switched off",
+    "missing_obstacle": "fly low on both sides of the suspected place",
+    "receiver_clock_offset": "fly one track forth and back",
+    "receiver_drift": "return to the same places at other times",
+    "receiver_gain_offset": "let the receivers measure side by side",
+    "receiver_position_error": "fly one track forth and back",
+    "receiver_saturation": "approach a device with line of sight",
+    "removed_obstacle": "fly low on both sides of the suspected building",
+}
+
+
+def closeloop_summary(report: dict) -> str:
+    """Summarise the result of a close-loop in a few sentences.
+
+    Args:
+        report: content of `closeloop.json`.
+    """
+    text = {"effect": _effect, "none": _none, "unexplained": _unexplained,
+            "undecided": _undecided}[report["verdict"]](report)
+    interpolated = any(each["name"] in INTERPOLATIONS for each in report["effects"])
+    if interpolated:
+        text += (" Interpolation of what remains, which explains nothing, brings the RMSE to "
+                 f"{number(report['error']['after']['rmse_db'])} dB.")
+    advice = (report.get("prediction") or {}).get("advice")
+    return f"{text} {advice}" if advice else text
+
+
+def cause_names(report: dict) -> list[str]:
+    """Return the names of the effects that explain something, with counts and probabilities."""
+    causes = [each for each in report["effects"] if each["name"] not in INTERPOLATIONS]
+    counts = Counter(name_label(each["name"]) for each in causes)
+    return [name if count == 1 else f"{name} ({count} times)" for name, count in counts.items()]
+
+
+def rivals(report: dict) -> str:
+    """Say how probable the causes are that were found, and what else it may be; or nothing."""
+    found = [f"{name_label(each['name'])} {probability(each['probability'])}"
+             for each in report["effects"] if each.get("probability") is not None]
+    text = f"Probability that it is there: {join_names(found)}. " if found else ""
+    step = next(iter(report["posterior"]), None)
+    if step is None:
+        return text
+    named = {each["name"] for each in report["effects"]}
+    others = [f"{_cause(each['name'])} {probability(each['probability'])}"
+              for each in step["probabilities"]
+              if each["name"] not in named and (each["probability"] or 0) >= LIKELY]
+    return text + (f"What else it may be: {join_names(others[:MAX_NAMED])}." if others else "")
+
+
+def detectable(report: dict) -> str:
+    """Say how large effects would have had to be, to be named."""
+    named = {each["name"] for each in report["effects"]}
+    sizes = [f"{name_label(each['name'])} {each['pattern']}: {number(each['size'])} {each['unit']}"
+             for each in report["detectable"]
+             if each["size"] is not None and each["name"] not in named]
+    return "; ".join(sizes)
+
+
+def drivers(report: dict) -> list[str]:
+    """Return labels of the variables that the residual depends on."""
+    found = report["remaining"]["drivers"] or report.get("dependences_before", [])
+    return [variable_label(each["variable"])[0] for each in found[:MAX_NAMED]]
+
+
+def number(value: float | None) -> str:
+    """Return a number as a page shows it."""
+    if value is None:
+        return "–"
+    if isinstance(value, int):
+        text = f"{value:,}"
+    elif 0.0005 < abs(value) < 0.1:
+        text = f"{value:.2g}"
+    else:
+        text = f"{value:.2f}" if abs(value) < 1000 else f"{value:,.0f}"
+    return text.replace("-", "−")
+
+
+def probability(value: float | None) -> str:
+    """Return a probability as a page shows it; none is ever 0 or 1."""
+    if value is None:
+        return "–"
+    return "> 0.99" if value > 0.99 else "< 0.01" if value < 0.01 else f"{value:.2f}"
+
+
+def _effect(report: dict) -> str:
+    error, causes = report["error"], cause_names(report)
+    explained = [each["heldout_rmse_db"] for each in report["candidates"]
+                 if each["kept"] and each["name"] not in INTERPOLATIONS]
+    after = explained[-1] if explained else error["after"]["rmse_db"]
+    it = "it" if len(causes) == 1 else "them"
+    text = (f"The model lacked {join_names(causes)}. With {it} the RMSE on held-out links falls "
+            f"from {number(error['before']['rmse_db'])} to {number(after)} dB.")
+    if report["remaining"]["drivers"]:
+        text += f" The remaining residual depends on {join_names(drivers(report))}."
+    return text
+
+
+def _none(report: dict) -> str:
+    return (f"No cause was found{_of(report, NONE)}. {_sizes(report)}")
+
+
+def _unexplained(report: dict) -> str:
+    text = (f"Something is missing that no effect of the catalogue explains{_of(report, OTHER)}: "
+            f"the residual is {number(report['error']['before']['rmse_db'])} dB RMSE")
+    names = drivers(report)
+    text += f" and depends on {join_names(names)}." if names else "."
+    return f"{text} {_sizes(report)}".strip()
+
+
+def _undecided(report: dict) -> str:
+    step = next(iter(report["posterior"]), None)
+    text = "Undecided: these measurements do not tell."
+    if step is None:
+        return text
+    likely = [each for each in step["probabilities"] if (each["probability"] or 0) >= LIKELY]
+    text += " Likeliest: " + join_names(
+        [f"{_cause(each['name'])} ({probability(each['probability'])})"
+         for each in likely[:MAX_NAMED]]) + "."
+    advice = [SETTLES[each["name"]] for each in likely if each["name"] in SETTLES]
+    if advice:
+        text += f" To settle it: {'; '.join(dict.fromkeys(advice[:2]))}."
+    return f"{text} {_sizes(report)}".strip()
+
+
+def _of(report: dict, name: str) -> str:
+    step = next(iter(report["posterior"]), None)
+    found = {each["name"]: each["probability"] for each in step["probabilities"]} if step else {}
+    return f" (probability {probability(found[name])})" if name in found else ""
+
+
+def _sizes(report: dict) -> str:
+    step = report["posterior"][-1] if report["posterior"] else None
+    if step is None or step["rest_db"] is None:
+        return ""
+    return (f"Of what the base misses about {number(step['rest_db'])} dB belong to places, as "
+            "errors of the map and of its materials do, and about "
+            f"{number(step['noise_db'])} dB to single readings.")
+
+
+def _cause(name: str) -> str:
+    return {NONE: "nothing is missing",
+            OTHER: "something that is not in the catalogue"}.get(name, name_label(name))
