@@ -9,6 +9,7 @@ candidates, or these would explain the faulty readings by walls and positions.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from radiotwin.closeloop.bases import Base
@@ -19,13 +20,15 @@ from radiotwin.closeloop.cross_validation import (
     training_parts,
 )
 from radiotwin.closeloop.folds import Folds, make_folds
-from radiotwin.closeloop.selection import (
+from radiotwin.closeloop.hypotheses import Hypotheses
+from radiotwin.closeloop.posterior import judge
+from radiotwin.closeloop.scoring import (
     Candidate,
     CandidateScore,
-    SelectionResult,
     fit_candidate,
     score_candidate,
 )
+from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.base import Effect
 from radiotwin.links import LinkData, evidence_blocks
 from radiotwin.links.correlation import devices_move
@@ -52,12 +55,18 @@ def select_faults(result: SelectionResult, effects: list[Effect], links: LinkDat
         step, refused = len(result.model.whole.effects), []
         fitted = [fit_candidate(result.model, effect, step, result.criteria) for effect in timed]
         candidates = [each for each in fitted if isinstance(each, Candidate)]
-        kept = None
+        kept, hypotheses = None, None
         for candidate in sorted(candidates, key=lambda each: -each.gain):
             on_progress(f"step {step + 1}: {candidate.effect.name}, held out within flights")
             model = model or _within_flights(result, links, base, seed)
             score, extended = _score(model, candidate.effect, len(timed), step, seed, result)
             if extended is not None:
+                hypotheses = hypotheses or Hypotheses.of(result.model.whole, result.model.fits[0],
+                                                         seed)
+                evidence = hypotheses.of_named(candidate.whole, candidate.fit)
+                score = judge([replace(score, evidence_nats=evidence)], model, hypotheses,
+                              result.criteria)[0][0]
+            if extended is not None and not score.reason:
                 kept = candidate
                 model = extended
                 result.keep(score, _adopted(result.model, candidate))

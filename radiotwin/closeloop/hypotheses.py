@@ -117,6 +117,9 @@ class Hypotheses:
         Args:
             model: this one's with one more effect.
             fit: of it.
+
+        Returns:
+            NaN for an effect that residuals do not show.
         """
         applied = model.effects[-1]
         term, own = applied.term.select(model.train), model.coefficient_slices[-1]
@@ -129,13 +132,16 @@ class Hypotheses:
         z += shown_db / self.scale_db
         columns = Columns(term.columns / self.scale_db[:, None], term.prior_sd_db)
         variation = applied.effect.variation(applied.params)
+        if term.random_effect_sd_db is not None and applied.effect.within_flights:
+            return np.nan  # it makes errors larger, which levels alone do not show
         numbers = 0 if variation is None else len(variation.values)
         acts = int(((term.offset_db != 0) | (term.columns != 0).any(axis=1)).sum()) or len(z)
         used = len(self.evidence.rows) / max(len(z), 1)
         return self.gain_nats(z, columns) - 0.5 * numbers * np.log(max(acts * used, 2.0))
 
-    def of_unnamed(self) -> dict[str, float]:
-        """Return the evidence for a cause without a name over each variable [nats]."""
+    @cached_property
+    def unnamed_nats(self) -> dict[str, float]:
+        """Evidence for a cause without a name over each variable [nats]."""
         found: dict[str, float] = {}
         for name, values in self._curves():
             scaled = values / self.scale_db[:, None]

@@ -56,7 +56,7 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
         hypotheses: about what it lacks.
         criteria: a candidate that passed is refused below `min_probability`.
     """
-    unnamed = hypotheses.of_unnamed()
+    unnamed = hypotheses.unnamed_nats
     best_unnamed = max([0.0, *unnamed.values()])
     before_db = model.rmse_db()
     judged = []

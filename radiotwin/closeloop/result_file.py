@@ -179,9 +179,10 @@ def _from_version_1(report: dict[str, Any]) -> dict[str, Any]:
     new["effects"] = [{("params" if name == "setting" else name): value
                        for name, value in effect.items()} | {"size_db": None}
                       for effect in report["effects"]]
-    new["error"] = _with_new_bias(report["error"])
+    new["error"] = _with_new_bias(report["error"]) | {"combined": None}
     new["baselines"] = _with_new_bias(report["baselines"])
-    return new | {"schema": SCHEMA, "criteria": {}, "posterior": [], "detectable": []}
+    return new | {"schema": SCHEMA, "criteria": {}, "posterior": [], "detectable": [],
+                  "combination": [], "prediction": None}
 
 
 def _with_new_bias(value: Any) -> Any:

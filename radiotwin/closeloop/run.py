@@ -22,6 +22,7 @@ from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.intervals import effect_parameters
 from radiotwin.closeloop.posterior import NONE, OTHER
 from radiotwin.closeloop.predictor import CombinedPrediction, combined_prediction
+from radiotwin.closeloop.relocate import relocate_devices
 from radiotwin.closeloop.residual_tests import ResidualDependence, residual_dependences
 from radiotwin.closeloop.selection import SelectionResult, add_shadowing, forward_selection
 from radiotwin.closeloop.sensitivity import Detectable, detectable
@@ -171,6 +172,8 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     forward_selection(selection, [effect for effect in effects if not effect.within_flights], seed,
                       on_progress)
     select_change_points(selection, links, bases[best], folds, seed, on_progress)
+    on_progress("unknown devices again, beside the effects")
+    selection.model = relocate_devices(selection.model)
     selection.explained = selection.model
     on_progress("looking at what is left")
     dependences_after = dependences_before

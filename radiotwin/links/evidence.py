@@ -14,7 +14,7 @@ from radiotwin.links.correlation import (
 )
 from radiotwin.links.link_data import LinkData
 
-LENGTHS = 2.0  # side of a piece over the correlation length
+LENGTHS = 1.0  # side of a piece over the correlation length
 UNKNOWN_M = 100.0  # side of a piece while no residual has been looked at
 MIN_PLACES = 6  # that the ground of a campaign is cut into, where it is wide enough
 NARROWER = 0.8  # from one width that is tried to the next

@@ -6,7 +6,6 @@ from typing import Any
 
 from radiotwin.closeloop.result_file import check_report
 from radiotwin.report import closeloop_words as words
-from radiotwin.report.closeloop_words import number
 from radiotwin.report.html import Table, read_picture, write_page
 from radiotwin.report.labels import (
     INTERPOLATIONS,
@@ -89,13 +88,13 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         "errors_by_member": _error_table(report, ("device", "receiver", "flight")),
         "detectable": Table(
             ("effect", "would have been named from", "what its size is"),
-            [[name_label(each["name"]), f"{number(each['size'])} {each['unit']}", each["pattern"]]
+            [[name_label(each["name"]), f"{words.number(each['size'])} {each['unit']}", each["pattern"]]
              for each in report["detectable"]]),
         "trials": f"{len(candidates)} trials in {len({c['step'] for c in candidates})} steps",
         "candidates": _candidate_table(candidates),
         "remaining": Table(
             ("variable", "standard deviation of the mean residual over it [dB]", "p, corrected"),
-            [[variable_label(driver["variable"])[0], number(driver.get("effect_db")),
+            [[variable_label(driver["variable"])[0], words.number(driver.get("effect_db")),
               _p_value(driver["p_value"])] for driver in report["remaining"]["drivers"]]),
         "notes": report["notes"]}
 
@@ -103,7 +102,7 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
 def _cards(report: dict) -> list[tuple[str, str]]:
     cards = []
     for key, label, unit in CARDS:
-        before, after = (number(report["error"][when].get(key)) for when in ("before", "after"))
+        before, after = (words.number(report["error"][when].get(key)) for when in ("before", "after"))
         unchanged = before == after and not report["effects"]
         cards.append((label, (before if unchanged else f"{before} → {after}") + unit))
     return cards
@@ -132,7 +131,7 @@ def _evidence(effect: dict) -> str:
         text += f"Probability that it is there: {words.probability(effect['probability'])}. "
     if effect.get("size_db") is not None:
         size = effect["size_db"]
-        text += f"It changes the links that it acts on by {number(size['value'])} dB (RMS"
+        text += f"It changes the links that it acts on by {words.number(size['value'])} dB (RMS"
         text += f"; 90 % interval {_interval(size)}). " if _interval(size) != "–" else "). "
     text += f"That held-out links gain by chance: p {_p_value(evidence['p_value'])}."
     same = [name_label(name) for name in effect.get("indistinguishable_from", [])]
@@ -157,10 +156,10 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
                    and (kind != "los" or both["before"]["n"] < report["error"]["before"]["n"])]
     for number, (label, both) in enumerate(groups):
         rows += [[label if when == "before" else "", when,
-                  *(number(both[when].get(key)) for key in columns)]
+                  *(words.number(both[when].get(key)) for key in columns)]
                  for when in ("before", "after")]
         if number == 0:
-            rows += [["", name_label(name), *(number(scores.get(key)) for key in columns)]
+            rows += [["", name_label(name), *(words.number(scores.get(key)) for key in columns)]
                      for name, scores in others.items()]
     heldout = report["heldout"]
     headings = [COLUMNS.get(key, key.replace("_", " ")) for key in columns]
@@ -170,8 +169,8 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
 
 def _candidate_table(candidates: list[dict]) -> Table:
     rows = [[c["step"], name_label(c["name"]), "kept" if c["kept"] else c["reason"],
-             words.probability(c.get("probability")), number(c["heldout_rmse_db"]),
-             number(c.get("evidence_nats")), number(c["heldout_nll_gain"])] for c in candidates]
+             words.probability(c.get("probability")), words.number(c["heldout_rmse_db"]),
+             words.number(c.get("evidence_nats")), words.number(c["heldout_nll_gain"])] for c in candidates]
     return Table(("step", "effect", "kept, or why not", "probability", "held-out RMSE [dB]",
                   "evidence [nats]", "held-out gain [nats]"), rows, "", 3,
                  {number for number, c in enumerate(candidates) if c["kept"]})
@@ -187,12 +186,12 @@ def _facts(report: dict) -> list[str]:
 
 
 def _value(parameter: dict) -> str:
-    return number(parameter["value"]) if parameter.get("determined", True) else "not determined"
+    return words.number(parameter["value"]) if parameter.get("determined", True) else "not determined"
 
 
 def _interval(parameter: dict) -> str:
     low, high = parameter["low"], parameter["high"]
-    return "–" if None in (low, high) or low == high else f"{number(low)} to {number(high)}"
+    return "–" if None in (low, high) or low == high else f"{words.number(low)} to {words.number(high)}"
 
 
 def _p_value(value: float | None) -> str:

@@ -56,8 +56,8 @@ def page(content, folder):
 @pytest.mark.parametrize("verdict, sentence, badge", [
     ("effect", "The model lacked receiver drift. With it the RMSE on held-out links falls from 3.00 to 2.00 dB",
      "found: receiver drift"),
-    ("none", "No cause was found (probability 0.71).", "no cause found"),
-    ("undecided", "Undecided: these measurements do not tell. Likeliest: nothing is missing (0.71), antenna pattern (0.29). "
+    ("none", "No cause was found (probability 0.70).", "no cause found"),
+    ("undecided", "Undecided: these measurements do not tell. Likeliest: nothing is missing (0.70), antenna pattern (0.29). "
      "To settle it: fly around the device at one distance and one height.", "undecided"),
     ("unexplained",
      "no effect of the catalogue explains (probability &lt; 0.01): the residual is 3.00 dB RMSE and depends on time in flight",
