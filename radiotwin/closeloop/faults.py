@@ -51,21 +51,21 @@ def select_faults(result: SelectionResult, effects: list[Effect], links: LinkDat
     timed = [effect for effect in effects
              if effect.within_flights and not effect.unavailable(result.model.links)]
     model: CrossValidatedModel | None = None
-    while not result.is_full:
+    while timed and not result.is_full:
         step, refused = len(result.model.whole.effects), []
-        fitted = [fit_candidate(result.model, effect, step, result.criteria) for effect in timed]
+        hypotheses = Hypotheses.of(result.model.whole, result.model.fits[0], seed)
+        fitted = [fit_candidate(result.model, effect, step, result.criteria, hypotheses)
+                  for effect in timed]
         candidates = [each for each in fitted if isinstance(each, Candidate)]
-        kept, hypotheses = None, None
+        refused += [each for each in fitted if isinstance(each, CandidateScore)]
+        kept = None
         for candidate in sorted(candidates, key=lambda each: -each.gain):
             on_progress(f"step {step + 1}: {candidate.effect.name}, held out within flights")
             model = model or _within_flights(result, links, base, seed)
             score, extended = _score(model, candidate.effect, len(timed), step, seed, result)
             if extended is not None:
-                hypotheses = hypotheses or Hypotheses.of(result.model.whole, result.model.fits[0],
-                                                         seed)
-                evidence = hypotheses.of_named(candidate.whole, candidate.fit)
-                score = judge([replace(score, evidence_nats=evidence)], model, hypotheses,
-                              result.criteria)[0][0]
+                score = replace(score, evidence_nats=candidate.evidence)
+                score = judge([score], model, hypotheses, result.criteria)[0][0]
             if extended is not None and not score.reason:
                 kept = candidate
                 model = extended
