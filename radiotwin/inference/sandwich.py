@@ -15,7 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, issparse
 from scipy.stats import norm, t
 
 MIN_CLUSTERS = 1.5  # effective ones, below which a way to cluster says nothing of a parameter
@@ -105,4 +105,4 @@ def _by_cluster(rows: np.ndarray | csr_array, own: np.ndarray, count: int) -> np
 
 
 def _dense(matrix: np.ndarray | csr_array) -> np.ndarray:
-    return matrix.toarray() if isinstance(matrix, csr_array) else np.asarray(matrix)
+    return matrix.toarray() if issparse(matrix) else np.asarray(matrix)

@@ -31,6 +31,7 @@ RISE_DB, FALL_DB = 2.0, 1.0  # above and below a declared limit: as good as ther
 SURE_SDS = 3.0  # beyond that
 ROUNDS = 2  # of levels and limits in turn
 QUANTILE_90 = 1.645  # of the normal distribution
+MIN_OFF_DB = 0.5  # a declared limit that is off by less is right
 MIN_BELOW, BELOW_SHARE = 3, 0.002  # readings below a declared limit that contradict it
 DIFFER_DB = 3.0  # between receivers, from which on it is told
 DEAF_DB, DEAF_SDS = 6.0, 4.5  # above the usual limit: a receiver that stands out
@@ -189,6 +190,8 @@ def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) ->
     A receiver that reads levels down to the declared limit has that, however few they are.
     """
     rise_db = found.limit_db - declared_db
+    if abs(rise_db) < MIN_OFF_DB:
+        return False
     off_db = max(rise_db - RISE_DB, -rise_db - FALL_DB)
     reaches = rise_db > 0 and _below(read_db, declared_db + RISE_DB + FALL_DB)
     sure = off_db > SURE_SDS * found.sd_db and found.over_declared_nats > MIN_NATS
