@@ -67,7 +67,7 @@ def close_foreign(seed: int, settings: dict) -> dict:
 
 
 CANDIDATE = ("step", "name", "heldout_nll_gain", "p_value", "heldout_rmse_db", "kept",
-             "evidence_nats", "lead_nats", "probability")
+             "evidence_nats", "features", "probability")
 """What a row keeps of each candidate, in this order: criteria are calibrated on it."""
 
 

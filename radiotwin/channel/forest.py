@@ -52,7 +52,7 @@ class Forest:
     @classmethod
     def of_boosting(cls, fitted: HistGradientBoostingRegressor) -> Self:
         """Return the trees of fitted boosting on numbers without gaps."""
-        trees = []
+        trees: list[tuple[np.ndarray, ...]] = []
         for (predictor,) in fitted._predictors:  # the library has no public way to its nodes
             nodes = predictor.nodes
             leaf = nodes["is_leaf"].astype(bool)

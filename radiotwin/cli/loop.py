@@ -58,13 +58,14 @@ def close_loop(
     check_twin_target(out / "twin")
     if write_scene is not None:
         check_corrected_target(write_scene, world, out)
+    inputs = {"inputs": {"measurements": str(measurements), "scene": scene and str(scene)}}
     with keep_pieces() as pieces:
         with progress("closing the loop", total=None) as advance:
             loop = run(data, world, base, seed,
                        lambda text: advance(1, "; ".join(filter(None, [text, pieces.progress]))),
                        hold_out)
-        report = make_report(loop) | {
-            "inputs": {"measurements": str(measurements), "scene": scene and str(scene)}}
+            advance(1, "other models, and the combination of all")
+            report = make_report(loop) | inputs
         write_closeloop_figures(loop, world, report, out)
     notice(pieces.progress)
     write_report(report, out / "closeloop.json")

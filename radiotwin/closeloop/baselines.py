@@ -177,8 +177,8 @@ def held_out_baselines(model: CrossValidatedModel, parts: list[Part], criteria: 
             if isinstance(law, RegressionKriging):
                 kriging.append(law)
             result[kind.name][test] = _if_detected(law, part.links, test)
-        for kind in (EXTRA_TREES, BOOSTING):
-            result[kind][test] = trees_db(kind, part, fold.train, test, seed)
+        for learner in (EXTRA_TREES, BOOSTING):
+            result[learner][test] = trees_db(learner, part, fold.train, test, seed)
     return result | published_laws(model.links), kriging
 
 

@@ -2,8 +2,8 @@
 
 Nuisances are always there: a level and a slope of each class of line of sight, small errors of each
 device, receiver and flight, and a field over positions (`radiotwin.inference.correlated_evidence`).
-Causes without a name are curves over each variable, for all links, each receiver or each device: what
-one of them explains better than any named effect is not in the catalogue.
+Causes without a name are curves over each variable, for all links, each receiver or each device:
+what one of them explains better than any named effect is not in the catalogue.
 """
 
 from __future__ import annotations

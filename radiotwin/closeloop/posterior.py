@@ -1,10 +1,10 @@
 """How probable it is that an effect is there, that nothing is, or something that has no name.
 
-Evidence [nats] is worth what it turned out to be worth: a logistic regression, fitted on worlds that
-others made (`tests/undeclared/foreign`, the cities for calibration; `python -m studies foreign
---report` judges it on the other cities), turns evidence, its lead over curves without a name and
-over other effects, and what held-out links gain into a probability (Platt 1999, 'Probabilistic
-outputs for support vector machines'). Its few numbers are in `calibration.json`.
+Evidence [nats] is worth what it turned out to be worth: a logistic regression, fitted on foreign
+worlds (`tests/undeclared/foreign`, the cities for calibration; `python -m studies foreign` judges
+it on the others), turns evidence, its lead over curves without a name and over other effects, and
+what held-out links gain into a probability (Platt 1999, 'Probabilistic outputs for support vector
+machines'). Its few numbers are in `calibration.json`, made by `python -m studies.calibration`.
 """
 
 from __future__ import annotations
@@ -61,12 +61,13 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
     before_db = model.rmse_db()
     judged = []
     for score in scores:
-        others = [each.nats for each in scores if each.name != score.name
-                  and each.gain_by_fold.size]
-        lead = score.nats - best_unnamed, score.nats - max([0.0, *others])
-        score = replace(score, lead_nats=lead)
         if score.gain_by_fold.size:
-            probability = probability_of(score.name, features(score, before_db))
+            others = [each.nats for each in scores if each.name != score.name
+                      and each.gain_by_fold.size]
+            fall = np.log(before_db / score.rmse_db) if score.rmse_db > 0 else 0.0
+            leads = score.nats, score.nats - best_unnamed, score.nats - max([0.0, *others])
+            score = replace(score, features=features(leads, float(np.nan_to_num(fall))))
+            probability = probability_of(score.name, score.features)
             low = not score.reason and probability < criteria.min_probability
             why = (f"it is not probable enough ({probability:.2f}; "
                    f"{criteria.min_probability:g} is needed)")
@@ -77,19 +78,18 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
                         _probabilities(judged, best_unnamed, rest_db, noise_db))
 
 
-def features(score: CandidateScore, before_db: float) -> np.ndarray:
+def features(nats: tuple[float, float, float], rmse_fall: float) -> tuple[float, ...]:
     """Return what a candidate's probability depends on, (4,).
 
     Args:
-        score: with its leads.
-        before_db: held-out RMSE without it [dB].
+        nats: its evidence, and its lead over the best curve without a name and over the best
+            other effect [nats].
+        rmse_fall: of held-out links, logarithm of the error without it over that with it.
     """
-    fall = np.log(before_db / score.rmse_db) if score.rmse_db > 0 else 0.0
-    nats = [score.nats, *score.lead_nats]
-    return np.array([*np.arcsinh(np.array(nats) / NATS), 10 * np.nan_to_num(fall)])
+    return (*np.arcsinh(np.array(nats) / NATS).tolist(), 10 * rmse_fall)
 
 
-def probability_of(name: str, values: np.ndarray) -> float:
+def probability_of(name: str, values: tuple[float, ...]) -> float:
     """Return the probability that an effect is there, from its `features`."""
     weights = calibration()["effect"]
     own = weights["names"].get(name, 0.0)

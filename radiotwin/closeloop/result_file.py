@@ -45,8 +45,9 @@ def make_report(loop: Loop) -> dict[str, Any]:
         effects.append(_shadowing(kept[-1], loop.after, len(effects) + 1))
     candidates = [{"name": score.name, "step": score.step + 1, "heldout_rmse_db": score.rmse_db,
                    "heldout_nll_gain": score.nll_gain, "p_value": score.p_value, "kept": score.kept,
-                   "reason": score.reason, "evidence_nats": score.evidence_nats,
-                   "lead_nats": list(score.lead_nats), "probability": score.probability}
+                   "reason": score.reason, "passed": score.passed,
+                   "evidence_nats": score.evidence_nats, "features": list(score.features),
+                   "probability": score.probability}
                   for score in selection.scores]
     links = loop.after.links
     error: dict[str, Any] = {"before": scores(loop.before), "after": scores(loop.after),
@@ -177,7 +178,8 @@ def _from_version_1(report: dict[str, Any]) -> dict[str, Any]:
     new_names = {"remarks": "notes", "structure_before": "dependences_before"}
     new = {new_names.get(name, name): value for name, value in report.items()}
     new["effects"] = [{("params" if name == "setting" else name): value
-                       for name, value in effect.items()} | {"size_db": None, "uses": [], "probability": None}
+                       for name, value in effect.items()}
+                      | {"size_db": None, "uses": [], "probability": None}
                       for effect in report["effects"]]
     new["error"] = _with_new_bias(report["error"]) | {"combined": None}
     new["baselines"] = _with_new_bias(report["baselines"])

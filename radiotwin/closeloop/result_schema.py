@@ -87,7 +87,8 @@ class CandidateRecord(Record):
     kept: bool
     reason: str
     evidence_nats: Number | None = None
-    lead_nats: list[Number | None] = Field(default_factory=list)
+    passed: bool = False
+    features: list[Number | None] = Field(default_factory=list)
     probability: Number | None = None
 
 

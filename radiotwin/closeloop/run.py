@@ -48,7 +48,7 @@ class Loop:
         before: the base alone.
         selection: base and effects.
         dependences_before, dependences_after: of the held-out residual.
-        prediction: held-out, by all that was learnt, and by other models alone.
+        seed: of what is still to be drawn.
         noise_floor_db: from links measured twice at one position; NaN where there are none.
     """
 
@@ -59,7 +59,7 @@ class Loop:
     selection: SelectionResult
     dependences_before: list[ResidualDependence]
     dependences_after: list[ResidualDependence]
-    prediction: CombinedPrediction
+    seed: int
     noise_floor_db: float = np.nan
 
     @property
@@ -99,6 +99,12 @@ class Loop:
             return "unexplained"
         sure = step.probabilities[NONE] >= self.criteria.min_probability
         return "none" if sure else "undecided"
+
+    @cached_property
+    def prediction(self) -> CombinedPrediction:
+        """Held-out, by all that was learnt, and by other models alone; takes a while."""
+        return combined_prediction(self.selection.named, bool(self.remaining), self.criteria,
+                                   self.seed)
 
     @cached_property
     def detectable(self) -> list[Detectable]:
@@ -187,10 +193,8 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         forward_selection(selection, [*trends[:criteria.max_trends]], seed, on_progress)
         on_progress("correlated_shadowing")
         add_shadowing(selection, seed)
-    on_progress("other models, and the combination of all")
-    prediction = combined_prediction(selection.named, bool(left), criteria, seed)
     return Loop(best, links, folds, before, selection, dependences_before, dependences_after,
-                prediction, _noise_floor_db(all_links, criteria))
+                seed, _noise_floor_db(all_links, criteria))
 
 
 def _dependences(model: CrossValidatedModel, seed: int) -> list[ResidualDependence]:

@@ -32,8 +32,10 @@ class CandidateScore:
             empty where it was not tried.
         evidence_nats: beside errors of the base that are correlated, see `Hypotheses`; NaN where
             it was not looked at.
-        lead_nats: of that over the best curve without a name, and over the best other effect.
-        probability: that it is there, by `radiotwin.closeloop.posterior`.
+        passed: whether held-out links support it, however probable it is.
+        features: (4,) what its probability depends on, see `radiotwin.closeloop.posterior`; empty
+            where it was not tried.
+        probability: that it is there.
     """
 
     name: str
@@ -45,7 +47,8 @@ class CandidateScore:
     step: int = 0
     gain_by_fold: np.ndarray = field(default_factory=lambda: np.zeros(0))
     evidence_nats: float = np.nan
-    lead_nats: tuple[float, float] = (np.nan, np.nan)
+    passed: bool = False
+    features: tuple[float, ...] = ()
     probability: float = np.nan
 
     @property
@@ -177,10 +180,10 @@ def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score
         reason = (f"gains {per_link:.3f} nats a link only, {criteria.min_gain_per_link_nats} are "
                   "needed")
     elif after_db > criteria.max_rmse_rise * model.rmse_db(usable):
-        reason = (f"the error of held-out links would rise to {after_db:.2f} dB, though they become "
-                  "likelier")
+        reason = (f"the error of held-out links would rise to {after_db:.2f} dB, though they "
+                  "become likelier")
     elif los_p > criteria.max_los_p_value:
         reason = ("links with line of sight, where the base is surest, do not support it "
                   f"(p = {los_p:.2g})")
-    return replace(score, reason=reason, nll_gain=total, rmse_db=after_db, p_value=p_value,
-                   gain_by_fold=shares)
+    return replace(score, reason=reason, passed=not reason, nll_gain=total, rmse_db=after_db,
+                   p_value=p_value, gain_by_fold=shares)

@@ -15,7 +15,7 @@ from scipy.optimize import brentq
 
 from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.hypotheses import Hypotheses
-from radiotwin.closeloop.posterior import NATS, probability_of
+from radiotwin.closeloop.posterior import features, probability_of
 from radiotwin.links import LinkData
 
 MAX_ENDS = 12  # devices or receivers of which the median is taken
@@ -64,7 +64,7 @@ def detectable(hypotheses: Hypotheses, criteria: SelectionCriteria) -> list[Dete
 def needed_nats(name: str, probability: float) -> float:
     """Return the evidence that makes an effect so probable, if nothing competes with it."""
     def lack(nats: float) -> float:
-        return probability_of(name, np.array([*[np.arcsinh(nats / NATS)] * 3, 0.0])) - probability
+        return probability_of(name, features((nats, nats, nats), 0.0)) - probability
 
     if lack(0.0) >= 0:
         return 0.0

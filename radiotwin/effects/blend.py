@@ -105,7 +105,8 @@ class Blend:
         settings: dict[str, Any] = {
             "weights": {name: list(each) for name, each in self.weights.items()},
             "half_m": self.half_m, "sd_ratio": list(self.sd_ratio), "models": {}}
-        for name, model in (*self.forests.items(), *self.laws.items()):
+        models: dict[str, Forest | ChannelModel] = {**self.forests, **self.laws}
+        for name, model in models.items():
             own, settings["models"][name] = model.state()
             arrays |= {f"{name}/{each}": array for each, array in own.items()}
         return arrays, settings

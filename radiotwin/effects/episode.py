@@ -218,7 +218,9 @@ def _best_window(ends_s: np.ndarray, time_s: np.ndarray, rest_db: np.ndarray, we
         return None
     centred, total = rest_db - weight @ rest_db / weight.sum(), weight.sum()
     best = None
-    for form, shape in (("loss", np.ones(len(cell))), ("attenuation", distance_km)):
+    shapes: dict[Literal["loss", "attenuation"], np.ndarray] = {
+        "loss": np.ones(len(cell)), "attenuation": distance_km}
+    for form, shape in shapes.items():
         wx, wxx, wxd = (_sums(cell, weight * value, len(ends_s)) for value in
                         (shape, shape**2, shape * centred))
         x, xx, xd = (each[None, :] - each[:, None] for each in (wx, wxx, wxd))

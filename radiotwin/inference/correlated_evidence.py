@@ -1,7 +1,7 @@
 """Evidence for a cause beside errors that are allowed to be correlated.
 
-A base lacks more than noise: walls stand elsewhere than on the map, materials differ. Such a rest is
-a Gaussian field over positions, unknown to the catalogue, and it explains part of whatever has a
+A base lacks more than noise: walls stand elsewhere than on the map, materials differ. Such a rest
+is a Gaussian field over positions, unknown to the catalogue, and it explains part of whatever has a
 position. So a cause is judged by how much likelier the data are with it *beside* that field, whose
 strength is fitted anew each time (Kennedy and O'Hagan 2001, 'Bayesian calibration of computer
 models', J. R. Stat. Soc. B 63; Brynjarsdóttir and O'Hagan 2014, Inverse Problems 30).

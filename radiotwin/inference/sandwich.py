@@ -105,4 +105,4 @@ def _by_cluster(rows: np.ndarray | csr_array, own: np.ndarray, count: int) -> np
 
 
 def _dense(matrix: np.ndarray | csr_array) -> np.ndarray:
-    return matrix.toarray() if issparse(matrix) else np.asarray(matrix)
+    return matrix.toarray() if issparse(matrix) else np.asarray(matrix)  # type: ignore[union-attr]

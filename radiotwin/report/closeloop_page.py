@@ -80,7 +80,8 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         verdict += join_names(words.cause_names(report))
     pictures = [read_picture(folder, name, title, text) for name, title, text in FIGURES]
     return {
-        "lead": words.closeloop_summary(report), "rivals": words.rivals(report), "verdict": verdict, "cards": _cards(report),
+        "lead": words.closeloop_summary(report), "rivals": words.rivals(report),
+        "verdict": verdict, "cards": _cards(report),
         "figures": [picture for picture in pictures if picture],
         "effects": _effects(report, folder),
         "more_effects": max(len(report["effects"]) - MAX_EFFECTS, 0),
@@ -88,8 +89,8 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         "errors_by_member": _error_table(report, ("device", "receiver", "flight")),
         "detectable": Table(
             ("effect", "would have been named from", "what its size is"),
-            [[name_label(each["name"]), f"{words.number(each['size'])} {each['unit']}", each["pattern"]]
-             for each in report["detectable"]]),
+            [[name_label(each["name"]), f"{words.number(each['size'])} {each['unit']}",
+              each["pattern"]] for each in report["detectable"]]),
         "trials": f"{len(candidates)} trials in {len({c['step'] for c in candidates})} steps",
         "candidates": _candidate_table(candidates),
         "remaining": Table(
@@ -102,7 +103,8 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
 def _cards(report: dict) -> list[tuple[str, str]]:
     cards = []
     for key, label, unit in CARDS:
-        before, after = (words.number(report["error"][when].get(key)) for when in ("before", "after"))
+        before, after = (words.number(report["error"][when].get(key))
+                         for when in ("before", "after"))
         unchanged = before == after and not report["effects"]
         cards.append((label, (before if unchanged else f"{before} → {after}") + unit))
     return cards
@@ -170,7 +172,8 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
 def _candidate_table(candidates: list[dict]) -> Table:
     rows = [[c["step"], name_label(c["name"]), "kept" if c["kept"] else c["reason"],
              words.probability(c.get("probability")), words.number(c["heldout_rmse_db"]),
-             words.number(c.get("evidence_nats")), words.number(c["heldout_nll_gain"])] for c in candidates]
+             words.number(c.get("evidence_nats")), words.number(c["heldout_nll_gain"])]
+            for c in candidates]
     return Table(("step", "effect", "kept, or why not", "probability", "held-out RMSE [dB]",
                   "evidence [nats]", "held-out gain [nats]"), rows, "", 3,
                  {number for number, c in enumerate(candidates) if c["kept"]})
@@ -186,12 +189,14 @@ def _facts(report: dict) -> list[str]:
 
 
 def _value(parameter: dict) -> str:
-    return words.number(parameter["value"]) if parameter.get("determined", True) else "not determined"
+    known = parameter.get("determined", True)
+    return words.number(parameter["value"]) if known else "not determined"
 
 
 def _interval(parameter: dict) -> str:
     low, high = parameter["low"], parameter["high"]
-    return "–" if None in (low, high) or low == high else f"{words.number(low)} to {words.number(high)}"
+    unknown = None in (low, high) or low == high
+    return "–" if unknown else f"{words.number(low)} to {words.number(high)}"
 
 
 def _p_value(value: float | None) -> str:

@@ -1,4 +1,4 @@
-"""Say in sentences what a close-loop found: how probable, what was tried, what would have been seen."""
+"""Say in sentences what a close-loop found, how probable it is and what would have been seen."""
 
 from collections import Counter
 

@@ -73,7 +73,7 @@ def loop():
 def with_model(loop, model):
     """Return a loop that found something else."""
     return Loop(loop.base, loop.links, loop.folds, loop.before, SelectionResult(model), loop.dependences_before, [],
-                loop.prediction)
+                loop.seed)
 
 
 def with_effect(model, effect, params):

@@ -57,7 +57,7 @@ def page(content, folder):
     ("effect", "The model lacked receiver drift. With it the RMSE on held-out links falls from 3.00 to 2.00 dB",
      "found: receiver drift"),
     ("none", "No cause was found (probability 0.70).", "no cause found"),
-    ("undecided", "Undecided: these measurements do not tell. Likeliest: nothing is missing (0.70), antenna pattern (0.29). "
+    ("undecided", "Undecided: these measurements do not tell. Likeliest: nothing is missing (0.70) and antenna pattern (0.29). "
      "To settle it: fly around the device at one distance and one height.", "undecided"),
     ("unexplained",
      "no effect of the catalogue explains (probability &lt; 0.01): the residual is 3.00 dB RMSE and depends on time in flight",
