@@ -18,8 +18,6 @@ class SelectionCriteria:
         min_training_gain_nats: on the links that it is fitted to, for a candidate to be fitted to
             the folds. Saves time: one that gains less cannot gain `min_gain_nats`
             on held-out links.
-        min_evidence_nats: beside errors of the base that are correlated, to be tried on held-out
-            links: below zero, those explain the residual as well.
         min_probability: that a cause is there, to be named. Calibrated, see
             `radiotwin.closeloop.posterior`.
         max_rest_db: standard deviation of what belongs to places and has no name, for
@@ -49,7 +47,6 @@ class SelectionCriteria:
     """
 
     min_training_gain_nats: float = 10.0
-    min_evidence_nats: float = 0.0
     min_probability: float = 0.8
     max_rest_db: float = 3.0
     min_gain_nats: float = 25.0

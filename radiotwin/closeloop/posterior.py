@@ -1,9 +1,9 @@
 """How probable it is that an effect is there, that nothing is, or something that has no name.
 
-Evidence [nats] is worth what it turned out to be worth: a logistic regression, fitted on foreign
-worlds (`tests/undeclared/foreign`, the cities for calibration; `python -m studies foreign` judges
-it on the others), turns evidence, its lead over curves without a name and over other effects, and
-what held-out links gain into a probability (Platt 1999, 'Probabilistic outputs for support vector
+Nats are worth what they turned out to be worth: a logistic regression, fitted on foreign worlds
+(`tests/undeclared/foreign`, the cities for calibration; `python -m studies foreign` judges it on
+the others), turns evidence beside a correlated rest, its lead over curves without a name, and what
+held-out links gain into a probability (Platt 1999, 'Probabilistic outputs for support vector
 machines'). Its few numbers are in `calibration.json`, made by `python -m studies.calibration`.
 """
 
@@ -62,11 +62,13 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
     judged = []
     for score in scores:
         if score.gain_by_fold.size:
-            others = [each.nats for each in scores if each.name != score.name
+            held_out = score.held_out_nats
+            others = [each.held_out_nats for each in scores if each.name != score.name
                       and each.gain_by_fold.size]
             fall = np.log(before_db / score.rmse_db) if score.rmse_db > 0 else 0.0
-            leads = score.nats, score.nats - best_unnamed, score.nats - max([0.0, *others])
-            score = replace(score, features=features(leads, float(np.nan_to_num(fall))))
+            nats = (score.nats, score.nats - best_unnamed, held_out,
+                    held_out - max([0.0, *others]))
+            score = replace(score, features=features(nats, float(np.nan_to_num(fall))))
             probability = probability_of(score.name, score.features)
             low = not score.reason and probability < criteria.min_probability
             why = (f"it is not probable enough ({probability:.2f}; "
@@ -78,12 +80,12 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
                         _probabilities(judged, best_unnamed, rest_db, noise_db))
 
 
-def features(nats: tuple[float, float, float], rmse_fall: float) -> tuple[float, ...]:
-    """Return what a candidate's probability depends on, (4,).
+def features(nats: tuple[float, float, float, float], rmse_fall: float) -> tuple[float, ...]:
+    """Return what a candidate's probability depends on, (5,).
 
     Args:
-        nats: its evidence, and its lead over the best curve without a name and over the best
-            other effect [nats].
+        nats: its evidence beside a correlated rest, its lead over the best curve without a name,
+            its gain on held-out links, and its lead over the best other effect there [nats].
         rmse_fall: of held-out links, logarithm of the error without it over that with it.
     """
     return (*np.arcsinh(np.array(nats) / NATS).tolist(), 10 * rmse_fall)

@@ -33,7 +33,7 @@ class CandidateScore:
         evidence_nats: beside errors of the base that are correlated, see `Hypotheses`; NaN where
             it was not looked at.
         passed: whether held-out links support it, however probable it is.
-        features: (4,) what its probability depends on, see `radiotwin.closeloop.posterior`; empty
+        features: (5,) what its probability depends on, see `radiotwin.closeloop.posterior`; empty
             where it was not tried.
         probability: that it is there.
     """
@@ -52,13 +52,14 @@ class CandidateScore:
     probability: float = np.nan
 
     @property
-    def nats(self) -> float:
-        """Evidence [nats]; held-out, links that err alike counted as one, where there is no other.
+    def held_out_nats(self) -> float:
+        """Gain on held-out links, those that err alike counted as one [nats]."""
+        return float(self.gain_by_fold.sum())
 
-        Levels do not show effects that make links blank.
-        """
-        return self.evidence_nats if np.isfinite(self.evidence_nats) \
-            else float(self.gain_by_fold.sum())
+    @property
+    def nats(self) -> float:
+        """Evidence beside a correlated rest; on held-out links where residuals do not show it."""
+        return self.evidence_nats if np.isfinite(self.evidence_nats) else self.held_out_nats
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,12 +102,7 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
                        "nats even on the links that it is fitted to")
     if hypotheses is None or not is_judged_by_levels(effect):
         return Candidate(effect, *whole, gain)
-    evidence = hypotheses.of_named(*whole)
-    if evidence < criteria.min_evidence_nats:
-        return replace(refused, evidence_nats=evidence, reason=(
-            "what the base may be wrong in explains the residual as well (the evidence is "
-            f"{evidence:.0f} nats, {criteria.min_evidence_nats:.0f} are needed)"))
-    return Candidate(effect, *whole, gain, evidence)
+    return Candidate(effect, *whole, gain, hypotheses.of_named(*whole))
 
 
 def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.ndarray, tried: int,

@@ -177,7 +177,7 @@ def _keep_best(result: SelectionResult, passed: list[_Passed], block: np.ndarray
                on_progress: Callable[[str], None]) -> None:
     """Keep the best of the candidates that passed, or several of one kind that are better."""
     criteria = result.criteria
-    passed.sort(key=lambda each: -each.score.nats)
+    passed.sort(key=lambda each: -each.score.held_out_nats)
     # Of those that the data cannot tell apart the one with the least error.
     close = [each for each in passed if _alike(passed[0].score, each.score, criteria)]
     passed.sort(key=lambda each: each.score.rmse_db if each in close else np.inf)
@@ -187,7 +187,7 @@ def _keep_best(result: SelectionResult, passed: list[_Passed], block: np.ndarray
     most = criteria.max_repeats if not first.effect.repeatable else _on_one_mast(first.model)
     if rival is not None and most > 1:
         on_progress(f"step {step + 1}: more of {rival.score.name}")
-        steps = _several(rival, block, hypotheses, seed, first.score.nats, most, criteria) or steps
+        steps = _several(rival, block, hypotheses, seed, first.score.held_out_nats, most, criteria) or steps
     best = steps[0][0]
     rivals = [each.score.name for each in passed
               if each.score.name != best.name and _alike(best, each.score, criteria)]
@@ -216,7 +216,7 @@ def _beyond(passed: _Passed, candidate: Candidate, model: CrossValidatedModel,
 
 
 def _alike(best: CandidateScore, other: CandidateScore, criteria: SelectionCriteria) -> bool:
-    return best.nats - other.nats < criteria.indistinguishable_nats
+    return best.held_out_nats - other.held_out_nats < criteria.indistinguishable_nats
 
 
 def _on_one_mast(model: CrossValidatedModel) -> int:
@@ -250,7 +250,7 @@ def _several(rival: _Passed, block: np.ndarray, hypotheses: Hypotheses | None, s
         extended = more
         score = replace(score, probability=rival.score.probability)
         steps.append((score, extended))
-        if sum(score.nats for score, _ in steps) > min_nats:
+        if sum(score.held_out_nats for score, _ in steps) > min_nats:
             return steps
     return None
 

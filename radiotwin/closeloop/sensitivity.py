@@ -64,7 +64,7 @@ def detectable(hypotheses: Hypotheses, criteria: SelectionCriteria) -> list[Dete
 def needed_nats(name: str, probability: float) -> float:
     """Return the evidence that makes an effect so probable, if nothing competes with it."""
     def lack(nats: float) -> float:
-        return probability_of(name, features((nats, nats, nats), 0.0)) - probability
+        return probability_of(name, features((nats, nats, nats, nats), 0.0)) - probability
 
     if lack(0.0) >= 0:
         return 0.0

@@ -24,8 +24,9 @@ from scipy.spatial.distance import cdist
 MAX_POINTS = 500  # of a series: its matrix is decomposed
 MAX_ROWS = 8000  # of all series
 MIN_POINTS = 3  # of a series that says anything
-LENGTHS = (0.02, 0.06, 0.2)  # of correlation, as shares of the extent of a series
-MIN_LENGTH_M = 2.0
+# Of correlation [m]: shadowing decorrelates within 10 to 50 m (3GPP TR 38.901, Table 7.5-6). Longer
+# ones would explain whatever an antenna or a wrong position does to a device's levels.
+LENGTHS_M = (5.0, 12.0, 30.0)
 EVALUATIONS = 20  # of the likelihood, for the two variances
 START = np.array([0.0, -1.0])  # logarithms: noise variance, field over noise
 BOUNDS = np.array([[-6.0, -7.0], [6.0, 7.0]])
@@ -75,7 +76,7 @@ class CorrelatedEvidence:
             seed: of the draw of rows, where there are many.
         """
         rng = np.random.default_rng(seed)
-        chosen, extents_m = [], []
+        chosen = []
         known = np.flatnonzero(np.isfinite(z))
         labels, member = np.unique(series[known], return_inverse=True)
         most = int(np.clip(MAX_ROWS // max(len(labels), 1), MIN_POINTS, MAX_POINTS))
@@ -86,12 +87,9 @@ class CorrelatedEvidence:
             if len(mine) > most:
                 mine = np.sort(rng.choice(mine, most, replace=False))
             chosen.append(mine)
-            extents_m.append(np.linalg.norm(np.ptp(position_m[mine], axis=0)))
         if len(chosen) * most > MAX_ROWS:
             chosen = [chosen[i] for i in sorted(rng.permutation(len(chosen))[:MAX_ROWS // most])]
-        extent_m = float(np.median(extents_m)) if extents_m else 1.0
-        tried = [cls._decomposed(chosen, position_m, max(share * extent_m, MIN_LENGTH_M))
-                 for share in LENGTHS]
+        tried = [cls._decomposed(chosen, position_m, length_m) for length_m in LENGTHS_M]
         return max(tried, key=lambda each: each.log_evidence(z, nuisance))
 
     @classmethod
