@@ -1,0 +1,120 @@
+"""What evidence is worth: the loop on the cities for calibration, and the regression upon it.
+
+python -m studies calibration --resume      # rows: the loop on each case
+python -m studies.calibration               # rows -> radiotwin/closeloop/calibration.json
+"""
+
+import json
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from sklearn.linear_model import LogisticRegression
+
+from radiotwin import close_loop
+from radiotwin.closeloop import posterior
+from radiotwin.closeloop.scoring import CandidateScore
+from radiotwin.files import atomic_path
+from studies.runner import RECORDS, Study, read_rows
+from studies.tables import markdown
+from tests.undeclared.foreign.cases import foreign_case, names
+
+LIMITS_DIFFER_DB = 2.0  # between receivers: then a limit of its own is no false name
+PHYSICS = ("wall_reflection", "diffraction")  # in every traced world
+REGULARISATION, NAME_SHARE = 1.0, 0.5  # C of the regression; weight of a name's own intercept
+PATH = Path(posterior.__file__).with_name("calibration.json")
+
+
+def calibration_cases(seed: int) -> dict[str, dict]:
+    """Return the cases of the cities for calibration; seed 0 only."""
+    return {} if seed else {name: {"case": name} for name in names("calibrate")}
+
+
+def candidates_of(seed: int, settings: dict) -> dict:
+    """Close the loop on a case, and keep what every candidate's probability depends on."""
+    hidden = foreign_case(settings["case"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        loop = close_loop(hidden.measurements, hidden.scene, seed=seed)
+    right, nuisance = {each["name"] for each in hidden.answer["effects"]}, hidden.answer["nuisance"]
+    open_names = {"missing_obstacle"} if nuisance["unmapped"] else set()
+    open_names |= {"removed_obstacle"} if nuisance["gone"] else set()
+    if nuisance["declared"] == "wrong" or np.ptp(nuisance["limit_db"]) > LIMITS_DIFFER_DB:
+        open_names |= {"noise_floor_censoring"}
+    return {
+        "hidden": [[each["name"], each["in_catalogue"]] for each in hidden.answer["effects"]],
+        "open": sorted(open_names - right), "size_db": hidden.size_db,
+        "named": [each.effect.name for each in loop.after.whole.effects],
+        "candidates": [[*_row(score), score.name in right] for score in loop.selection.scores
+                       if score.features],
+        "steps": [[max([0.0, *(score.nats for score in loop.selection.scores if score.features
+                               and score.step == step.number)]),
+                   max([0.0, *step.unnamed_nats.values()]), step.rest_db, step.noise_db]
+                  for step in loop.selection.steps]}
+
+
+def _row(score: CandidateScore) -> list:
+    return [score.step, score.name, score.passed, list(score.features)]
+
+
+def usable(rows: list[dict]) -> pd.DataFrame:
+    """Return candidates that passed and of which it is known whether they are right."""
+    found = [(row["name"], name, right, values) for row in rows
+             for _, name, passed, values, right in row["results"]["candidates"]
+             if passed and name not in (*PHYSICS, *row["results"]["open"])]
+    return pd.DataFrame(found, columns=["case", "name", "right", "features"])
+
+
+def fitted(rows: list[dict]) -> dict:
+    """Return the content of `calibration.json`.
+
+    Args:
+        rows: of the study, as its file has them.
+    """
+    table = usable(rows)
+    labels = sorted(set(table["name"]))
+    values = np.array(table["features"].tolist())
+    own = NAME_SHARE * (table["name"].to_numpy()[:, None] == np.array(labels))
+    effect = LogisticRegression(C=REGULARISATION, max_iter=10_000)
+    effect.fit(np.hstack([values, own]), table["right"])
+    weights, shares = np.split(effect.coef_[0], [values.shape[1]])
+    without = [row["results"] for row in rows
+               if not any(inside for _, inside in row["results"]["hidden"])]
+    steps = np.array([each["steps"][0] for each in without])
+    inputs = np.column_stack([np.arcsinh(steps[:, :2] / posterior.NATS),
+                              np.log(np.maximum(steps[:, 2:], 0.1))])
+    nothing = LogisticRegression(C=REGULARISATION, max_iter=10_000)
+    nothing.fit(inputs, [not each["hidden"] for each in without])
+    return {"effect": {"intercept": round(float(effect.intercept_[0]), 3),
+                       "weights": weights.round(3).tolist(),
+                       "names": {name: round(float(NAME_SHARE * share), 3)
+                                 for name, share in zip(labels, shares, strict=True)}},
+            "nothing": {"intercept": round(float(nothing.intercept_[0]), 3),
+                        "weights": nothing.coef_[0].round(3).tolist()},
+            "cases": len(rows), "candidates": len(table)}
+
+
+def calibration_table(rows: pd.DataFrame) -> str:
+    """Return how often a candidate that passed was right, by name."""
+    table = usable([{"name": row.name, "results": {
+        "candidates": row.candidates, "open": row.open}} for row in rows.itertuples()])
+    lines = [[f"`{name}`", str(len(each)), str(int(each["right"].sum()))]
+             for name, each in table.groupby("name")]
+    return markdown(["candidate that held-out links support", "times", "right"], lines,
+                    "Calibration", f" ({len(rows)} cases of the cities for calibration)")
+
+
+def main() -> None:
+    """Fit the regressions to the rows and write `calibration.json`."""
+    content = fitted(read_rows("calibration", RECORDS))
+    with atomic_path(PATH) as temporary:
+        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    print(f"wrote {PATH}: {content['cases']} cases, {content['candidates']} candidates")
+
+
+STUDIES = {"calibration": Study("What is evidence worth?", candidates_of, calibration_cases,
+                                calibration_table, seeds=1)}
+
+if __name__ == "__main__":
+    main()

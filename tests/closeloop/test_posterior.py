@@ -1,0 +1,79 @@
+"""Probabilities of causes, and what would have been seen."""
+
+import numpy as np
+import pytest
+
+from radiotwin.closeloop.bases import LogDistanceBase
+from radiotwin.closeloop.criteria import SelectionCriteria
+from radiotwin.closeloop.cross_validation import cross_validate, training_parts
+from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.hypotheses import Hypotheses
+from radiotwin.closeloop.posterior import NONE, OTHER, features, judge, probability_of
+from radiotwin.closeloop.scoring import CandidateScore
+from radiotwin.closeloop.sensitivity import detectable, needed_nats
+from radiotwin.effects.fitting import add_effect
+from radiotwin.effects.gain_offsets import ReceiverGainOffset
+from radiotwin.links import prepare_links
+
+CRITERIA = SelectionCriteria()
+
+
+def looked_at(open_ground, seed, change=lambda world: None):
+    """Return the model without effects, and the hypotheses about what it lacks."""
+    world = open_ground.fly(seed)
+    change(world)
+    links = prepare_links(open_ground.measured(world), None)
+    folds = make_folds(links, 0)
+    model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
+    return model, Hypotheses.of(model.whole, model.fits[0], 0)
+
+
+def test_evidence_for_an_offset_that_is_there_and_none_for_one_that_is_not(open_ground):
+    def louder(world):
+        world.gain_db[world.receiver == 1] += 5.0
+
+    for change, low, high in ((louder, 15.0, np.inf), (lambda world: None, -np.inf, 0.0)):
+        model, hypotheses = looked_at(open_ground, 2, change)
+        found = add_effect(model.whole, ReceiverGainOffset(), model.fits[0])
+        assert low < hypotheses.of_named(*found) < high
+
+
+def test_what_depends_on_time_alone_is_more_likely_without_a_name(open_ground):
+    def wander(world):
+        world.gain_db += 4.0 * np.sin(world.time_s / 60.0)
+
+    _, hypotheses = looked_at(open_ground, 3, wander)
+    unnamed = hypotheses.unnamed_nats
+    assert max(unnamed, key=unnamed.get).startswith("time") and max(unnamed.values()) > 50
+    assert max(looked_at(open_ground, 3)[1].unnamed_nats.values()) < 5
+
+
+def test_noise_is_told_from_a_rest_that_belongs_to_places(open_ground):
+    rest_db, noise_db = looked_at(open_ground, 4)[1].sizes_db
+    assert rest_db < 1.0 and noise_db == pytest.approx(2.0, rel=0.1)
+
+
+def test_probabilities_sum_to_one_and_a_weak_candidate_is_refused(open_ground):
+    model, hypotheses = looked_at(open_ground, 5)
+    scores = [CandidateScore(name, passed=True, nll_gain=10 * nats, rmse_db=model.rmse_db() * 0.99, evidence_nats=nats,
+                             gain_by_fold=np.full(4, nats / 4)) for name, nats in (("foliage", 3.0), ("interference", 2.0))]
+    judged, step = judge(scores, model, hypotheses, CRITERIA)
+    assert set(step.probabilities) == {"foliage", "interference", NONE, OTHER}
+    assert sum(step.probabilities.values()) == pytest.approx(1.0) and min(step.probabilities.values()) >= 0
+    for score in judged:
+        refused = score.probability < CRITERIA.min_probability
+        assert refused == ("is not probable enough" in score.reason)
+
+
+def test_more_evidence_is_never_less_probable():
+    nats = np.arange(0.0, 300.0, 10.0)
+    found = [probability_of("foliage", features((each,) * 4, 0.01 * each)) for each in nats]
+    assert np.all(np.diff(found) > 0)
+
+
+def test_an_effect_of_the_size_that_would_have_been_seen_has_the_evidence_for_it(open_ground):
+    _, hypotheses = looked_at(open_ground, 6)
+    sizes = {each.name: each.size for each in detectable(hypotheses, CRITERIA)}
+    assert {"receiver_gain_offset", "device_gain_offset", "excess_attenuation"} <= set(sizes)
+    assert all(size > 0 for size in sizes.values())
+    assert needed_nats("foliage", 0.5) <= needed_nats("foliage", 0.9)
