@@ -187,7 +187,8 @@ def _keep_best(result: SelectionResult, passed: list[_Passed], block: np.ndarray
     most = criteria.max_repeats if not first.effect.repeatable else _on_one_mast(first.model)
     if rival is not None and most > 1:
         on_progress(f"step {step + 1}: more of {rival.score.name}")
-        steps = _several(rival, block, hypotheses, seed, first.score.held_out_nats, most, criteria) or steps
+        least = first.score.held_out_nats
+        steps = _several(rival, block, hypotheses, seed, least, most, criteria) or steps
     best = steps[0][0]
     rivals = [each.score.name for each in passed
               if each.score.name != best.name and _alike(best, each.score, criteria)]

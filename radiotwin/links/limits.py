@@ -146,7 +146,8 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
         read_db = np.sort(level_db[np.isfinite(level_db)])
         trusted = np.isfinite(declared) and not _below(read_db, declared)
         if each is not None and each.is_sure:
-            trusted = trusted and not _overrules(each, read_db, declared)
+            near = abs(each.limit_db - declared) < MIN_OFF_DB  # whatever is odd in it
+            trusted = near or trusted and not _overrules(each, read_db, declared)
             own_db[receiver] = declared if trusted else each.limit_db
         elif len(read_db) == len(level_db):
             own_db[receiver] = declared if trusted and usual_db == declared else -np.inf
@@ -190,8 +191,6 @@ def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) ->
     A receiver that reads levels down to the declared limit has that, however few they are.
     """
     rise_db = found.limit_db - declared_db
-    if abs(rise_db) < MIN_OFF_DB:
-        return False
     off_db = max(rise_db - RISE_DB, -rise_db - FALL_DB)
     reaches = rise_db > 0 and _below(read_db, declared_db + RISE_DB + FALL_DB)
     sure = off_db > SURE_SDS * found.sd_db and found.over_declared_nats > MIN_NATS

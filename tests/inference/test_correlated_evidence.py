@@ -39,7 +39,7 @@ def test_the_marginal_likelihood_is_that_of_the_normal_distribution():
 def test_a_smooth_rest_is_no_evidence_for_a_smooth_pattern(seed):
     """Counted link by link it would be: hundreds of nats for a ramp that is not there."""
     rng = np.random.default_rng(seed)
-    label, position_m, z = field(rng, 3.0, 150.0)
+    label, position_m, z = field(rng, 3.0, 30.0)
     ramp = Columns((position_m[:, :1] - 200) / 200, np.array([3.0]))
     evidence = CorrelatedEvidence.fit(label, position_m, z, NOTHING, 0)
     assert evidence.log_evidence(z, ramp) - evidence.log_evidence(z, NOTHING) < 3.0

@@ -68,7 +68,7 @@ def test_pieces_are_twice_as_wide_as_errors_are_alike():
 
 
 def test_a_campaign_within_100_m_is_cut_into_smaller_pieces_and_says_so():
-    links = flown(1, 40.0, flights=2, side_m=80.0, step_m=4.0)
+    links = flown(1, 120.0, flights=2, side_m=60.0, step_m=4.0)
     marked = with_evidence(links, links.level_db)
     places = np.unique(np.column_stack([marked.evidence, marked.flight, marked.device]), axis=0)
     assert len(places) >= 6 and "evidence is little" in " ".join(marked.notes)
