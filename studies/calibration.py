@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from sklearn.linear_model import LogisticRegression
+from scipy.optimize import minimize
 
 from radiotwin import close_loop
 from radiotwin.closeloop import posterior
@@ -22,7 +22,7 @@ from tests.undeclared.foreign.cases import foreign_case, names
 
 LIMITS_DIFFER_DB = 2.0  # between receivers: then a limit of its own is no false name
 PHYSICS = ("wall_reflection", "diffraction")  # in every traced world
-REGULARISATION, NAME_SHARE = 1.0, 0.5  # C of the regression; weight of a name's own intercept
+SD, NAME_SD = 1.0, 0.5  # prior standard deviations of a weight, and of a name's own intercept
 PATH = Path(posterior.__file__).with_name("calibration.json")
 
 
@@ -75,24 +75,45 @@ def fitted(rows: list[dict]) -> dict:
     table = usable(rows)
     labels = sorted(set(table["name"]))
     values = np.array(table["features"].tolist())
-    own = NAME_SHARE * (table["name"].to_numpy()[:, None] == np.array(labels))
-    effect = LogisticRegression(C=REGULARISATION, max_iter=10_000)
-    effect.fit(np.hstack([values, own]), table["right"])
-    weights, shares = np.split(effect.coef_[0], [values.shape[1]])
+    own = table["name"].to_numpy()[:, None] == np.array(labels)
+    p, q = values.shape[1], len(labels)
+    effect = logistic(np.hstack([values, own]), table["right"].to_numpy(),
+                      np.r_[np.full(p, SD), np.full(q, NAME_SD)],
+                      [(0.0, None)] * p + [(None, None)] * q)
+    weights, shares = np.split(effect[1:], [p])
     without = [row["results"] for row in rows
                if not any(inside for _, inside in row["results"]["hidden"])]
     steps = np.array([each["steps"][0] for each in without])
     inputs = np.column_stack([np.arcsinh(steps[:, :2] / posterior.NATS),
                               np.log(np.maximum(steps[:, 2:], 0.1))])
-    nothing = LogisticRegression(C=REGULARISATION, max_iter=10_000)
-    nothing.fit(inputs, [not each["hidden"] for each in without])
-    return {"effect": {"intercept": round(float(effect.intercept_[0]), 3),
+    nothing = logistic(inputs, np.array([not each["hidden"] for each in without]),
+                       np.full(4, SD), [(None, 0.0)] * 2 + [(None, None)] * 2)
+    return {"effect": {"intercept": round(float(effect[0]), 3),
                        "weights": weights.round(3).tolist(),
-                       "names": {name: round(float(NAME_SHARE * share), 3)
+                       "names": {name: round(float(share), 3)
                                  for name, share in zip(labels, shares, strict=True)}},
-            "nothing": {"intercept": round(float(nothing.intercept_[0]), 3),
-                        "weights": nothing.coef_[0].round(3).tolist()},
+            "nothing": {"intercept": round(float(nothing[0]), 3),
+                        "weights": nothing[1:].round(3).tolist()},
             "cases": len(rows), "candidates": len(table)}
+
+
+def logistic(values: np.ndarray, right: np.ndarray, sd: np.ndarray,
+             bounds: list[tuple[float | None, float | None]]) -> np.ndarray:
+    """Return intercept and weights (1 + p,) of a logistic regression with normal priors.
+
+    Args:
+        values: (n, p).
+        right: (n,) bool.
+        sd: (p,) prior standard deviations of the weights.
+        bounds: p pairs: more evidence never makes a cause less probable.
+    """
+    sign = np.where(right, -1.0, 1.0)
+
+    def loss(theta: np.ndarray) -> float:
+        misfit = np.logaddexp(0.0, sign * (theta[0] + values @ theta[1:])).sum()
+        return float(misfit + 0.5 * np.square(theta[1:] / sd).sum())
+
+    return minimize(loss, np.zeros(1 + len(sd)), bounds=[(None, None), *bounds]).x
 
 
 def calibration_table(rows: pd.DataFrame) -> str:

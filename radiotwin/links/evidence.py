@@ -7,7 +7,6 @@ import pandas as pd
 
 from radiotwin.links.correlation import (
     correlation_length_m,
-    extent_m,
     moving_end_m,
     pair_of_ends,
     step_m,
@@ -18,7 +17,7 @@ LENGTHS = 1.0  # side of a piece over the correlation length
 UNKNOWN_M = 100.0  # side of a piece while no residual has been looked at
 MIN_PLACES = 6  # that the ground of a campaign is cut into, where it is wide enough
 NARROWER = 0.8  # from one width that is tried to the next
-LITTLE = 30  # pieces of evidence: fewer say little
+LITTLE = 30  # places: fewer say little
 
 
 def evidence_blocks(links: LinkData) -> np.ndarray:
@@ -51,14 +50,10 @@ def with_evidence(links: LinkData, z: np.ndarray) -> LinkData:
     length_m = correlation_length_m(links, z)
     width_m = fitting_width_m(links, LENGTHS * length_m)
     pieces = _pieces(links, width_m)
-    count, notes = len(np.unique(pieces)), []
-    if width_m < 0.99 * LENGTHS * length_m:
-        notes.append(f"errors are alike over {length_m:.0f} m, and the campaign is only "
-                     f"{extent_m(moving_end_m(links)):.0f} m wide: pieces of evidence of "
-                     f"{width_m:.0f} m are not independent, and evidence is little")
-    elif count < LITTLE:
-        notes.append(f"there are {count} independent pieces of evidence only: links within "
-                     f"{width_m:.0f} m of each other err alike, so evidence is little")
+    places, notes = _occupied(moving_end_m(links), width_m), []
+    if places < LITTLE:
+        notes.append(f"links within {width_m:.0f} m of each other err alike, and the campaign has "
+                     f"been at {places} such places only, so evidence is little")
     return replace(links, evidence=pieces, notes=[*links.notes, *notes])
 
 
