@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from radiotwin.effects.arrays import one_hot
 from radiotwin.effects.base import Effect
@@ -23,7 +24,8 @@ from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
 from radiotwin.links import LinkData
 
-MAX_Z = 4.0  # an outlier counts as this many scales
+MAX_Z = 3.0  # an outlier counts as this many scales from its neighbours
+NEIGHBOURS = 9
 LEVEL_SD_DB, SLOPE_SD_DB = 20.0, 10.0  # of a class of line of sight, at 100 m and per decade
 DEVICE_SD_DB, RECEIVER_SD_DB, FLIGHT_SD_DB = 1.0, 0.3, 0.3  # within tolerances: no effect
 MAX_ENDS = 40  # devices or receivers that have terms of their own
@@ -46,6 +48,7 @@ class Hypotheses:
         base_z: (n,) residuals without any further cause.
         mean_db: (n,) the model's mean.
         coefficients: of its fit, levels first.
+        near: (n, `NEIGHBOURS`) links of the same series that are nearest to each.
     """
 
     evidence: CorrelatedEvidence
@@ -55,6 +58,7 @@ class Hypotheses:
     base_z: np.ndarray
     mean_db: np.ndarray
     coefficients: np.ndarray
+    near: np.ndarray
 
     @classmethod
     def of(cls, model: FoldModel, fit: FitResult, seed: int) -> Hypotheses:
@@ -69,13 +73,14 @@ class Hypotheses:
         nuisance = _nuisance(links, predicted.mean_db)
         nuisance = Columns(nuisance.values / predicted.scale_db[:, None], nuisance.prior_sd)
         residual_db = np.where(_says_something(model, fit), model.training.residual_db(fit), np.nan)
-        z = _clipped(residual_db / predicted.scale_db)
         moving = receivers_move(links)
         series = links.device if moving else links.receiver
         position_m = links.receiver_m if moving else links.device_m[links.device]
+        near = _neighbours(series, position_m, np.isfinite(residual_db))
+        z = _tamed(residual_db / predicted.scale_db, near)
         evidence = CorrelatedEvidence.fit(series, position_m, z, nuisance, seed)
         return cls(evidence, links, predicted.scale_db, nuisance, z, predicted.mean_db,
-                   fit.coefficients)
+                   fit.coefficients, near)
 
     @cached_property
     def _rotated(self) -> tuple[np.ndarray, float, np.ndarray]:
@@ -123,7 +128,7 @@ class Hypotheses:
         """
         applied = model.effects[-1]
         term, own = applied.term.select(model.train), model.coefficient_slices[-1]
-        z = _clipped(model.training.residual_db(fit) / self.scale_db)
+        z = _tamed(model.training.residual_db(fit) / self.scale_db, self.near)
         # What its columns brought, and what levels gave way for it, is integrated over again.
         shown_db = term.columns @ fit.coefficients[own]
         levels = model.level_columns[model.train]
@@ -179,8 +184,25 @@ class Hypotheses:
                 yield variable + (f", {name}" if name else ""), np.hstack(blocks)
 
 
-def _clipped(z: np.ndarray) -> np.ndarray:
-    return np.clip(z, -MAX_Z, MAX_Z)
+def _neighbours(series: np.ndarray, position_m: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Return rows (n, `NEIGHBOURS`) that are known and nearest to each, of the same series."""
+    near = np.repeat(np.arange(len(series))[:, None], NEIGHBOURS, axis=1)
+    for label in np.unique(series):
+        mine = np.flatnonzero(series == label)
+        there = mine[known[mine]]
+        if len(there) >= NEIGHBOURS:
+            found = cKDTree(position_m[there]).query(position_m[mine], NEIGHBOURS)[1]
+            near[mine] = there[found]
+    return near
+
+
+def _tamed(z: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Return residuals (n,) in which a link counts as so far from its neighbours at most.
+
+    Outliers are single links. What neighbours have in common is none, however large.
+    """
+    common = np.median(z[near], axis=1)
+    return common + np.clip(z - common, -MAX_Z, MAX_Z)
 
 
 def _says_something(model: FoldModel, fit: FitResult) -> np.ndarray:
