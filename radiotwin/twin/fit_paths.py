@@ -42,7 +42,10 @@ def fit_along_paths(links: LinkData, scene: Scene, seed: int, start: Twin | None
     by_law = FoldModel.build(links, law.channel, dof, device_m=law_m)
     fit, both = by_paths.fit(), by_paths.usable & by_law.usable
     heard = np.bincount(by_paths.group[by_paths.usable & np.isfinite(links.level_db)], minlength=2)
-    loss = by_paths.regression(both).nll(fit).sum() \
+    # Slopes of their own would make any law of what paths bring.
+    as_they_are = replace(by_paths, level_columns=by_paths.level_columns[:, :2],
+                          level_prior_sd_db=by_paths.level_prior_sd_db[:2])
+    loss = as_they_are.regression(both).nll(as_they_are.fit()).sum() \
         - by_law.regression(both).nll(by_law.fit()).sum()
     if heard[0] >= MIN_HEARD and loss > MIN_LOSS_NATS * both.sum():
         warnings.warn("paths over the 3D map explain these levels worse than a law of distance and "

@@ -105,7 +105,7 @@ def test_figures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_p
     nothing = with_model(loop, loop.before)
     nothing.dependences_before = []
     content = make_report(nothing)
-    assert content["verdict"] == "none" and not content["effects"]
+    assert content["verdict"] == "undecided" and not content["effects"]  # no step has been looked at
     write_closeloop_figures(nothing, None, content, tmp_path)
     write_closeloop_page(content, tmp_path, "page")
     text = (tmp_path / "closeloop.html").read_text()
