@@ -127,7 +127,9 @@ class Blend:
             KeyError: a part is missing.
         """
         require_names("settings", settings, ["weights", "half_m", "sd_ratio", "models"])
-        forests, laws, own = {}, {}, {"measured_m", "measured_device"}
+        forests: dict[str, Forest] = {}
+        laws: dict[str, ChannelModel] = {}
+        own = {"measured_m", "measured_device"}
         for name, given in settings["models"].items():
             parts = {each.removeprefix(f"{name}/"): array for each, array in arrays.items()
                      if each.startswith(f"{name}/")}
