@@ -1,7 +1,10 @@
-"""What evidence is worth: the loop on the cities for calibration, and the regression upon it.
+"""What evidence is worth: the loop on cases for calibration, and the regression upon it.
 
-python -m studies calibration --resume      # rows: the loop on each case
-python -m studies.calibration               # rows -> radiotwin/closeloop/calibration.json
+The cases are those of the foreign cities for calibration, and those of the two traced cities whose
+maps are right within a survey's error (`tests/undeclared`).
+
+    python -m studies calibration --resume      # rows: the loop on each case
+    python -m studies.calibration               # rows -> radiotwin/closeloop/calibration.json
 """
 
 import json
@@ -18,6 +21,7 @@ from radiotwin.closeloop.scoring import CandidateScore
 from radiotwin.files import atomic_path
 from studies.runner import RECORDS, Study, read_rows
 from studies.tables import markdown
+from tests.undeclared.cases import FAMILIES, OUTSIDE, SEEDS, case, stored
 from tests.undeclared.foreign.cases import foreign_case, names
 
 LIMITS_DIFFER_DB = 2.0  # between receivers: then a limit of its own is no false name
@@ -27,24 +31,24 @@ PATH = Path(posterior.__file__).with_name("calibration.json")
 
 
 def calibration_cases(seed: int) -> dict[str, dict]:
-    """Return the cases of the cities for calibration; seed 0 only."""
-    return {} if seed else {name: {"case": name} for name in names("calibrate")}
+    """Return all cases for calibration, by `city00-w0-c0` or `foliage:1`; seed 0 only."""
+    known = [f"{family}:{number}" for number in SEEDS for family in (*FAMILIES, *OUTSIDE)
+             if stored(family, number)]
+    return {} if seed else {name: {"case": name} for name in (*names("calibrate"), *known)}
 
 
 def candidates_of(seed: int, settings: dict) -> dict:
     """Close the loop on a case, and keep what every candidate's probability depends on."""
-    hidden = foreign_case(settings["case"])
+    family, _, number = settings["case"].partition(":")
+    hidden = case(family, int(number)) if number else foreign_case(settings["case"])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         loop = close_loop(hidden.measurements, hidden.scene, seed=seed)
-    right, nuisance = {each["name"] for each in hidden.answer["effects"]}, hidden.answer["nuisance"]
-    open_names = {"missing_obstacle"} if nuisance["unmapped"] else set()
-    open_names |= {"removed_obstacle"} if nuisance["gone"] else set()
-    if nuisance["declared"] == "wrong" or np.ptp(nuisance["limit_db"]) > LIMITS_DIFFER_DB:
-        open_names |= {"noise_floor_censoring"}
+    right = {each["name"] for each in hidden.answer["effects"]}
     return {
-        "hidden": [[each["name"], each["in_catalogue"]] for each in hidden.answer["effects"]],
-        "open": sorted(open_names - right), "size_db": hidden.size_db,
+        "hidden": [[each["name"], each.get("in_catalogue", family not in OUTSIDE)]
+                   for each in hidden.answer["effects"]],
+        "open": sorted(_undeclared_besides(hidden.answer.get("nuisance")) - right),
         "named": [each.effect.name for each in loop.after.whole.effects],
         "candidates": [[*_row(score), score.name in right] for score in loop.selection.scores
                        if score.features],
@@ -52,6 +56,16 @@ def candidates_of(seed: int, settings: dict) -> dict:
                                and score.step == step.number)]),
                    max([0.0, *step.unnamed_nats.values()]), step.rest_db, step.noise_db]
                   for step in loop.selection.steps]}
+
+
+def _undeclared_besides(nuisance: dict | None) -> set[str]:
+    """Return names that are true of what no foreign campaign declares right: neither counts."""
+    if nuisance is None:
+        return set()
+    names = {"missing_obstacle": nuisance["unmapped"], "removed_obstacle": nuisance["gone"],
+             "noise_floor_censoring": nuisance["declared"] == "wrong"
+             or np.ptp(nuisance["limit_db"]) > LIMITS_DIFFER_DB}
+    return {name for name, there in names.items() if there}
 
 
 def _row(score: CandidateScore) -> list:
@@ -123,7 +137,7 @@ def calibration_table(rows: pd.DataFrame) -> str:
     lines = [[f"`{name}`", str(len(each)), str(int(each["right"].sum()))]
              for name, each in table.groupby("name")]
     return markdown(["candidate that held-out links support", "times", "right"], lines,
-                    "Calibration", f" ({len(rows)} cases of the cities for calibration)")
+                    "Calibration", f" ({len(rows)} cases)")
 
 
 def main() -> None:

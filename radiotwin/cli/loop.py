@@ -96,7 +96,7 @@ def _print(report: dict[str, Any]) -> None:
         f"Error on held-out links (by {report['heldout']['by']}) [dB], base {report['base']}",
         {"links": "left", "": "left", "RMSE": "right", "MAE": "right", "bias": "right"}, rows)
     rows = [[effect["name"], name,
-             _number(estimate["value"]) if estimate["determined"] else "not determined",
+             _number(estimate["value"]) if estimate.get("determined", True) else "not determined",
              *(_number(estimate[key]) for key in ("low", "high")), estimate["unit"]]
             for effect in report["effects"] for name, estimate in effect["parameters"].items()]
     print_rows("Effects found", {"effect": "left", "parameter": "left", "value": "right",

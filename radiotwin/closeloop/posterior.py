@@ -1,10 +1,11 @@
 """How probable it is that an effect is there, that nothing is, or something that has no name.
 
-Nats are worth what they turned out to be worth: a logistic regression, fitted on foreign worlds
-(`tests/undeclared/foreign`, the cities for calibration; `python -m studies foreign` judges it on
-the others), turns evidence beside a correlated rest, its lead over curves without a name, and what
-held-out links gain into a probability (Platt 1999, 'Probabilistic outputs for support vector
-machines'). Its few numbers are in `calibration.json`, made by `python -m studies.calibration`.
+Nats are worth what they turned out to be worth: a logistic regression, fitted on traced cases
+(`tests/undeclared`, of the foreign worlds the cities for calibration; `python -m studies foreign`
+judges it on the others), turns evidence beside a correlated rest, its lead over curves without a
+name, and what held-out links gain into a probability (Platt 1999, 'Probabilistic outputs for
+support vector machines'). Its few numbers are in `calibration.json`, made by
+`python -m studies.calibration`.
 """
 
 from __future__ import annotations
