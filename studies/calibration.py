@@ -26,7 +26,9 @@ from tests.undeclared.foreign.cases import foreign_case, names
 
 LIMITS_DIFFER_DB = 2.0  # between receivers: then a limit of its own is no false name
 PHYSICS = ("wall_reflection", "diffraction")  # in every traced world
-SD, NAME_SD = 1.0, 0.5  # prior standard deviations of a weight, and of a name's own intercept
+# Prior: log-odds rise with each feature; few cases do not show otherwise.
+MEAN, SD = (0.4, 0.3, 0.5, 0.1, 0.2), 0.2
+NAME_SD, NOTHING_SD = 0.5, 1.0  # of a name's own intercept, and of the weights of "nothing"
 PATH = Path(posterior.__file__).with_name("calibration.json")
 
 
@@ -92,7 +94,7 @@ def fitted(rows: list[dict]) -> dict:
     own = table["name"].to_numpy()[:, None] == np.array(labels)
     p, q = values.shape[1], len(labels)
     effect = logistic(np.hstack([values, own]), table["right"].to_numpy(),
-                      np.r_[np.full(p, SD), np.full(q, NAME_SD)],
+                      np.r_[MEAN, np.zeros(q)], np.r_[np.full(p, SD), np.full(q, NAME_SD)],
                       [(0.0, None)] * p + [(None, None)] * q)
     weights, shares = np.split(effect[1:], [p])
     without = [row["results"] for row in rows
@@ -101,7 +103,7 @@ def fitted(rows: list[dict]) -> dict:
     inputs = np.column_stack([np.arcsinh(steps[:, :2] / posterior.NATS),
                               np.log(np.maximum(steps[:, 2:], 0.1))])
     nothing = logistic(inputs, np.array([not each["hidden"] for each in without]),
-                       np.full(4, SD), [(None, 0.0)] * 2 + [(None, None)] * 2)
+                       np.zeros(4), np.full(4, NOTHING_SD), [(None, 0.0)] * 2 + [(None, None)] * 2)
     return {"effect": {"intercept": round(float(effect[0]), 3),
                        "weights": weights.round(3).tolist(),
                        "names": {name: round(float(share), 3)
@@ -111,23 +113,24 @@ def fitted(rows: list[dict]) -> dict:
             "cases": len(rows), "candidates": len(table)}
 
 
-def logistic(values: np.ndarray, right: np.ndarray, sd: np.ndarray,
+def logistic(values: np.ndarray, right: np.ndarray, mean: np.ndarray, sd: np.ndarray,
              bounds: list[tuple[float | None, float | None]]) -> np.ndarray:
     """Return intercept and weights (1 + p,) of a logistic regression with normal priors.
 
     Args:
         values: (n, p).
         right: (n,) bool.
-        sd: (p,) prior standard deviations of the weights.
+        mean: (p,) of the weights, before data.
+        sd: (p,) standard deviations of them.
         bounds: p pairs: more evidence never makes a cause less probable.
     """
     sign = np.where(right, -1.0, 1.0)
 
     def loss(theta: np.ndarray) -> float:
         misfit = np.logaddexp(0.0, sign * (theta[0] + values @ theta[1:])).sum()
-        return float(misfit + 0.5 * np.square(theta[1:] / sd).sum())
+        return float(misfit + 0.5 * np.square((theta[1:] - mean) / sd).sum())
 
-    return minimize(loss, np.zeros(1 + len(sd)), bounds=[(None, None), *bounds]).x
+    return minimize(loss, np.r_[0.0, mean], bounds=[(None, None), *bounds]).x
 
 
 def calibration_table(rows: pd.DataFrame) -> str:
