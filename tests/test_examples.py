@@ -39,7 +39,7 @@ def test_close_the_loop(run):
     assert "verdict: effect" in out and "receiver_gain_offset" in out
     before, after = map(float, re.search(r"([\d.]+) dB before, ([\d.]+) dB after", out).groups())
     assert after < before
-    assert out.splitlines()[-1].startswith("log_distance with ")  # the saved twin
+    assert out.splitlines()[-1].startswith("segmented_log_distance with ")  # the saved twin
 
 
 def test_plan_with_your_twin(run):
