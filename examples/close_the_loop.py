@@ -15,8 +15,9 @@ table.loc[table["receiver"] == "uav1", "gain_db"] += 6.0
 measurements = rt.Measurements(table, correct.devices)
 
 # %% [markdown]
-# The base is a twin with a segmented law over the 3D map. Without the map it would be a log-distance
-# law, which errs by 8 dB here: beside that, 6 dB of one receiver are not probable enough to be named.
+# The base is a twin with a segmented law over the 3D map. Without the map it would be a
+# log-distance law, which errs by 8 dB here: beside that, 6 dB of one receiver are not probable
+# enough to be named.
 
 # %%
 loop = rt.close_loop(measurements, scene, base="twin", seed=0)
