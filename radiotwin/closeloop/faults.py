@@ -20,7 +20,6 @@ from radiotwin.closeloop.cross_validation import (
     training_parts,
 )
 from radiotwin.closeloop.folds import Folds, make_folds
-from radiotwin.closeloop.hypotheses import Hypotheses
 from radiotwin.closeloop.posterior import judge
 from radiotwin.closeloop.scoring import (
     Candidate,
@@ -53,7 +52,7 @@ def select_faults(result: SelectionResult, effects: list[Effect], links: LinkDat
     model: CrossValidatedModel | None = None
     while timed and not result.is_full:
         step, refused = len(result.model.whole.effects), []
-        hypotheses = Hypotheses.of(result.model.whole, result.model.fits[0], seed)
+        hypotheses = result.hypotheses(seed)
         fitted = [fit_candidate(result.model, effect, step, result.criteria, hypotheses)
                   for effect in timed]
         candidates = [each for each in fitted if isinstance(each, Candidate)]

@@ -97,15 +97,12 @@ class Hypotheses:
         noise_db = np.exp(0.5 * theta[0]) * float(np.median(self.scale_db))
         return noise_db * np.exp(0.5 * theta[1]), noise_db
 
-    def gain_nats(self, z: np.ndarray, columns: Columns | None) -> float:
+    def gain_nats(self, z: np.ndarray, columns: Columns) -> float:
         """Return how much likelier residuals z (n,) with columns are than those of the model."""
         nuisance, base, theta = self._rotated
-        sd = self.nuisance.prior_sd
-        if columns is not None:
-            nuisance = np.hstack([nuisance, self.evidence.rotated(columns.values)])
-            sd = np.concatenate([sd, columns.prior_sd])
-        z = np.where(np.isfinite(z), z, 0.0)
-        return self.evidence.of_rotated(self.evidence.rotated(z), nuisance, sd, theta)[0] - base
+        both = np.hstack([nuisance, self.evidence.rotated(columns.values)])
+        sd = np.concatenate([self.nuisance.prior_sd, columns.prior_sd])
+        return self.evidence.of_rotated(self.evidence.rotated(z), both, sd, theta)[0] - base
 
     def information(self, pattern_db: np.ndarray) -> float:
         """Return how sharply the data would show a change (n,) of unit size [1/size²]."""
@@ -128,6 +125,8 @@ class Hypotheses:
         """
         applied = model.effects[-1]
         term, own = applied.term.select(model.train), model.coefficient_slices[-1]
+        if term.random_effect_sd_db is not None and applied.effect.within_flights:
+            return np.nan  # it makes errors larger, which levels alone do not show
         z = _tamed(model.training.residual_db(fit) / self.scale_db, self.near)
         # What its columns brought, and what levels gave way for it, is integrated over again.
         shown_db = term.columns @ fit.coefficients[own]
@@ -137,8 +136,6 @@ class Hypotheses:
         z += shown_db / self.scale_db
         columns = Columns(term.columns / self.scale_db[:, None], term.prior_sd_db)
         variation = applied.effect.variation(applied.params)
-        if term.random_effect_sd_db is not None and applied.effect.within_flights:
-            return np.nan  # it makes errors larger, which levels alone do not show
         numbers = 0 if variation is None else len(variation.values)
         acts = int(((term.offset_db != 0) | (term.columns != 0).any(axis=1)).sum()) or len(z)
         used = len(self.evidence.rows) / max(len(z), 1)

@@ -109,8 +109,8 @@ class Loop:
     @cached_property
     def detectable(self) -> list[Detectable]:
         """How large effects would have had to be, to be named."""
-        left = self.selection.hypotheses
-        return [] if left is None else detectable(left, self.criteria)
+        left = self.selection.looked_at
+        return [] if left is None else detectable(left[1], self.criteria)
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:

@@ -41,7 +41,7 @@ class SelectionResult:
         rivals: of each kept effect, names of those that the data cannot tell from it.
         steps: what each step's residual says, the first step first; the last is of what is left.
         explained: the model before any last resort.
-        hypotheses: about what is left.
+        looked_at: the model that was looked at last, and the hypotheses about what it lacks.
     """
 
     model: CrossValidatedModel
@@ -50,7 +50,7 @@ class SelectionResult:
     rivals: list[list[str]] = field(default_factory=list)
     steps: list[Step] = field(default_factory=list)
     explained: CrossValidatedModel | None = None
-    hypotheses: Hypotheses | None = None
+    looked_at: tuple[CrossValidatedModel, Hypotheses] | None = None
 
     @property
     def is_full(self) -> bool:
@@ -63,6 +63,13 @@ class SelectionResult:
         named = self.explained or self.model
         same = len(named.whole.effects) == len(self.model.whole.effects)
         return self.model if same else named
+
+    def hypotheses(self, seed: int) -> Hypotheses:
+        """Return the hypotheses about what the model lacks, made once for each model."""
+        if self.looked_at is None or self.looked_at[0] is not self.model:
+            found = Hypotheses.of(self.model.whole, self.model.fits[0], seed)
+            self.looked_at = self.model, found
+        return self.looked_at[1]
 
     def keep(self, score: CandidateScore, model: CrossValidatedModel) -> None:
         """Take over a model with one more effect."""
@@ -104,8 +111,7 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
         hypotheses = None
         if causes:
             on_progress(f"step {step + 1}: what the base may be wrong in")
-            hypotheses = Hypotheses.of(result.model.whole, result.model.fits[0], seed)
-            result.hypotheses = hypotheses
+            hypotheses = result.hypotheses(seed)
         passed = _score_all(result, available, block, hypotheses, seed, on_progress)
         if hypotheses is not None:
             passed = _probable(result, passed, hypotheses, step)
