@@ -3,10 +3,12 @@
 Its readings have an offset, follow the prediction with another slope (0: not at all), and scatter
 more (a random effect beside the error scale). So they no longer corrupt what is learnt of others.
 
-A flight stands out if its level or its scatter, compared with other flights at the same places,
-is an outlier among the flights of its receiver: Student's t with the pooled standard deviation of
-all others, corrected for the number of flights (Grubbs 1969, 'Procedures for detecting outlying
-observations in samples', Technometrics 11).
+A flight stands out if its level, compared with other flights at the same places, is an outlier
+among the flights of its receiver, or its scatter or its roughness (the scatter from one reading of
+a device to its next) among all flights: Student's t with the pooled standard deviation of all
+others, corrected for the number of flights and of statistics (Grubbs 1969, 'Procedures for
+detecting outlying observations in samples', Technometrics 11). Maps that are wrong make the scatter
+of flights differ; roughness they hardly change.
 """
 
 from dataclasses import dataclass, replace
@@ -30,11 +32,17 @@ from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.links import LinkData
 
 MIN_LINKS = 30  # of a receiver on a flight, at places where other flights were
-MIN_FLIGHTS = 3  # of a receiver: of two that differ, either may be the faulty one
+MIN_FLIGHTS = 3  # of a receiver: of two whose levels differ, either may be the faulty one
+MIN_ALL_FLIGHTS = 4  # of all receivers, for one that scatters more to stand out
 MIN_DEVICE_LINKS = 5  # of a device, to be asked whether it agrees
 MIN_DEVICES = 0.7  # share of the devices that must agree: a fault of the receiver acts on all
 MIN_OFFSET_DB = 2.0  # a smaller one changes no decision
 MIN_SCATTER = 1.5  # times the others'
+MIN_SCATTER_DB = 1e-3
+# Of flights' log scatters and log roughnesses, before any is seen, and the flights that it counts
+# for (Smyth 2004, 'Linear models and empirical Bayes methods', Stat. Appl. Genet. Mol. Biol. 3).
+PRIOR_LOG_SD, PRIOR_FREEDOM = (0.35, 0.25), 3
+STATISTICS = 4  # that are tested
 MAX_P_VALUE = 0.01  # corrected for the number of flights
 PRIOR_SD_DB = 15.0
 RELATION_SD = 0.5  # of the slope that is lost or gained
@@ -43,13 +51,21 @@ MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal 
 
 @dataclass(frozen=True)
 class _Flight:
-    """A receiver's flight: level and log of the scatter of what is left after the comparison."""
+    """A receiver's flight, and what tells whether it is like others; NaN: not known.
+
+    Attributes:
+        receiver, flight: which.
+        rows: its detected links.
+        levels_db: of its residuals, compared with other flights at the same places and as they
+            are, over the median of the receiver's flights; NaN where its devices disagree.
+        log_scatters: of what comparison leaves, and from reading to reading.
+    """
 
     receiver: int
     flight: int
     rows: np.ndarray
-    level_db: float
-    log_scatter: float
+    levels_db: tuple[float, float]
+    log_scatters: tuple[float, float]
 
 
 class FaultyFlight(GainEffect):
@@ -75,15 +91,17 @@ class FaultyFlight(GainEffect):
     @override
     def unavailable(self, links: LinkData) -> str | None:
         pairs = np.unique(np.column_stack([links.receiver, links.flight]), axis=0)
-        if np.unique(pairs[:, 0], return_counts=True)[1].max() < MIN_FLIGHTS:
-            return f"no receiver is on {MIN_FLIGHTS} flights, so that one could disagree"
+        most = np.unique(pairs[:, 0], return_counts=True)[1].max()
+        if most < 2 or (most < MIN_FLIGHTS and len(pairs) < MIN_ALL_FLIGHTS):
+            return (f"no receiver is on {MIN_FLIGHTS} flights, and all are on fewer than "
+                    f"{MIN_ALL_FLIGHTS}, so that one could disagree")
         return None
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         known = list(zip(view.found_params(self.name, "receiver"),
                          view.found_params(self.name, "flight"), strict=True))
-        flights = _compared_flights(view)
+        flights = _flights(view)
         found = []
         for each in flights:
             name = str(view.links.flight_names[each.flight])
@@ -125,65 +143,108 @@ class FaultyFlight(GainEffect):
                 "relation" + member: Parameter.normal(1 + slope, slope_sd, "of the prediction")}
 
 
-def _compared_flights(view: ResidualView) -> list[_Flight]:
-    """Return every flight of every receiver that was where others were."""
-    links, rest_db = view.links, compared_db(view)
-    known = np.isfinite(rest_db) & np.isfinite(links.level_db)
+def _flights(view: ResidualView) -> list[_Flight]:
+    """Return every flight of every receiver with links enough."""
+    links = view.links
+    seen = np.isfinite(links.level_db)
+    pairs = np.unique(np.column_stack([links.receiver, links.flight])[seen], axis=0)
+    rows = [np.flatnonzero(seen & (links.receiver == receiver) & (links.flight == flight))
+            for receiver, flight in pairs]
+    residuals_db = [np.where(seen, each, np.nan) for each in (compared_db(view), view.residual_db)]
+    levels_db = np.column_stack([_levels_db(each, rows, pairs[:, 0], links)
+                                 for each in residuals_db])
     found = []
-    for receiver, flight in np.unique(np.column_stack([links.receiver, links.flight])[known],
-                                      axis=0).tolist():
-        rows = np.flatnonzero(known & (links.receiver == receiver) & (links.flight == flight))
-        if len(rows) >= MIN_LINKS:
-            level_db = float(np.median(rest_db[rows]))
-            scatter_db = MAD_SD * float(np.median(np.abs(rest_db[rows] - level_db)))
-            found.append(_Flight(receiver, flight, rows, level_db,
-                                 float(np.log(max(scatter_db, 1e-3)))))
-    # What a receiver always has is no fault of one of its flights.
-    own = {each.receiver: float(np.median([other.level_db for other in found
-                                           if other.receiver == each.receiver])) for each in found}
-    for number, each in enumerate(found):
-        rest_db[each.rows] -= own[each.receiver]
-        found[number] = replace(each, level_db=each.level_db - own[each.receiver])
-    return [each for each in found if _devices_agree(each, found, rest_db, links)
-            or abs(each.level_db) < MIN_OFFSET_DB]
+    for (receiver, flight), mine, level_db in zip(pairs.tolist(), rows, levels_db, strict=True):
+        if len(mine) >= MIN_LINKS:
+            scatters_db = (_robust_sd(residuals_db[0][mine]), _robust_sd(
+                _from_reading_to_reading_db(view.residual_db[mine], links.select(mine))))
+            logs = [float(np.log(max(each, MIN_SCATTER_DB))) for each in scatters_db]
+            found.append(_Flight(receiver, flight, mine, (level_db[0], level_db[1]),
+                                 (logs[0], logs[1])))
+    return found
 
 
-def _devices_agree(flight: _Flight, others: list[_Flight], rest_db: np.ndarray,
-                   links: LinkData) -> bool:
+def _levels_db(residual_db: np.ndarray, rows: list[np.ndarray], receiver: np.ndarray,
+               links: LinkData) -> np.ndarray:
+    """Return levels (f,) of flights over those of the same receiver; NaN if devices disagree."""
+    known = [mine[np.isfinite(residual_db[mine])] for mine in rows]
+    level_db = np.array([np.median(residual_db[mine]) if len(mine) >= MIN_LINKS else np.nan
+                         for mine in known])
+    for each in np.unique(receiver):  # what a receiver always has is no fault of one of its flights
+        same = (receiver == each) & np.isfinite(level_db)
+        level_db[same] -= np.median(level_db[same]) if same.any() else 0.0
+    for number, (mine, own_db) in enumerate(zip(known, level_db.tolist(), strict=True)):
+        if abs(own_db) >= MIN_OFFSET_DB and not _devices_agree(residual_db[mine], own_db,
+                                                               links.device[mine]):
+            level_db[number] = np.nan
+    return level_db
+
+
+def _devices_agree(residual_db: np.ndarray, level_db: float, device: np.ndarray) -> bool:
     """Return whether most devices show what the flight as a whole shows."""
-    device, own_db = links.device[flight.rows], rest_db[flight.rows]
     if len(np.unique(device)) > len(device) / MIN_DEVICE_LINKS:  # positions of one that moves
         return True
-    if abs(flight.level_db) >= MIN_OFFSET_DB and share_alike(
-            device, own_db, MIN_DEVICE_LINKS, 0.4 * flight.level_db) >= MIN_DEVICES:
-        return True
-    usual_db = float(np.exp(np.median([other.log_scatter for other in others])))
-    return share_alike(device, np.abs(own_db - np.median(own_db)), MIN_DEVICE_LINKS,
-                       MIN_SCATTER * usual_db / MAD_SD) >= MIN_DEVICES
+    return share_alike(device, residual_db, MIN_DEVICE_LINKS, 0.4 * level_db) >= MIN_DEVICES
+
+
+def _robust_sd(values: np.ndarray) -> float:
+    """Return the standard deviation of normal values (n,); NaN where few are known."""
+    known = values[np.isfinite(values)]
+    if len(known) < MIN_LINKS:
+        return np.nan
+    return MAD_SD * float(np.median(np.abs(known - np.median(known))))
+
+
+def _from_reading_to_reading_db(residual_db: np.ndarray, links: LinkData) -> np.ndarray:
+    """Return how far readings are from the one before of the same device, over sqrt(2) [dB]."""
+    order = np.lexsort((links.time_s, links.device))
+    same = np.diff(links.device[order]) == 0
+    return np.diff(residual_db[order])[same] / np.sqrt(2)
 
 
 def _disagreement(flight: _Flight, flights: list[_Flight], links: LinkData) -> tuple[float, float]:
     """Return the p-value of a flight's disagreement, and the scatter that it adds [dB]."""
     others = [each for each in flights if each is not flight]
-    same = [each for each in others if each.receiver == flight.receiver]
-    if len(same) < MIN_FLIGHTS - 1:
+    noisy = [_excess(own, np.array([each.log_scatters[kind] for each in others]), prior_sd)
+             for kind, (own, prior_sd) in enumerate(zip(flight.log_scatters, PRIOR_LOG_SD,
+                                                        strict=True))]
+    p_value, added_db = min(noisy)
+    if not _is_first_or_last(flight, links):
+        p_value = min(p_value, *(_offset_p_value(flight, others, kind) for kind in range(2)))
+    return min(STATISTICS * p_value, 1.0), min(added_db, 50.0)
+
+
+def _excess(own: float, usual: np.ndarray, prior_sd: float) -> tuple[float, float]:
+    """Return the p-value of a log scatter against others (m,), and the scatter added [dB]."""
+    usual = usual[np.isfinite(usual)]
+    if np.isnan(own) or len(usual) < MIN_FLIGHTS - 1:
         return 1.0, 0.0
-    usual = float(np.median([each.log_scatter for each in others]))
-    excess = flight.log_scatter - usual
-    noisy_p = 1.0
-    if excess > np.log(MIN_SCATTER):
-        sd = float(np.std([each.log_scatter for each in others], ddof=1))
-        noisy_p = float(t.sf(excess / max(sd, 0.05), len(others) - 1))
-    levels_db = np.array([each.level_db for each in others])
-    receivers = len({each.receiver for each in others})
-    freedom = max(len(others) - receivers, 1)
-    sd_db = max(float(np.sqrt((levels_db**2).sum() / freedom)), 0.1)
-    own_db = flight.level_db - float(np.median([each.level_db for each in same]))
-    offset_p = 1.0
-    if abs(own_db) >= MIN_OFFSET_DB and not _is_first_or_last(flight, links):
-        offset_p = float(2 * t.sf(abs(own_db) / sd_db, freedom))
-    added_db = np.sqrt(max(np.exp(2 * flight.log_scatter) - np.exp(2 * usual), 0.0))
-    return min(2 * min(noisy_p, offset_p), 1.0), float(min(added_db, 50.0))
+    excess = own - float(np.median(usual))
+    added_db = np.sqrt(max(np.exp(2 * own) - np.exp(2 * np.median(usual)), 0.0))
+    if excess <= np.log(MIN_SCATTER):
+        return 1.0, float(added_db)
+    freedom = len(usual) - 1
+    sum_of_squares = freedom * np.var(usual, ddof=1) + PRIOR_FREEDOM * prior_sd**2
+    sd = np.sqrt(sum_of_squares / (freedom + PRIOR_FREEDOM))
+    return float(t.sf(excess / sd, freedom + PRIOR_FREEDOM)), float(added_db)
+
+
+def _offset_p_value(flight: _Flight, others: list[_Flight], kind: int) -> float:
+    """Return the p-value of a flight's level against others'; 1 if it is small or unknown."""
+    levels_db = {receiver: np.array([each.levels_db[kind] for each in others
+                                     if each.receiver == receiver
+                                     and np.isfinite(each.levels_db[kind])])
+                 for receiver in {each.receiver for each in others}}
+    same_db = levels_db.get(flight.receiver, np.zeros(0))
+    if len(same_db) < MIN_FLIGHTS - 1:
+        return 1.0
+    own_db = flight.levels_db[kind] - float(np.median(same_db))
+    if not abs(own_db) >= MIN_OFFSET_DB:
+        return 1.0
+    every_db = np.concatenate([each for each in levels_db.values() if len(each)])
+    freedom = max(len(every_db) - sum(len(each) > 0 for each in levels_db.values()), 1)
+    sd_db = max(float(np.sqrt((every_db**2).sum() / freedom)), 0.1)
+    return float(2 * t.sf(abs(own_db) / sd_db, freedom))
 
 
 def _is_first_or_last(flight: _Flight, links: LinkData) -> bool:
