@@ -43,7 +43,7 @@ MIN_SCATTER_DB = 1e-3
 # for (Smyth 2004, 'Linear models and empirical Bayes methods', Stat. Appl. Genet. Mol. Biol. 3).
 PRIOR_LOG_SD, PRIOR_FREEDOM = (0.35, 0.25), 3
 STATISTICS = 4  # that are tested
-MAX_P_VALUE = 0.01  # corrected for the number of flights
+MAX_P_VALUE = 0.02  # corrected for the number of flights
 PRIOR_SD_DB = 15.0
 RELATION_SD = 0.5  # of the slope that is lost or gained
 MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal errors
