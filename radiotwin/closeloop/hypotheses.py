@@ -34,6 +34,7 @@ KNOTS = 8  # of a curve over a variable
 TIME_KNOTS = 24  # of one over time
 CURVE_SD_DB = 4.0  # prior standard deviation of a curve
 MAX_COLUMNS = 250  # of one hypothesis
+STEP_SHARE = 0.3  # of a number's typical uncertainty, for what it changes
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,10 +112,12 @@ class Hypotheses:
         return self.evidence.information(pattern, columns, self.nuisance.prior_sd, theta)
 
     def of_named(self, model: FoldModel, fit: FitResult) -> float:
-        """Return the evidence for the last effect of a model [nats], penalised by its numbers.
+        """Return the evidence for the last effect of a model [nats].
 
-        Coefficients are integrated over their priors; each number that was searched for costs
-        half the logarithm of the links that it acts on (Schwarz 1978).
+        Coefficients are integrated over their priors, and so are the numbers that were searched
+        for, of which what they change is taken as linear (Laplace's approximation; MacKay 2003,
+        'Information theory, inference, and learning algorithms', Ch. 28): what the data do not
+        determine costs nothing, and what fits best without the rest is fitted again beside it.
 
         Args:
             model: this one's with one more effect.
@@ -135,11 +138,9 @@ class Hypotheses:
         shown_db += levels @ (fit.coefficients[:p] - self.coefficients[:p])
         z += shown_db / self.scale_db
         columns = Columns(term.columns / self.scale_db[:, None], term.prior_sd_db)
-        variation = applied.effect.variation(applied.params)
-        numbers = 0 if variation is None else len(variation.values)
-        acts = int(((term.offset_db != 0) | (term.columns != 0).any(axis=1)).sum()) or len(z)
-        used = len(self.evidence.rows) / max(len(z), 1)
-        return self.gain_nats(z, columns) - 0.5 * numbers * np.log(max(acts * used, 2.0))
+        slopes = _slopes(model, fit)
+        return self.gain_nats(z, columns.beside(
+            Columns(slopes.values / self.scale_db[:, None], slopes.prior_sd)))
 
     @cached_property
     def unnamed_nats(self) -> dict[str, float]:
@@ -179,6 +180,25 @@ class Hypotheses:
                 blocks = [basis if member is None else basis * (label == member)[:, None]
                           for member in members]
                 yield variable + (f", {name}" if name else ""), np.hstack(blocks)
+
+
+def _slopes(model: FoldModel, fit: FitResult) -> Columns:
+    """Return what each number of the last effect changes (n, q) [dB], and how far it may (q,)."""
+    applied = model.effects[-1]
+    variation = applied.effect.variation(applied.params)
+    if variation is None:
+        return Columns(np.zeros((int(model.train.sum()), 0)), np.zeros(0))
+    mean_db, slopes_db = model.training.predict(fit).mean_db, []
+    for number, step in enumerate(STEP_SHARE * variation.steps):
+        values = variation.values.copy()
+        if values[number] + step > variation.high[number]:
+            step = -step
+        values[number] += step
+        other = model.apply(applied.effect, variation.params(values))
+        changed = model.with_effects([*model.effects[:-1], other]).training.predict(fit)
+        slopes_db.append((changed.mean_db - mean_db) / step)
+    width = variation.high - variation.low
+    return Columns(np.column_stack(slopes_db), width / np.sqrt(12.0))
 
 
 def _neighbours(series: np.ndarray, position_m: np.ndarray, known: np.ndarray) -> np.ndarray:

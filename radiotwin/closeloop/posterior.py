@@ -46,6 +46,11 @@ class Step:
     noise_db: float
     probabilities: dict[str, float]
 
+    @property
+    def best_unnamed(self) -> float:
+        """Most evidence for a curve without a name, at least 0 [nats]."""
+        return max([0.0, *self.unnamed_nats.values()])
+
 
 def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypotheses: Hypotheses,
           criteria: SelectionCriteria) -> tuple[list[CandidateScore], Step]:
@@ -90,6 +95,23 @@ def features(nats: tuple[float, float, float, float], rmse_fall: float) -> tuple
         rmse_fall: of held-out links, logarithm of the error without it over that with it.
     """
     return (*np.arcsinh(np.array(nats) / NATS).tolist(), 10 * rmse_fall)
+
+
+def probability_of_both(first: CandidateScore, second: CandidateScore, other: float,
+                        unnamed: float, before_db: float) -> float:
+    """Return the probability that two effects are there, from what they explain together.
+
+    Args:
+        first: of a model without any of the two.
+        second: of the model with the first.
+        other: most that any other effect gains on held-out links [nats].
+        unnamed: most evidence for a curve without a name [nats].
+        before_db: held-out error without any of the two [dB].
+    """
+    evidence, held_out = (first.nats + second.nats, first.held_out_nats + second.held_out_nats)
+    values = features((evidence, evidence - unnamed, held_out, held_out - other),
+                      float(np.nan_to_num(np.log(before_db / second.rmse_db))))
+    return min(probability_of(each.name, values) for each in (first, second))
 
 
 def probability_of(name: str, values: tuple[float, ...]) -> float:

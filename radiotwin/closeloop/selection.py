@@ -14,6 +14,7 @@ import numpy as np
 from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.closeloop.hypotheses import Hypotheses
+from radiotwin.closeloop.pairs import Passed, probable_pair
 from radiotwin.closeloop.posterior import Step, judge
 from radiotwin.closeloop.scoring import (
     Candidate,
@@ -78,15 +79,6 @@ class SelectionResult:
         self.rivals.append([])
 
 
-@dataclass(frozen=True, eq=False)
-class _Passed:
-    """A candidate that passed: its effect, score, and the model with it."""
-
-    effect: Effect
-    score: CandidateScore
-    model: CrossValidatedModel
-
-
 def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
                       on_progress: Callable[[str], None]) -> None:
     """Add to the model the effect with the most evidence, and again, until none passes.
@@ -114,7 +106,14 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
             hypotheses = result.hypotheses(seed)
         passed = _score_all(result, available, block, hypotheses, seed, on_progress)
         if hypotheses is not None:
-            passed = _probable(result, passed, hypotheses, step)
+            judged = _judged(result, passed, hypotheses, step)
+            passed = [each for each in judged if not each.score.reason]
+            if not passed:
+                pair = probable_pair(judged, result.model, result.steps[-1], block, len(available),
+                                     seed, result.criteria, on_progress)
+                if pair:
+                    _keep_both(result, pair, step)
+                    continue
         if not passed:
             break
         _keep_best(result, passed, block, hypotheses, seed, step, on_progress)
@@ -127,7 +126,7 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
 
 def _score_all(result: SelectionResult, available: list[Effect], block: np.ndarray,
                hypotheses: Hypotheses | None, seed: int,
-               on_progress: Callable[[str], None]) -> list[_Passed]:
+               on_progress: Callable[[str], None]) -> list[Passed]:
     """Score every available effect in one step; return those that pass."""
     step = len(result.model.whole.effects)
     candidates: list[Candidate] = []
@@ -141,7 +140,7 @@ def _score_all(result: SelectionResult, available: list[Effect], block: np.ndarr
             result.scores.append(candidate)
         else:
             candidates.append(candidate)
-    passed: list[_Passed] = []
+    passed: list[Passed] = []
     for candidate in sorted(candidates, key=lambda candidate: -candidate.gain):
         effect = candidate.effect
         better = next((each for each in passed
@@ -160,25 +159,37 @@ def _score_all(result: SelectionResult, available: list[Effect], block: np.ndarr
                                              evidence_nats=candidate.evidence), None
         result.scores.append(score)
         if extended is not None:
-            passed.append(_Passed(effect, score, extended))
+            passed.append(Passed(effect, score, extended))
     return passed
 
 
-def _probable(result: SelectionResult, passed: list[_Passed], hypotheses: Hypotheses,
-              step: int) -> list[_Passed]:
-    """Give all scores of a step their probabilities; return what passed and is probable."""
+def _judged(result: SelectionResult, passed: list[Passed], hypotheses: Hypotheses,
+            step: int) -> list[Passed]:
+    """Give all scores of a step their probabilities; return what passed with its own."""
     here = [i for i, entry in enumerate(result.scores) if entry.step == step]
     judged, summary = judge([result.scores[i] for i in here], result.model,
                             hypotheses, result.criteria)
     result.steps.append(summary)
     old = {id(result.scores[i]): score for i, score in zip(here, judged, strict=True)}
-    probable = [replace(each, score=old[id(each.score)]) for each in passed]
+    found = [replace(each, score=old[id(each.score)]) for each in passed]
     for i, score in zip(here, judged, strict=True):
         result.scores[i] = score
-    return [each for each in probable if not each.score.reason]
+    return found
 
 
-def _keep_best(result: SelectionResult, passed: list[_Passed], block: np.ndarray,
+def _keep_both(result: SelectionResult, pair: list[Passed], step: int) -> None:
+    """Keep two effects that are probable together."""
+    first, second = pair
+    for i, entry in enumerate(result.scores):
+        if entry.step == step and entry.name == first.score.name and entry.passed:
+            result.scores[i] = replace(first.score, kept=True)
+            break
+    result.scores.append(replace(second.score, kept=True))
+    result.rivals += [[], []]
+    result.model = _exactly(second.model)
+
+
+def _keep_best(result: SelectionResult, passed: list[Passed], block: np.ndarray,
                hypotheses: Hypotheses | None, seed: int, step: int,
                on_progress: Callable[[str], None]) -> None:
     """Keep the best of the candidates that passed, or several of one kind that are better."""
@@ -208,7 +219,7 @@ def _keep_best(result: SelectionResult, passed: list[_Passed], block: np.ndarray
     result.model = _exactly(steps[-1][1])
 
 
-def _beyond(passed: _Passed, candidate: Candidate, model: CrossValidatedModel,
+def _beyond(passed: Passed, candidate: Candidate, model: CrossValidatedModel,
             criteria: SelectionCriteria) -> bool:
     """Return whether an effect that passed gains so much that another need not be scored.
 
@@ -235,7 +246,7 @@ def _on_one_mast(model: CrossValidatedModel) -> int:
     return len(devices) if on_mast else 0
 
 
-def _several(rival: _Passed, block: np.ndarray, hypotheses: Hypotheses | None, seed: int,
+def _several(rival: Passed, block: np.ndarray, hypotheses: Hypotheses | None, seed: int,
              min_nats: float, most: int, criteria: SelectionCriteria,
              ) -> list[tuple[CandidateScore, CrossValidatedModel]] | None:
     """Add an effect of which a step finds one again and again, until all have more than `min_nats`.

@@ -21,9 +21,9 @@ from scipy.linalg import cho_factor, cho_solve, eigh
 from scipy.optimize import minimize
 from scipy.spatial.distance import cdist
 
-MAX_POINTS = 500  # of a series: its matrix is decomposed
+MAX_POINTS = 400  # of a part of a series: its matrix is decomposed
 MAX_ROWS = 8000  # of all series
-MIN_POINTS = 3  # of a series that says anything
+MIN_POINTS = 3  # of a part that says anything
 # Of correlation [m]: shadowing decorrelates within 10 to 50 m (3GPP TR 38.901, Table 7.5-6). Longer
 # ones would explain whatever an antenna or a wrong position does to a device's levels.
 LENGTHS_M = (5.0, 12.0, 30.0)
@@ -50,9 +50,10 @@ class CorrelatedEvidence:
     """Marginal likelihoods of residuals beside a correlated rest.
 
     Attributes:
-        rows: (m,) rows that are used, series after series.
-        parts: where each series is among them.
-        bases: of each series the eigenvectors of its correlation matrix.
+        rows: (m,) rows that are used, part after part.
+        parts: where each part of a series is among them: links near each other; what is further
+            away counts as not correlated.
+        bases: of each part the eigenvectors of its correlation matrix.
         spectrum: (m,) the eigenvalues.
         length_m: of the correlation.
     """
@@ -79,16 +80,13 @@ class CorrelatedEvidence:
         chosen = []
         known = np.flatnonzero(np.isfinite(z))
         labels, member = np.unique(series[known], return_inverse=True)
-        most = int(np.clip(MAX_ROWS // max(len(labels), 1), MIN_POINTS, MAX_POINTS))
-        for number in range(len(labels)):
+        most = max(MAX_ROWS // max(len(labels), 1), MIN_POINTS)
+        for number in rng.permutation(len(labels))[:MAX_ROWS // MIN_POINTS]:
             mine = known[member == number]
-            if len(mine) < MIN_POINTS:
-                continue
             if len(mine) > most:
                 mine = np.sort(rng.choice(mine, most, replace=False))
-            chosen.append(mine)
-        if len(chosen) * most > MAX_ROWS:
-            chosen = [chosen[i] for i in sorted(rng.permutation(len(chosen))[:MAX_ROWS // most])]
+            chosen += [part for part in _near_each_other(mine, position_m)
+                       if len(part) >= MIN_POINTS]
         tried = [cls._decomposed(chosen, position_m, length_m) for length_m in LENGTHS_M]
         return max(tried, key=lambda each: each.log_evidence(z, nuisance))
 
@@ -169,3 +167,14 @@ class CorrelatedEvidence:
         shared = weighted @ pattern
         left = (pattern * pattern / variance).sum() - shared @ np.linalg.solve(inner, shared)
         return max(float(left), 0.0)
+
+
+def _near_each_other(rows: np.ndarray, position_m: np.ndarray) -> list[np.ndarray]:
+    """Return rows in parts of at most `MAX_POINTS`, halved across the longest side (k-d tree)."""
+    if len(rows) <= MAX_POINTS:
+        return [rows]
+    mine_m = position_m[rows]
+    order = np.argsort(mine_m[:, np.ptp(mine_m, axis=0).argmax()], kind="stable")
+    half = len(rows) // 2
+    return [part for each in (order[:half], order[half:])
+            for part in _near_each_other(rows[np.sort(each)], position_m)]
