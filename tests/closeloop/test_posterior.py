@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 
 from radiotwin.closeloop.bases import LogDistanceBase
 from radiotwin.closeloop.criteria import SelectionCriteria
@@ -11,8 +12,11 @@ from radiotwin.closeloop.hypotheses import Hypotheses
 from radiotwin.closeloop.posterior import NONE, OTHER, features, judge, probability_of
 from radiotwin.closeloop.scoring import CandidateScore
 from radiotwin.closeloop.sensitivity import detectable, needed_nats
+from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.fitting import add_effect
 from radiotwin.effects.gain_offsets import ReceiverGainOffset
+from radiotwin.effects.position_errors import DevicePositionError
+from radiotwin.inference.correlated_evidence import Columns
 from radiotwin.links import prepare_links
 
 CRITERIA = SelectionCriteria()
@@ -36,6 +40,44 @@ def test_evidence_for_an_offset_that_is_there_and_none_for_one_that_is_not(open_
         model, hypotheses = looked_at(open_ground, 2, change)
         found = add_effect(model.whole, ReceiverGainOffset(), model.fits[0])
         assert low < hypotheses.of_named(*found) < high
+
+
+def late(world):
+    """Write the levels of receiver 1 beside the positions of three seconds before."""
+    mine = np.flatnonzero((world.receiver == 1) & (world.slot >= 3))
+    world.receiver_m[mine] = world.receiver_m[mine - 3 * len(world.device_m)].copy()
+
+
+def moved(world):
+    """Declare an anchor 25 m from where it is."""
+    world.device_m[1, 0] += 25.0
+
+
+@pytest.mark.parametrize("effect, change", [(ReceiverClockOffset(), late), (DevicePositionError(), moved)])
+@pytest.mark.parametrize("seed", range(5))
+def test_evidence_is_that_of_all_numbers_an_effect_may_have(open_ground, monkeypatch, effect, change, seed):
+    model, hypotheses = looked_at(open_ground, seed, change)
+    found, fit = add_effect(model.whole, effect, model.fits[0])
+    by_laplace = hypotheses.of_named(found, fit)
+    monkeypatch.setattr("radiotwin.closeloop.hypotheses._slopes",
+                        lambda model, fit: Columns(np.zeros((int(model.train.sum()), 0)), np.zeros(0)))
+    applied = found.effects[-1]
+    varied = effect.variation(applied.params)
+
+    def nats(numbers):
+        other = found.with_effects([found.apply(effect, varied.params(numbers))])
+        return hypotheses.of_named(other, other.fit(fit))
+
+    # Of a uniform prior: the sum over a grid around the best, wide enough to hold what is likely.
+    best, reach = nats(varied.values), []
+    for axis in np.eye(len(varied.values)):
+        sizes = varied.steps @ axis * np.geomspace(0.02, 12.0, 30)
+        reach.append(next(size for size in sizes if all(
+            nats(varied.values + sign * size * axis) < best - 6 for sign in (-1, 1))))
+    axes = [value + side * np.linspace(-1, 1, 15) for value, side in zip(varied.values, reach)]
+    grid = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, len(axes))
+    cell = np.prod([axis[1] - axis[0] for axis in axes]) / np.prod(varied.high - varied.low)
+    assert by_laplace == pytest.approx(logsumexp([nats(each) for each in grid]) + np.log(cell), abs=3.0)
 
 
 def test_what_depends_on_time_alone_is_more_likely_without_a_name(open_ground):

@@ -5,6 +5,7 @@ import pytest
 from scipy.spatial.distance import cdist
 from scipy.stats import multivariate_normal
 
+from radiotwin.inference import correlated_evidence
 from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
 
 NOTHING = Columns(np.zeros((240, 0)), np.zeros(0))
@@ -70,12 +71,30 @@ def test_information_is_twice_the_expected_log_likelihood_ratio():
     assert np.mean(gains) == pytest.approx(0.5 * 0.4**2 * information, rel=0.25)
 
 
-def test_long_series_are_thinned_and_blank_rows_are_left_out():
+def test_long_series_are_thinned_and_cut_into_parts_and_blank_rows_are_left_out(monkeypatch):
+    monkeypatch.setattr(correlated_evidence, "MAX_ROWS", 1000)
     rng = np.random.default_rng(2)
     position_m, z = rng.uniform(0, 300, (5000, 3)), rng.normal(size=5000)
     z[::3] = np.nan
     evidence = CorrelatedEvidence.fit(np.zeros(5000, dtype=int), position_m, z, Columns(np.zeros((5000, 0)), np.zeros(0)), 0)
-    assert len(evidence.rows) == 500 and np.isfinite(z[evidence.rows]).all()
+    assert len(evidence.rows) == len(set(evidence.rows)) == 1000 and np.isfinite(z[evidence.rows]).all()
+    assert [part.stop - part.start for part in evidence.parts] == [250] * 4
+    extent_m = [np.prod(np.ptp(position_m[evidence.rows[part]], axis=0)) for part in evidence.parts]
+    assert np.sum(extent_m) < 1.05 * 300.0**3  # parts are boxes beside each other
+
+
+def test_a_series_in_parts_is_worth_nearly_what_it_is_in_one(monkeypatch):
+    found = []
+    for most in (400, 40):
+        monkeypatch.setattr(correlated_evidence, "MAX_POINTS", most)
+        rng = np.random.default_rng(3)
+        label, position_m, z = field(rng, 1.0, 20.0)
+        pattern = rng.normal(size=(240, 1))
+        evidence = CorrelatedEvidence.fit(label, position_m, z + 0.5 * pattern[:, 0], NOTHING, 0)
+        own = Columns(pattern, np.ones(1))
+        found.append(evidence.log_evidence(z + 0.5 * pattern[:, 0], own)
+                     - evidence.log_evidence(z + 0.5 * pattern[:, 0], NOTHING))
+    assert found[0] > 5 and found[1] == pytest.approx(found[0], rel=0.2)
 
 
 def test_nothing_to_look_at_is_no_evidence():
