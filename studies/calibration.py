@@ -20,13 +20,13 @@ from radiotwin import close_loop
 from radiotwin.closeloop import posterior
 from radiotwin.closeloop.scoring import CandidateScore
 from radiotwin.files import atomic_path
+from studies.foreign_roc import undeclared_besides
 from studies.runner import RECORDS, Study, read_rows
 from studies.tables import markdown
 from tests.undeclared.cases import FAMILIES, OUTSIDE, case, stored
 from tests.undeclared.foreign.cases import foreign_case, names
 
 KNOWN_SEEDS = (1, 2)  # of the traced cities' cases
-LIMITS_DIFFER_DB = 2.0  # between receivers: then a limit of its own is no false name
 PHYSICS = ("wall_reflection", "diffraction")  # in every traced world
 # Prior: log-odds rise with each feature; few cases do not show otherwise.
 MEAN, SD = (0.4, 0.3, 0.5, 0.1, 0.2), 0.2
@@ -49,10 +49,11 @@ def candidates_of(seed: int, settings: dict) -> dict:
         warnings.simplefilter("ignore")
         loop = close_loop(hidden.measurements, hidden.scene, seed=seed)
     right = {each["name"] for each in hidden.answer["effects"]}
+    nuisance = hidden.answer.get("nuisance")  # of a foreign case
     return {
         "hidden": [[each["name"], each.get("in_catalogue", family not in OUTSIDE)]
                    for each in hidden.answer["effects"]],
-        "open": sorted(_undeclared_besides(hidden.answer.get("nuisance")) - right),
+        "open": sorted(undeclared_besides(nuisance) - right) if nuisance else [],
         "named": [each.effect.name for each in loop.after.whole.effects],
         "candidates": [[*_row(score), score.name in right] for score in loop.selection.scores
                        if score.features],
@@ -60,16 +61,6 @@ def candidates_of(seed: int, settings: dict) -> dict:
                                and score.step == step.number)]),
                    max([0.0, *step.unnamed_nats.values()]), step.rest_db, step.noise_db]
                   for step in loop.selection.steps]}
-
-
-def _undeclared_besides(nuisance: dict | None) -> set[str]:
-    """Return names that are true of what no foreign campaign declares right: neither counts."""
-    if nuisance is None:
-        return set()
-    names = {"missing_obstacle": nuisance["unmapped"], "removed_obstacle": nuisance["gone"],
-             "noise_floor_censoring": nuisance["declared"] == "wrong"
-             or np.ptp(nuisance["limit_db"]) > LIMITS_DIFFER_DB}
-    return {name for name, there in names.items() if there}
 
 
 def _row(score: CandidateScore) -> list:

@@ -18,12 +18,13 @@ from radiotwin.closeloop.bases import make_bases
 from radiotwin.closeloop.cross_validation import cross_validate, training_parts
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.links import prepare_links
-from studies.foreign_table import PHYSICS, UNNAMED, foreign_figures, foreign_table
+from studies.foreign_figures import foreign_figures
+from studies.foreign_roc import COLUMNS, LIMITS_DIFFER_DB
+from studies.foreign_table import PHYSICS, UNNAMED, foreign_table
 from studies.runner import Study
 from tests.undeclared.foreign.cases import ForeignCase, families, foreign_case, names, split_of
 
 NEAR_M = 25.0  # of a building that the map lacks or shows by mistake: a box there is no false name
-LIMITS_DIFFER_DB = 2.0
 NONE, OTHER = "none", "not in the catalogue"
 
 
@@ -58,17 +59,14 @@ def close_foreign(seed: int, settings: dict) -> dict:
                        for name, probability in _first_posterior(report)],
         "parameters": [each for truth in hidden.answer["effects"]
                        for each in compared(truth, effects, hidden)],
-        **{when: {name: error[when][name] for name in ("rmse_db", "bias_db", "nll")}
-           for when in ("before", "after")},
+        "seen": [sizes for truth in hidden.answer["effects"]
+                 for sizes in _sizes(truth, hidden, report["detectable"])],
+        **{when: {name: error[when].get(name) for name in ("rmse_db", "bias_db", "nll")}
+           for when in ("before", "after", "combined")},
         "oracle_rmse_db": oracle_rmse_db,
         "baselines": {name: each["rmse_db"] for name, each in report["baselines"].items()},
-        "candidates": [[each.get(key) for key in CANDIDATE] for each in report["candidates"]
+        "candidates": [[each.get(key) for key in COLUMNS] for each in report["candidates"]
                        if each["heldout_nll_gain"] is not None]}
-
-
-CANDIDATE = ("step", "name", "heldout_nll_gain", "p_value", "heldout_rmse_db", "kept",
-             "evidence_nats", "features", "probability")
-"""What a row keeps of each candidate, in this order: criteria are calibrated on it."""
 
 
 def _plain(nuisance: dict) -> dict:
@@ -190,6 +188,24 @@ def _true_parameters(truth: dict, hidden: ForeignCase) -> dict[str, Any]:
         "episode": lambda: {"loss_db": truth["loss_db"], "start_s": truth["start_s"],
                             "end_s": truth["end_s"]},
     }.get(truth["name"], dict)()
+
+
+def _sizes(truth: dict, hidden: ForeignCase, detectable: list[dict]) -> Iterator[list]:
+    """Yield the name of an effect, its size, and the least size that would have been named."""
+    size = {"receiver_gain_offset": "offset_db", "device_gain_offset": "offset_db",
+            "antenna_pattern": "front_to_back_db", "excess_attenuation": "per_km_db",
+            "body_shadowing": "depth_db", "episode": "loss_db", "faulty_flight": "offset_db"
+            }.get(truth["name"])
+    value = truth.get(size or "")
+    if truth["name"].endswith("_drift"):
+        value = next(iter(_course(truth).values()))
+    elif truth["name"] == "device_position_error":
+        device = list(hidden.measurements.devices["device"]).index(truth["device"])
+        written_m = hidden.measurements.devices[["x_m", "y_m"]].to_numpy(float)[device]
+        value = float(np.linalg.norm(np.array(truth["true_m"][:2]) - written_m))
+    least = [each["size"] for each in detectable if each["name"] == truth["name"]]
+    if value is not None and least and least[0] is not None:
+        yield [truth["name"], abs(value), least[0]]
 
 
 def _course(truth: dict) -> dict[str, Any]:

@@ -6,10 +6,9 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 
-from marl.figures import COLOURS
-from studies.tables import make_panels, markdown, number, with_legend
+from studies.foreign_roc import detection_rates
+from studies.tables import markdown, number
 
 UNNAMED = frozenset({"correlated_shadowing", "unexplained_trend"})  # these explain nothing
 PHYSICS = frozenset({"wall_reflection", "diffraction"})  # of every traced world
@@ -31,12 +30,17 @@ def foreign_table(rows: pd.DataFrame) -> str:
                  _family_lines([part for _, part in splits]), "By family",
                  f" (first of cases; missed although of {NOTICEABLE_DB:g} dB and more; true "
                  "parameters in their 90 % intervals)"),
+        markdown(["hidden", *(f"{split}: {head}" for split, _ in splits for head in ROC_HEADS)],
+                 _roc_lines([part for _, part in splits]), "False alarms",
+                 " (share of the cases with an effect in which its score is higher than in all but "
+                 "1 % or 5 % of the cases without it)"),
         markdown(["case", "hidden (size [dB])", "verdict", "named (probability)", "before [dB]",
-                  "after", "oracle", "best baseline"],
+                  "after", "combined", "oracle", "best baseline"],
                  [_case_line(row) for row in rows.itertuples()], "Case by case")])
 
 
 FAMILY_HEADS = ("first", "missed", "in intervals")
+ROC_HEADS = ("probability, 1 %", "5 %", "held-out likelihood alone, 1 %", "5 %")
 
 
 def physical(row: Any) -> list[tuple[str, float | None]]:
@@ -73,8 +77,9 @@ def _figures_of(rows: list[Any]) -> dict[str, str]:
     outside = [row for row in rows if row.hidden and not in_catalogue(row)]
     mixed = [row for row in rows if row.hidden and row not in known and row not in outside]
     nulls = [row for row in rows if not row.hidden]
-    held = [each for row in rows for each in row.parameters if _has_interval(each)]
-    best = [(row.after["rmse_db"], min(row.baselines.values())) for row in rows if row.baselines]
+    held = [each for row in rows for each in row.parameters if has_interval(each)]
+    best = [(row.combined["rmse_db"], min(row.baselines.values())) for row in rows if row.baselines]
+    seen = [(name in row.named, size >= least) for row in rows for name, size, least in row.seen]
     return {
         "right first, of cases of the catalogue": _share(map(is_first, known)),
         f"… of those of {NOTICEABLE_DB:g} dB and more": _share(
@@ -87,10 +92,13 @@ def _figures_of(rows: list[Any]) -> dict[str, str]:
             bool(false_names(row, CONFIDENT)) for row in nulls),
         f"not in the catalogue, given a cause with {CONFIDENT:g} and more": _share(
             bool(false_names(row, CONFIDENT)) for row in outside),
-        "true parameters in their 90 % intervals": _share(map(_holds, held)),
+        "true parameters in their 90 % intervals": _share(map(holds, held)),
+        "named, of effects as large as would have been seen": _share(
+            named for named, large in seen if large),
+        "named, of smaller ones": _share(named for named, large in seen if not large),
         "error after / oracle, median": _ratio(
             [(row.after["rmse_db"], row.oracle_rmse_db) for row in rows]),
-        "error after / best baseline, median": _ratio(best),
+        "combined prediction / best baseline, median": _ratio(best),
         "cases where a baseline is better by 2 % and more": _share(
             after > 1.02 * other for after, other in best)}
 
@@ -105,12 +113,14 @@ def _ratio(pairs: list[tuple[float, float]]) -> str:
     return f"{np.median(ratios):.2f}" if ratios else "–"
 
 
-def _has_interval(parameter: dict) -> bool:
+def has_interval(parameter: dict) -> bool:
+    """Return whether a reported parameter has an interval that is wider than nothing."""
     return (parameter["determined"] and None not in (parameter["low"], parameter["high"])
             and parameter["low"] < parameter["high"])
 
 
-def _holds(parameter: dict) -> bool:
+def holds(parameter: dict) -> bool:
+    """Return whether its interval holds the truth."""
     return parameter["low"] <= parameter["truth"] <= parameter["high"]
 
 
@@ -147,8 +157,8 @@ def _family_lines(parts: list[pd.DataFrame]) -> list[list[str]]:
             name = {"sector_antenna": "antenna_pattern", "tilted_dipole": "antenna_pattern",
                     "noise_floor": "noise_floor_censoring"}.get(family, family)
             alone = [row for row in its if len(row.families) == 1]
-            held = [_holds(each) for row in its for each in row.parameters
-                    if each["name"] == name and _has_interval(each)]
+            held = [holds(each) for row in its for each in row.parameters
+                    if each["name"] == name and has_interval(each)]
             known = any(name in in_catalogue(row) for row in its)
             missed = [row for row in alone if row.size_db >= NOTICEABLE_DB
                       and name not in row.named]
@@ -158,6 +168,14 @@ def _family_lines(parts: list[pd.DataFrame]) -> list[list[str]]:
     return lines
 
 
+def _roc_lines(parts: list[pd.DataFrame]) -> list[list[str]]:
+    found = [detection_rates(part) for part in parts]
+    names = sorted({name for each in found for name in each})
+    return [[f"`{name}`" if name != "all" else "all", *(
+        number(share, 2) for each in found
+        for share in each.get(name, (None,) * len(ROC_HEADS)))] for name in names]
+
+
 def _case_line(row: Any) -> list[str]:
     hidden = ", ".join(each["name"] for each in row.hidden) or "nothing"
     named = [name if probability is None else f"{name} ({probability:.2f})"
@@ -165,36 +183,4 @@ def _case_line(row: Any) -> list[str]:
     best = min(row.baselines.values(), default=None)
     return [row.name, f"{hidden} ({row.size_db:.1f})", row.verdict, ", ".join(named) or "–",
             *(number(each, 2) for each in (row.before["rmse_db"], row.after["rmse_db"],
-                                           row.oracle_rmse_db, best))]
-
-
-def foreign_figures(rows: pd.DataFrame) -> dict[str, Figure]:
-    """Draw how often what was said with a probability is true, and coverage by family."""
-    figure, (left, right) = make_panels(2, 2, 4.2)
-    left.plot([0, 1], [0, 1], color="black", linewidth=0.8, label="calibrated")
-    held: dict[str, dict[str, list[bool]]] = {}
-    for index, split in enumerate(SPLITS):
-        part = rows[rows["split"] == split]
-        points = [each for each in reliability(part) if each[2]]
-        if points:
-            given, true, count = np.array(points).T
-            error = np.sqrt(np.maximum(true * (1 - true), 0.25 / count) / count)
-            left.errorbar(given, true, error, marker="os"[index], color=COLOURS[index],
-                          capsize=2, label=split)
-        for each in (each for listed in part["parameters"] for each in listed):
-            if _has_interval(each):
-                held.setdefault(each["name"], {}).setdefault(split, []).append(_holds(each))
-    left.set(xlabel="probability given", ylabel="share of statements that are true",
-             xlim=(-0.02, 1.02), ylim=(-0.02, 1.02))
-    families = sorted(held, reverse=True)
-    for index, split in enumerate(SPLITS):
-        shares = np.array([np.mean(held[name][split]) if split in held[name] else np.nan
-                           for name in families])
-        right.barh(np.arange(len(families)) + 0.2 - 0.4 * index, shares, 0.38,
-                   color=COLOURS[index], label=split)
-    right.axvspan(0.8, 0.97, color="black", alpha=0.1, linewidth=0, zorder=0, label="80 to 97 %")
-    right.set_yticks(range(len(families)), families, fontsize="small")
-    right.set(xlabel="true parameters in their 90 % intervals", xlim=(0, 1.02))
-    for axes in (left, right):
-        axes.grid(alpha=0.3)
-    return {"foreign": with_legend(figure, [left, right], 4)}
+                                           row.combined["rmse_db"], row.oracle_rmse_db, best))]

@@ -2,10 +2,11 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pandas as pd
 import pytest
 
-from studies import foreign, foreign_table
+from studies import foreign, foreign_figures, foreign_roc, foreign_table
 
 NUISANCE = {"unmapped": [[[0, 0], [10, 0], [10, 10], [0, 10]]], "gone": [], "declared": "silent", "limit_db": [-100.0, -100.5],
             "sent_dbm": 20.0}
@@ -20,12 +21,15 @@ def effect(name, **values):
                                          for key, value in values.items()}}
 
 
-def row(name, hidden, named, *, split="judge", size_db=2.0, tolerated=(), parameters=(), statements=(), families=()):
+def row(name, hidden, named, *, split="judge", size_db=2.0, tolerated=(), parameters=(), statements=(), families=(),
+        candidates=(), seen=()):
     errors = {"rmse_db": 3.0, "bias_db": 0.0, "nll": 2.5}
     return {"name": name, "split": split, "hidden": hidden, "size_db": size_db, "verdict": "effect", "named": list(named),
             "probabilities": list(named.values()), "tolerated": list(tolerated), "parameters": list(parameters),
             "statements": list(statements), "families": list(families), "before": errors | {"rmse_db": 4.0},
-            "after": errors, "oracle_rmse_db": 2.5, "baselines": {"log_distance": 9.0, "kriging": 3.1}}
+            "after": errors, "combined": errors, "seen": list(seen), "nuisance": NUISANCE | {"unmapped": 0, "gone": 0},
+            "candidates": [[1, name, nats, 0.01, 3.0, False, nats / 10, [], probability]
+                           for name, nats, probability in candidates], "oracle_rmse_db": 2.5, "baselines": {"log_distance": 9.0, "kriging": 3.1}}
 
 
 def test_offsets_are_compared_relative_to_the_receiver_that_the_report_takes():
@@ -33,7 +37,7 @@ def test_offsets_are_compared_relative_to_the_receiver_that_the_report_takes():
     said = effect("receiver_gain_offset", **{"offset_db[r2]": -3.5})
     said["parameters"]["offset_db[r1]"] = {"value": 0.0, "low": 0.0, "high": 0.0, "unit": "dB"}
     (found,) = foreign.compared(hidden, [said], case(hidden))
-    assert found["truth"] == -4.0 and found["value"] == -3.5 and foreign_table._holds(found)
+    assert found["truth"] == -4.0 and found["value"] == -3.5 and foreign_table.holds(found)
     assert foreign.compared(hidden, [], case(hidden)) == []
 
 
@@ -46,7 +50,7 @@ def test_levels_are_compared_in_the_units_of_the_table_and_angles_around_the_cir
     said = effect("antenna_pattern", **{"azimuth_deg[d1]": 0.2})
     said["parameters"]["azimuth_deg[d1]"]["unit"] = "deg"
     (found,) = foreign.compared(sector, [said], case(sector))
-    assert found["truth"] == pytest.approx(-0.5) and foreign_table._holds(found)
+    assert found["truth"] == pytest.approx(-0.5) and foreign_table.holds(found)
 
 
 def test_a_building_that_the_map_lacks_by_mistake_is_no_false_name():
@@ -69,7 +73,8 @@ def test_the_table_counts_what_was_said():
             "determined": True}
     rows = pd.DataFrame([
         row("judge/a", [foliage], {"wall_reflection": 0.9, "foliage": 0.95, "interference": 0.6}, families=["foliage"],
-            parameters=[held], statements=[["foliage", 0.95, True], ["interference", 0.6, False]]),
+            parameters=[held], statements=[["foliage", 0.95, True], ["interference", 0.6, False]],
+            candidates=[("foliage", 90.0, 0.95), ("interference", 30.0, 0.6)], seen=[["foliage", 6.0, 4.0]]),
         row("judge/b", [], {"missing_obstacle": 0.97, "correlated_shadowing": None}, tolerated=["missing_obstacle"]),
         row("judge/c", [{"name": "warm_front", "in_catalogue": False}], {"excess_attenuation": None},
             families=["warm_front"])])
@@ -77,7 +82,24 @@ def test_the_table_counts_what_was_said():
     for line in ("| right first, of cases of the catalogue | 1 of 1 |", "| false names a case of the catalogue | 1.00 |",
                  "| nulls that were given a cause | 0 of 1 |", "| not in the catalogue, given a cause with 0.9 and more | 1 of 1 |",
                  "| true parameters in their 90 % intervals | 1 of 1 |", "| error after / oracle, median | 1.20 |",
-                 "| 0.9 to 0.97 | 100% of 1 |", "| `foliage` | 1 of 1 | 0 | 1 of 1 |",
+                 "| 0.9 to 0.97 | 100% of 1 |", "| named, of effects as large as would have been seen | 1 of 1 |", "| `foliage` | 1 of 1 | 0 | 1 of 1 |",
                  "| `warm_front` | not in the catalogue | – | – |"):
         assert line in text, text
-    assert set(foreign_table.foreign_figures(rows)) == {"foreign"}
+    assert set(foreign_figures.foreign_figures(rows)) == {"foreign"}
+
+
+def test_effects_are_detected_at_the_false_alarms_that_the_others_give():
+    foliage = [{"name": "foliage", "in_catalogue": True}]
+    with_it = [row(f"judge/{i}", foliage, {}, candidates=[("foliage", 50.0 - 20 * i, 0.9 - 0.3 * i)]) for i in range(3)]
+    without = [row(f"judge/n{i}", [], {}, candidates=[("foliage", 20.0, 0.5)] if i == 0 else []) for i in range(20)]
+    table = foreign_roc.scored(pd.DataFrame(with_it + without), "probability")
+    assert table["there"].sum() == 3 and np.isneginf(table["score"]).sum() == 19
+    false, true = foreign_roc.curve(table["there"].to_numpy(), table["score"].to_numpy())
+    assert false.tolist() == [0, 0, 0, 0.05, 0.05] and true.tolist() == pytest.approx([0, 1 / 3, 2 / 3, 2 / 3, 1])
+    assert foreign_roc.detection_rates(pd.DataFrame(with_it + without))["foliage"] == pytest.approx((2 / 3, 1, 2 / 3, 1))
+
+
+def test_what_the_map_lacks_anyhow_is_neither_a_detection_nor_a_false_alarm():
+    assert foreign_roc.undeclared_besides(NUISANCE) == {"missing_obstacle"}
+    other = {"unmapped": 0, "gone": 1, "declared": "silent", "limit_db": [-100.0, -95.0]}
+    assert foreign_roc.undeclared_besides(other) == {"removed_obstacle", "noise_floor_censoring"}
