@@ -1,8 +1,8 @@
 """What evidence is worth: the loop on cases for calibration, and the regression upon it.
 
-The cases are those of the foreign cities for calibration, and some of those of the two traced
-cities whose maps are right within a survey's error (`tests/undeclared`); the others are left for
-the studies `hidden` and `null`.
+The cases are those of the foreign cities for calibration, with their maps and without; some of those
+of the two traced cities whose maps are right within a survey's error (`tests/undeclared`), the
+others of which are left for the studies `hidden` and `null`; and campaigns over open ground.
 
     python -m studies calibration --resume      # rows: the loop on each case
     python -m studies.calibration               # rows -> radiotwin/closeloop/calibration.json
@@ -23,8 +23,9 @@ from radiotwin.files import atomic_path
 from studies.foreign_roc import undeclared_besides
 from studies.runner import RECORDS, Study, read_rows
 from studies.tables import markdown
-from tests.undeclared.cases import FAMILIES, OUTSIDE, case, stored
-from tests.undeclared.foreign.cases import foreign_case, names
+from tests.undeclared.cases import FAMILIES, OUTSIDE, Case, case, stored
+from tests.undeclared.foreign.cases import ForeignCase, foreign_case, names
+from tests.undeclared.open_ground import CASES, OpenCase, open_case
 
 KNOWN_SEEDS = (1, 2)  # of the traced cities' cases
 PHYSICS = ("wall_reflection", "diffraction")  # in every traced world
@@ -35,32 +36,46 @@ PATH = Path(posterior.__file__).with_name("calibration.json")
 
 
 def calibration_cases(seed: int) -> dict[str, dict]:
-    """Return all cases for calibration, by `city00-w0-c0` or `foliage:1`; seed 0 only."""
+    """Return all cases: `city00-w0-c0`, with `-no-map`, `foliage:1`, `open:7`; seed 0 only."""
+    if seed:
+        return {}
     known = [f"{family}:{number}" for number in KNOWN_SEEDS for family in (*FAMILIES, *OUTSIDE)
              if stored(family, number)]
-    return {} if seed else {name: {"case": name} for name in (*names("calibrate"), *known)}
+    named = [*names("calibrate"), *known, *(f"open:{number}" for number in range(CASES))]
+    return {name: {"case": name, "map": True} for name in named} | {
+        f"{name}-no-map": {"case": name, "map": False} for name in names("calibrate")}
 
 
 def candidates_of(seed: int, settings: dict) -> dict:
     """Close the loop on a case, and keep what every candidate's probability depends on."""
     family, _, number = settings["case"].partition(":")
-    hidden = case(family, int(number)) if number else foreign_case(settings["case"])
+    hidden = _case(family, number)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        loop = close_loop(hidden.measurements, hidden.scene, seed=seed)
+        scene = hidden.scene if settings["map"] else None
+        loop = close_loop(hidden.measurements, scene, seed=seed)
     right = {each["name"] for each in hidden.answer["effects"]}
     nuisance = hidden.answer.get("nuisance")  # of a foreign case
+    undeclared = undeclared_besides(nuisance) if nuisance else set()
+    if not settings["map"]:
+        undeclared |= {"missing_obstacle", "removed_obstacle"}
     return {
         "hidden": [[each["name"], each.get("in_catalogue", family not in OUTSIDE)]
                    for each in hidden.answer["effects"]],
-        "open": sorted(undeclared_besides(nuisance) - right) if nuisance else [],
+        "open": sorted(undeclared - right),
         "named": [each.effect.name for each in loop.after.whole.effects],
         "candidates": [[*_row(score), score.name in right] for score in loop.selection.scores
                        if score.features],
         "steps": [[max([0.0, *(score.nats for score in loop.selection.scores if score.features
                                and score.step == step.number)]),
-                   max([0.0, *step.unnamed_nats.values()]), step.rest_db, step.noise_db]
+                   step.best_unnamed, step.rest_db, step.noise_db]
                   for step in loop.selection.steps]}
+
+
+def _case(family: str, number: str) -> Case | ForeignCase | OpenCase:
+    if family == "open":
+        return open_case(int(number))
+    return case(family, int(number)) if number else foreign_case(family)
 
 
 def _row(score: CandidateScore) -> list:

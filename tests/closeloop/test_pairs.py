@@ -1,0 +1,47 @@
+"""Two effects that are probable together."""
+
+import pytest
+
+from radiotwin.closeloop.bases import LogDistanceBase
+from radiotwin.closeloop.criteria import SelectionCriteria
+from radiotwin.closeloop.cross_validation import cross_validate, training_parts
+from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.selection import SelectionResult, forward_selection
+from radiotwin.effects.gain_offsets import ReceiverGainOffset
+from radiotwin.effects.position_errors import DevicePositionError
+from radiotwin.links import prepare_links
+
+
+@pytest.fixture
+def selected(open_ground):
+    """Function that declares anchors away from where they are, and selects with a probability that is needed."""
+    def run(moved_m, min_probability):
+        world = open_ground.fly(2)
+        for device, east_m in moved_m.items():
+            world.device_m[device, 0] += east_m
+        links = prepare_links(open_ground.measured(world), None)
+        folds = make_folds(links, 0)
+        model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
+        result = SelectionResult(model, SelectionCriteria(min_probability=min_probability))
+        forward_selection(result, [DevicePositionError(), ReceiverGainOffset()], 0, lambda _: None)
+        return result
+    return run
+
+
+def best_alone(result):
+    return max(score.probability for score in result.scores if score.probability == score.probability)
+
+
+def test_two_anchors_of_which_none_is_probable_alone_are_named_together(selected):
+    moved_m = {1: 25.0, 3: -25.0}
+    needed = best_alone(selected(moved_m, 1.0)) + 0.005
+    result = selected(moved_m, needed)
+    assert {each.params.device for each in result.model.whole.effects} == set(moved_m)
+    kept = [score for score in result.scores if score.kept]
+    assert len(kept) == len(result.rivals) == 2 and {score.reason for score in kept} == {""}
+    assert all(score.probability >= needed for score in kept)
+
+
+def test_one_anchor_has_no_second_beside_it(selected):
+    needed = best_alone(selected({1: 25.0}, 1.0)) + 0.005
+    assert selected({1: 25.0}, needed).model.whole.effects == []
