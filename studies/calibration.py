@@ -1,8 +1,8 @@
 """What evidence is worth: the loop on cases for calibration, and the regression upon it.
 
-The cases are those of the foreign cities for calibration, with their maps and without; some of those
-of the two traced cities whose maps are right within a survey's error (`tests/undeclared`), the
-others of which are left for the studies `hidden` and `null`; and campaigns over open ground.
+The cases are those of the foreign cities for calibration, with their maps and without; some of
+those of the two traced cities whose maps are right within a survey's error (`tests/undeclared`),
+the others of which are left for the studies `hidden` and `null`; and campaigns over open ground.
 
     python -m studies calibration --resume      # rows: the loop on each case
     python -m studies.calibration               # rows -> radiotwin/closeloop/calibration.json

@@ -44,18 +44,18 @@ class _World:
     level_db: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property
-    def away_m(self):
+    def away_m(self) -> np.ndarray:
         return self.place_m - self.device_m[self.device]
 
-    def pick(self, label):
+    def pick(self, label: np.ndarray) -> np.ndarray:
         """Return the mask of the readings of one of the labels (n,)."""
         return label == self.rng.choice(np.unique(label))
 
-    def size_db(self, low=1.0, high=9.0):
-        return self.rng.choice([-1, 1]) * np.exp(self.rng.uniform(np.log(low), np.log(high)))
+    def size_db(self, low: float = 1.0, high: float = 9.0) -> float:
+        return float(self.rng.choice([-1, 1]) * np.exp(self.rng.uniform(np.log(low), np.log(high))))
 
 
-def _campaign(rng):
+def _campaign(rng: np.random.Generator) -> _World:
     side_m, devices, receivers = rng.uniform(300, 900), rng.integers(4, 9), rng.integers(1, 4)
     flights, slots = rng.integers(3, 9), rng.integers(50, 121)
     rows = []
@@ -71,13 +71,13 @@ def _campaign(rng):
                 place = place + CRUISE_M_S * EVERY_S * np.array([np.sin(heading), np.cos(heading)])
                 rows += [(flight, receiver, device, slot, slots * 1.5 * flight + slot * EVERY_S, *place, height)
                          for device in range(devices)]
-    flight, receiver, device, slot, time_s, *place = np.array(rows).T
+    flight, receiver, device, slot, time_s, *place_m = np.array(rows).T
     device_m = np.column_stack([rng.uniform(0, side_m, (devices, 2)), rng.uniform(1, 10, devices)])
     flight, receiver, device, slot = (each.astype(int) for each in (flight, receiver, device, slot))
-    return _World(rng, side_m, device_m, flight, receiver, device, slot, time_s, np.column_stack(place))
+    return _World(rng, side_m, device_m, flight, receiver, device, slot, time_s, np.column_stack(place_m))
 
 
-def _shadowing_db(at):
+def _shadowing_db(at: _World) -> np.ndarray:
     """Return a field (n,) for each device whose correlation falls exponentially with the distance."""
     sd_db, length_m = at.rng.choice([0.0, 1.0, 2.5, 5.0, 8.0]), np.exp(at.rng.uniform(np.log(6), np.log(80)))
     result = np.zeros(len(at.device))
@@ -90,38 +90,38 @@ def _shadowing_db(at):
     return result
 
 
-def _receiver_gain_offset(at):
+def _receiver_gain_offset(at: _World) -> None:
     at.level_db[at.pick(at.receiver)] += at.size_db()
 
 
-def _device_gain_offset(at):
+def _device_gain_offset(at: _World) -> None:
     at.level_db[at.pick(at.device)] += at.size_db()
 
 
-def _receiver_drift(at):
+def _receiver_drift(at: _World) -> None:
     mine, lasts_s = at.pick(at.receiver), at.rng.uniform(0.1, 0.4) * np.ptp(at.time_s)
     at.level_db[mine] += at.size_db(2.0, 10.0) * np.exp(-(at.time_s[mine] - at.time_s.min()) / lasts_s)
 
 
-def _device_drift(at):
+def _device_drift(at: _World) -> None:
     when_s = at.rng.uniform(0.3, 0.7) * np.ptp(at.time_s)
     at.level_db[at.pick(at.device) & (at.time_s > when_s)] += at.size_db()
 
 
-def _antenna_pattern(at):
+def _antenna_pattern(at: _World) -> None:
     mine, turned = at.pick(at.device), at.rng.uniform(0, 2 * np.pi)
     east, north, _ = at.away_m[mine].T
     forward = 0.5 + 0.5 * np.cos(np.arctan2(east, north) - turned)
     at.level_db[mine] -= abs(at.size_db(4.0, 25.0)) * (1 - forward ** at.rng.uniform(0.7, 3.0))
 
 
-def _episode(at):
+def _episode(at: _World) -> None:
     mine, length_s = at.pick(at.receiver), at.rng.uniform(0.08, 0.25) * np.ptp(at.time_s)
     start_s = at.rng.uniform(0.1, 0.9 - length_s / np.ptp(at.time_s)) * np.ptp(at.time_s)
     at.level_db[mine & (at.time_s > start_s) & (at.time_s < start_s + length_s)] -= abs(at.size_db(3.0, 15.0))
 
 
-def _faulty_flight(at):
+def _faulty_flight(at: _World) -> None:
     flown = np.unique(np.column_stack([at.receiver, at.flight]), axis=0)
     receivers, counts = np.unique(flown[:, 0], return_counts=True)
     mine = at.receiver == at.rng.choice(receivers[counts >= min(3, counts.max())])
@@ -132,32 +132,32 @@ def _faulty_flight(at):
         at.level_db[mine] += at.rng.normal(0, at.rng.uniform(4, 10), mine.sum())
 
 
-def _interference(at):
+def _interference(at: _World) -> None:
     place_m = np.r_[at.rng.uniform(0, at.side_m, 2), 10.0]
     away_m = np.maximum(np.linalg.norm(at.place_m - place_m, axis=1), 5.0)
     noise_db = np.quantile(at.level_db, at.rng.uniform(0.3, 0.8)) - 20 * np.log10(away_m / (0.2 * at.side_m))
     at.level_db[:] = 10 * np.log10(10 ** (at.level_db / 10) + 10 ** (noise_db / 10))
 
 
-def _receiver_saturation(at):
+def _receiver_saturation(at: _World) -> None:
     mine = at.pick(at.receiver)
     most_db = np.quantile(at.level_db[mine], at.rng.uniform(0.4, 0.85))
     over_db = np.maximum(at.level_db[mine] - most_db, 0)
     at.level_db[mine] -= over_db - 3 * np.log1p(over_db / 3) * 0.5
 
 
-def _wander(at):
+def _wander(at: _World) -> None:
     mine = at.pick(at.receiver)
     at.level_db[mine] += at.size_db(2.0, 8.0) * np.sin(2 * np.pi * at.time_s[mine] / at.rng.uniform(60, 300))
 
 
-def _lobes(at):
+def _lobes(at: _World) -> None:
     mine = at.pick(at.device)
     up = np.arctan2(at.away_m[mine, 2], np.linalg.norm(at.away_m[mine, :2], axis=1))
     at.level_db[mine] += abs(at.size_db(3.0, 9.0)) * np.sin(at.rng.uniform(10, 40) * up + at.rng.uniform(0, 6))
 
 
-def _lorry(at):
+def _lorry(at: _World) -> None:
     mine, towards = at.pick(at.device), at.rng.uniform(0, 2 * np.pi)
     hidden = np.cos(np.arctan2(at.away_m[:, 0], at.away_m[:, 1]) - towards) > np.cos(at.rng.uniform(0.2, 0.6))
     when_s = at.rng.uniform(0.3, 0.6) * np.ptp(at.time_s)
@@ -201,7 +201,8 @@ def open_case(number: int) -> OpenCase:
                     {"effects": [{"name": name, "in_catalogue": name not in OUTSIDE}] if name else []})
 
 
-def _measured(at, written_m, declared_m, keep, rng):
+def _measured(at: _World, written_m: np.ndarray, declared_m: np.ndarray, keep: np.ndarray,
+              rng: np.random.Generator) -> Measurements:
     step_db = rng.choice([0.1, 0.25, 1.0])
     level_db = np.round(at.level_db / step_db) * step_db
     limit_db = np.quantile(level_db, rng.choice([0.0, 0.05, 0.2]))
