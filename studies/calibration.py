@@ -29,9 +29,10 @@ from tests.undeclared.open_ground import CASES, OpenCase, open_case
 
 KNOWN_SEEDS = (1, 2)  # of the traced cities' cases
 PHYSICS = ("wall_reflection", "diffraction")  # in every traced world
-# Prior: log-odds rise with each feature; few cases do not show otherwise.
-MEAN, SD = (0.4, 0.3, 0.5, 0.1, 0.2), 0.2
-NAME_SD, NOTHING_SD = 0.5, 1.0  # of a name's own intercept, and of the weights of "nothing"
+# Prior: log-odds rise with each feature but the last; few cases do not show otherwise.
+MEAN, SD = (0.4, 0.3, 0.5, 0.1, 0.2, -0.5), (0.2, 0.2, 0.2, 0.2, 0.2, 0.4)
+RISES = (True, True, True, True, True, False)
+NAME_SD, NOTHING_SD = 0.7, 1.0  # of a name's own intercept, and of the weights of "nothing"
 PATH = Path(posterior.__file__).with_name("calibration.json")
 
 
@@ -103,8 +104,9 @@ def fitted(rows: list[dict]) -> dict:
     own = table["name"].to_numpy()[:, None] == np.array(labels)
     p, q = values.shape[1], len(labels)
     effect = logistic(np.hstack([values, own]), table["right"].to_numpy(),
-                      np.r_[MEAN, np.zeros(q)], np.r_[np.full(p, SD), np.full(q, NAME_SD)],
-                      [(0.0, None)] * p + [(None, None)] * q)
+                      np.r_[MEAN, np.zeros(q)], np.r_[SD, np.full(q, NAME_SD)],
+                      [(0.0, None) if rises else (None, 0.0) for rises in RISES]
+                      + [(None, None)] * q)
     weights, shares = np.split(effect[1:], [p])
     without = [row["results"] for row in rows
                if not any(inside for _, inside in row["results"]["hidden"])]

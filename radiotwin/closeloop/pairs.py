@@ -69,7 +69,8 @@ def probable_pair(passed: Sequence[Passed], before: CrossValidatedModel, step: S
         others = [each.score.held_out_nats for each in ranked
                   if each.score.name not in (first.score.name, score.name)]
         probability = probability_of_both(first.score, score, max([0.0, *others]),
-                                          step.best_unnamed, before.rmse_db())
+                                          step.best_unnamed, before.rmse_db(),
+                                          step.rest_db / step.noise_db)
         if probability >= max([criteria.min_probability,
                                *(each.score.probability for each in found)]):
             found = [replace(first, score=replace(first.score, reason="", probability=probability)),

@@ -3,7 +3,8 @@
 Nats are worth what they turned out to be worth: a logistic regression, fitted on traced cases
 (`tests/undeclared`, of the foreign worlds the cities for calibration; `python -m studies foreign`
 judges it on the others), turns evidence beside a correlated rest, its lead over curves without a
-name, and what held-out links gain into a probability (Platt 1999, 'Probabilistic outputs for
+name, what held-out links gain, and how much of the rest belongs to places (a map that is wrong, or
+none) into a probability (Platt 1999, 'Probabilistic outputs for
 support vector machines'). Its few numbers are in `calibration.json`, made by
 `python -m studies.calibration`.
 """
@@ -24,6 +25,7 @@ from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.closeloop.hypotheses import Hypotheses
 from radiotwin.closeloop.scoring import CandidateScore
 
+LEAST_RATIO = 0.2  # of what belongs to places to noise; less is none
 NATS = 10.0  # evidence is linear up to about this, and logarithmic beyond
 NONE, OTHER = "none", "not in the catalogue"
 
@@ -64,7 +66,7 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
     """
     unnamed = hypotheses.unnamed_nats
     best_unnamed = max([0.0, *unnamed.values()])
-    before_db = model.rmse_db()
+    before_db, (rest_db, noise_db) = model.rmse_db(), hypotheses.sizes_db
     judged = []
     for score in scores:
         if score.gain_by_fold.size:
@@ -74,31 +76,34 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
             fall = np.log(before_db / score.rmse_db) if score.rmse_db > 0 else 0.0
             nats = (score.nats, score.nats - best_unnamed, held_out,
                     held_out - max([0.0, *others]))
-            score = replace(score, features=features(nats, float(np.nan_to_num(fall))))
+            score = replace(score, features=features(nats, float(np.nan_to_num(fall)),
+                                                     rest_db / noise_db))
             probability = probability_of(score.name, score.features)
             low = not score.reason and probability < criteria.min_probability
             why = (f"it is not probable enough ({probability:.2f}; "
                    f"{criteria.min_probability:g} is needed)")
             score = replace(score, probability=probability, reason=why if low else score.reason)
         judged.append(score)
-    rest_db, noise_db = hypotheses.sizes_db
     return judged, Step(len(model.whole.effects), unnamed, rest_db, noise_db,
                         _probabilities(judged, best_unnamed, rest_db, noise_db))
 
 
-def features(nats: tuple[float, float, float, float], rmse_fall: float) -> tuple[float, ...]:
-    """Return what a candidate's probability depends on, (5,).
+def features(nats: tuple[float, float, float, float], rmse_fall: float,
+             rest_over_noise: float) -> tuple[float, ...]:
+    """Return what a candidate's probability depends on, (6,).
 
     Args:
         nats: its evidence beside a correlated rest, its lead over the best curve without a name,
             its gain on held-out links, and its lead over the best other effect there [nats].
         rmse_fall: of held-out links, logarithm of the error without it over that with it.
+        rest_over_noise: standard deviations of what belongs to places and of noise.
     """
-    return (*np.arcsinh(np.array(nats) / NATS).tolist(), 10 * rmse_fall)
+    return (*np.arcsinh(np.array(nats) / NATS).tolist(), 10 * rmse_fall,
+            float(np.log(max(rest_over_noise, LEAST_RATIO))))
 
 
 def probability_of_both(first: CandidateScore, second: CandidateScore, other: float,
-                        unnamed: float, before_db: float) -> float:
+                        unnamed: float, before_db: float, rest_over_noise: float) -> float:
     """Return the probability that two effects are there, from what they explain together.
 
     Args:
@@ -107,10 +112,12 @@ def probability_of_both(first: CandidateScore, second: CandidateScore, other: fl
         other: most that any other effect gains on held-out links [nats].
         unnamed: most evidence for a curve without a name [nats].
         before_db: held-out error without any of the two [dB].
+        rest_over_noise: standard deviations of what belongs to places and of noise, without them.
     """
     evidence, held_out = (first.nats + second.nats, first.held_out_nats + second.held_out_nats)
     values = features((evidence, evidence - unnamed, held_out, held_out - other),
-                      float(np.nan_to_num(np.log(before_db / second.rmse_db))))
+                      float(np.nan_to_num(np.log(before_db / second.rmse_db))),
+                      rest_over_noise)
     return min(probability_of(each.name, values) for each in (first, second))
 
 

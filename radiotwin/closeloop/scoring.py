@@ -33,7 +33,7 @@ class CandidateScore:
         evidence_nats: beside errors of the base that are correlated, see `Hypotheses`; NaN where
             it was not looked at.
         passed: whether held-out links support it, however probable it is.
-        features: (5,) what its probability depends on, see `radiotwin.closeloop.posterior`; empty
+        features: (6,) what its probability depends on, see `radiotwin.closeloop.posterior`; empty
             where it was not tried.
         probability: that it is there.
     """

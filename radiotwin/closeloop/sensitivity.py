@@ -52,19 +52,22 @@ def detectable(hypotheses: Hypotheses, criteria: SelectionCriteria) -> list[Dete
         criteria: with the probability that is needed.
     """
     found: dict[tuple[str, str, str], list[float]] = {}
+    rest_db, noise_db = hypotheses.sizes_db
+    ratio, probability = rest_db / noise_db, criteria.min_probability
     for name, unit, what, pattern in _patterns(hypotheses.links):
         information = hypotheses.information(pattern)
-        nats = needed_nats(name, criteria.min_probability) + 0.5 * np.log(len(pattern))
+        nats = needed_nats(name, probability, ratio) + 0.5 * np.log(len(pattern))
         size = np.sqrt(2 * nats / information) if information > 0 else np.inf
         found.setdefault((name, unit, what), []).append(float(size))
     return [Detectable(name, float(np.median(sizes)), unit, what)
             for (name, unit, what), sizes in found.items()]
 
 
-def needed_nats(name: str, probability: float) -> float:
+def needed_nats(name: str, probability: float, rest_over_noise: float) -> float:
     """Return the evidence that makes an effect so probable, if nothing competes with it."""
     def lack(nats: float) -> float:
-        return probability_of(name, features((nats, nats, nats, nats), 0.0)) - probability
+        return probability_of(name, features((nats, nats, nats, nats), 0.0,
+                                             rest_over_noise)) - probability
 
     if lack(0.0) >= 0:
         return 0.0

@@ -109,8 +109,13 @@ def test_probabilities_sum_to_one_and_a_weak_candidate_is_refused(open_ground):
 
 def test_more_evidence_is_never_less_probable():
     nats = np.arange(0.0, 300.0, 10.0)
-    found = [probability_of("foliage", features((each,) * 4, 0.01 * each)) for each in nats]
+    found = [probability_of("foliage", features((each,) * 4, 0.01 * each, 1.0)) for each in nats]
     assert np.all(np.diff(found) > 0)
+
+
+def test_where_more_of_the_rest_belongs_to_places_the_same_evidence_is_worth_less():
+    found = [probability_of("foliage", features((40.0,) * 4, 0.1, ratio)) for ratio in (0.3, 1.0, 3.0, 9.0)]
+    assert np.all(np.diff(found) < 0)
 
 
 def test_an_effect_of_the_size_that_would_have_been_seen_has_the_evidence_for_it(open_ground):
@@ -118,4 +123,4 @@ def test_an_effect_of_the_size_that_would_have_been_seen_has_the_evidence_for_it
     sizes = {each.name: each.size for each in detectable(hypotheses, CRITERIA)}
     assert {"receiver_gain_offset", "device_gain_offset", "excess_attenuation"} <= set(sizes)
     assert all(size > 0 for size in sizes.values())
-    assert needed_nats("foliage", 0.5) <= needed_nats("foliage", 0.9)
+    assert needed_nats("foliage", 0.5, 1.0) <= needed_nats("foliage", 0.9, 1.0) <= needed_nats("foliage", 0.9, 4.0)
