@@ -14,6 +14,7 @@ import numpy as np
 from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.closeloop.hypotheses import Hypotheses
+from radiotwin.closeloop.moved_limits import with_moved_limits
 from radiotwin.closeloop.pairs import Passed, probable_pair
 from radiotwin.closeloop.posterior import Step, judge
 from radiotwin.closeloop.scoring import (
@@ -186,7 +187,7 @@ def _keep_both(result: SelectionResult, pair: list[Passed], step: int) -> None:
             break
     result.scores.append(replace(second.score, kept=True))
     result.rivals += [[], []]
-    result.model = _exactly(second.model)
+    result.model = with_moved_limits(_exactly(second.model))
 
 
 def _keep_best(result: SelectionResult, passed: list[Passed], block: np.ndarray,
@@ -216,7 +217,7 @@ def _keep_best(result: SelectionResult, passed: list[Passed], block: np.ndarray,
     result.scores += [replace(score, kept=True) for score, _ in steps[1:]]
     result.rivals += [rivals, *([] for _ in steps[1:])]
     on_progress(f"step {step + 1}: {best.name}, exactly")
-    result.model = _exactly(steps[-1][1])
+    result.model = with_moved_limits(_exactly(steps[-1][1]))
 
 
 def _beyond(passed: Passed, candidate: Candidate, model: CrossValidatedModel,

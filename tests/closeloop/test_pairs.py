@@ -33,7 +33,7 @@ def best_alone(result):
 
 
 def test_two_anchors_of_which_none_is_probable_alone_are_named_together(selected):
-    moved_m = {1: 25.0, 3: -25.0}
+    moved_m = {1: 45.0, 3: -45.0}
     needed = best_alone(selected(moved_m, 1.0)) + 0.005
     result = selected(moved_m, needed)
     assert {each.params.device for each in result.model.whole.effects} == set(moved_m)
@@ -43,5 +43,5 @@ def test_two_anchors_of_which_none_is_probable_alone_are_named_together(selected
 
 
 def test_one_anchor_has_no_second_beside_it(selected):
-    needed = best_alone(selected({1: 25.0}, 1.0)) + 0.005
-    assert selected({1: 25.0}, needed).model.whole.effects == []
+    needed = best_alone(selected({1: 45.0}, 1.0)) + 0.005
+    assert selected({1: 45.0}, needed).model.whole.effects == []

@@ -1,0 +1,34 @@
+"""A receiver that reads too much has a limit of detection that is as much higher."""
+
+import numpy as np
+import pytest
+
+from radiotwin.closeloop.bases import LogDistanceBase
+from radiotwin.closeloop.cross_validation import cross_validate, training_parts
+from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.selection import SelectionResult, forward_selection
+from radiotwin.effects.detection_limit import DetectionLimit
+from radiotwin.effects.gain_offsets import ReceiverGainOffset
+from radiotwin.links import prepare_links
+from radiotwin.links.limits import limits_to_explain
+
+LIMIT_DB = -97.0
+
+
+@pytest.mark.parametrize("off_db, limit_moves, named", [
+    (6.0, True, ["receiver_gain_offset"]), (6.0, False, ["receiver_gain_offset"]),
+    (0.0, True, ["noise_floor_censoring"])])
+def test_one_fault_has_one_name(open_ground, off_db, limit_moves, named):
+    world = open_ground.fly(3)
+    mine = world.receiver == 1
+    limit_db = np.where(mine & limit_moves, LIMIT_DB + 6.0, LIMIT_DB)
+    world.gain_db += np.where(mine, off_db, 0.0)
+    world.gain_db[world.gain_db < limit_db] = np.nan
+    world.limit_db = -np.inf
+    links = limits_to_explain(prepare_links(open_ground.measured(world), None))
+    folds = make_folds(links, 0)
+    result = SelectionResult(cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds)))
+    forward_selection(result, [ReceiverGainOffset(), DetectionLimit()], 0, lambda _: None)
+    assert [each.effect.name for each in result.model.whole.effects] == named
+    used_db = [float(np.median(result.model.whole.limit_db[links.receiver == receiver])) for receiver in (0, 1)]
+    assert used_db == pytest.approx([LIMIT_DB, LIMIT_DB + 6.0 * limit_moves], abs=1.0)
