@@ -30,9 +30,9 @@ from tests.undeclared.open_ground import CASES, OpenCase, open_case
 KNOWN_SEEDS = (1, 2)  # of the traced cities' cases
 PHYSICS = ("wall_reflection", "diffraction")  # in every traced world
 # Prior: log-odds rise with each feature but the last; few cases do not show otherwise.
-MEAN, SD = (0.4, 0.3, 0.5, 0.1, 0.2, -0.5), (0.2, 0.2, 0.2, 0.2, 0.2, 0.4)
+MEAN, SD = (0.4, 0.3, 0.5, 0.1, 0.2, -0.5), (0.3, 0.3, 0.3, 0.3, 0.3, 0.5)
 RISES = (True, True, True, True, True, False)
-NAME_SD, NOTHING_SD = 0.7, 1.0  # of a name's own intercept, and of the weights of "nothing"
+NAME_SD, NOTHING_SD = 1.0, 1.0  # of a name's own intercept, and of the weights of "nothing"
 PATH = Path(posterior.__file__).with_name("calibration.json")
 
 
@@ -57,7 +57,9 @@ def candidates_of(seed: int, settings: dict) -> dict:
         loop = close_loop(hidden.measurements, scene, seed=seed)
     right = {each["name"] for each in hidden.answer["effects"]}
     nuisance = hidden.answer.get("nuisance")  # of a foreign case
-    undeclared = undeclared_besides(nuisance) if nuisance else set()
+    undeclared = set(hidden.answer.get("besides", ()))  # of a campaign over open ground
+    if nuisance:
+        undeclared |= undeclared_besides(nuisance)
     if not settings["map"]:
         undeclared |= {"missing_obstacle", "removed_obstacle"}
     return {

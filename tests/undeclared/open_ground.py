@@ -21,7 +21,11 @@ CRUISE_M_S, EVERY_S = 10.0, 1.0
 
 @dataclass(frozen=True, eq=False)
 class OpenCase:
-    """A campaign; `answer["effects"]` is a list of what is hidden, each with `name` and `in_catalogue`."""
+    """A campaign, and what is in it.
+
+    `answer["effects"]` is a list of what is hidden, each with `name` and `in_catalogue`; `answer["besides"]` names what
+    is true of every campaign: devices are about a decibel off.
+    """
 
     measurements: Measurements
     answer: dict
@@ -198,7 +202,8 @@ def open_case(number: int) -> OpenCase:
         written_m[there] = at.place_m[there - late * len(at.device_m)]
         keep &= ~mine | (at.slot >= late)
     return OpenCase(_measured(at, written_m, declared_m, keep, rng),
-                    {"effects": [{"name": name, "in_catalogue": name not in OUTSIDE}] if name else []})
+                    {"effects": [{"name": name, "in_catalogue": name not in OUTSIDE}] if name else [],
+                     "besides": ["device_gain_offset"]})
 
 
 def _measured(at: _World, written_m: np.ndarray, declared_m: np.ndarray, keep: np.ndarray,
