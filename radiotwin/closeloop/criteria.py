@@ -18,9 +18,8 @@ class SelectionCriteria:
         min_training_gain_nats: on the links that it is fitted to, for a candidate to be fitted to
             the folds. Saves time: one that gains less cannot gain `min_gain_nats`
             on held-out links.
-        min_probability: that a cause is there, to be named; it is told with the name. Below one
-            half, because it is calibrated on few cases, most of them with wrong maps
-            (`radiotwin.closeloop.posterior`).
+        min_probability: that a cause is there, to be named; it is told with the name: more probable
+            than not (`radiotwin.closeloop.posterior`).
         max_rest_db: standard deviation of what belongs to places and has no name, for
             "none" to be said.
         min_gain_nats: on held-out links. Calibrated.
@@ -48,7 +47,7 @@ class SelectionCriteria:
     """
 
     min_training_gain_nats: float = 10.0
-    min_probability: float = 0.35
+    min_probability: float = 0.5
     max_rest_db: float = 3.0
     min_gain_nats: float = 25.0
     min_gain_per_link_nats: float = 0.01
