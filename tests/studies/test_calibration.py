@@ -1,0 +1,49 @@
+"""The regression that says what evidence is worth, on made-up candidates of which the truth is known."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from studies import calibration_fit
+
+WEIGHTS = np.array([0.5, 0.2, 0.6, 0.1, 0.2, -0.8])
+
+
+def rows(seed, cases=120):
+    """Rows of the study: four candidates a case, right with log-odds of -2 + `WEIGHTS` · features."""
+    rng, found = np.random.default_rng(seed), []
+    for case in range(cases):
+        features = rng.normal(1.0, 2.0, (4, 6))
+        right = rng.random(4) < 1 / (1 + np.exp(2 - features @ WEIGHTS))
+        candidates = [[0, name, True, values.tolist(), [1.0], 0.001, bool(there)] for name, values, there in
+                      zip(("foliage", "episode", "lock_loss", "interference"), features, right, strict=True)]
+        found.append({"name": f"city{case // 5:02d}-w0-c{case % 5}", "results": {
+            "candidates": candidates, "open": [], "steps": [[5.0, 3.0, 1.0, 2.0]],
+            "hidden": [["foliage", True]] if case % 3 else []}})
+    return found
+
+
+def test_weights_come_back():
+    fit = calibration_fit.fitted(rows(0, 400))["effect"]
+    assert fit["weights"] == pytest.approx(WEIGHTS, abs=0.15) and fit["intercept"] == pytest.approx(-2.0, abs=0.4)
+
+
+def test_signs_are_kept_whatever_the_cases_say():
+    weights = calibration_fit.logistic(np.random.default_rng(1).normal(size=(50, 2)), np.arange(50) % 2 == 0,
+                                       np.zeros(2), np.ones(2), [(0.0, None), (None, 0.0)])
+    assert weights[1] >= 0 >= weights[2]
+
+
+def test_probabilities_of_other_cities_are_as_often_right_as_they_say():
+    table = calibration_fit.cross_validated(rows(2))
+    assert table["probability"].between(0, 1).all() and len(table) == 480
+    for _, each in table.groupby(pd.cut(table["probability"], [0, 0.2, 0.5, 0.8, 1])):
+        spread = 3 * np.sqrt(0.25 / len(each))
+        assert each["right"].mean() == pytest.approx(each["probability"].mean(), abs=spread)
+
+
+def test_what_is_open_and_what_held_out_links_do_not_support_is_left_out():
+    (one,) = rows(3, 1)
+    one["results"]["open"] = ["foliage"]
+    one["results"]["candidates"][1][2] = False
+    assert sorted(calibration_fit.usable([one])["name"]) == ["interference", "lock_loss"]
