@@ -34,6 +34,8 @@ def foreign_table(rows: pd.DataFrame) -> str:
                  _roc_lines([part for _, part in splits]), "False alarms",
                  " (share of the cases with an effect in which its score is higher than in all but "
                  "1 % or 5 % of the cases without it)"),
+        markdown(["case", "effect", "size", "would have been named from"], _missed_lines(rows),
+                 "Missed", " although as large as would have been named"),
         markdown(["case", "hidden (size [dB])", "verdict", "named (probability)", "before [dB]",
                   "after", "combined", "oracle", "best baseline"],
                  [_case_line(row) for row in rows.itertuples()], "Case by case")])
@@ -174,6 +176,12 @@ def _roc_lines(parts: list[pd.DataFrame]) -> list[list[str]]:
     return [[f"`{name}`" if name != "all" else "all", *(
         number(share, 2) for each in found
         for share in each.get(name, (None,) * len(ROC_HEADS)))] for name in names]
+
+
+def _missed_lines(rows: pd.DataFrame) -> list[list[str]]:
+    return [[row.name, f"`{name}`", number(size, 1), number(least, 1)]
+            for row in rows.itertuples(index=False) for name, size, least in row.seen
+            if size >= least and name not in row.named] or [["none", "–", "–", "–"]]
 
 
 def _case_line(row: Any) -> list[str]:

@@ -77,12 +77,13 @@ def test_the_table_counts_what_was_said():
             candidates=[("foliage", 90.0, 0.95), ("interference", 30.0, 0.6)], seen=[["foliage", 6.0, 4.0]]),
         row("judge/b", [], {"missing_obstacle": 0.97, "correlated_shadowing": None}, tolerated=["missing_obstacle"]),
         row("judge/c", [{"name": "warm_front", "in_catalogue": False}], {"excess_attenuation": None},
-            families=["warm_front"])])
+            families=["warm_front"]),
+        row("judge/d", [{"name": "episode", "in_catalogue": True}], {}, families=["episode"], seen=[["episode", 7.0, 5.0]])])
     text = foreign_table.foreign_table(rows)
-    for line in ("| right first, of cases of the catalogue | 1 of 1 |", "| false names a case of the catalogue | 1.00 |",
+    for line in ("| right first, of cases of the catalogue | 1 of 2 |", "| false names a case of the catalogue | 0.50 |",
                  "| nulls that were given a cause | 0 of 1 |", "| not in the catalogue, given a cause with 0.9 and more | 1 of 1 |",
                  "| true parameters in their 90 % intervals | 1 of 1 |", "| error after / oracle, median | 1.20 |",
-                 "| 0.9 to 0.97 | 100% of 1 |", "| named, of effects as large as would have been seen | 1 of 1 |", "| `foliage` | 1 of 1 | 0 | 1 of 1 |",
+                 "| 0.9 to 0.97 | 100% of 1 |", "| named, of effects as large as would have been seen | 1 of 2 |", "| judge/d | `episode` | 7.0 | 5.0 |", "| `foliage` | 1 of 1 | 0 | 1 of 1 |",
                  "| `warm_front` | not in the catalogue | – | – |"):
         assert line in text, text
     assert set(foreign_figures.foreign_figures(rows)) == {"foreign"}
