@@ -24,6 +24,7 @@ from radiotwin.scene import Scene
 BINS = 20
 MAX_PANELS = 6
 MAX_MEMBERS = 24  # receivers, devices or flights in one panel
+MAX_LINE = 1.5  # times the highest bar: other models up to there are lines
 MIN_STEP_DB = 0.005  # smaller changes are not a bar of their own
 CONTRIBUTION = "contribution of the effects"
 ON_MAP = ("place_of_ray", "place_of_receiver")  # variables that the residual map shows
@@ -61,7 +62,8 @@ def waterfall_figure(report: dict) -> Figure:
     """Draw the held-out RMSE of the base, the change by each kept effect, and the final RMSE.
 
     Args:
-        report: content of `closeloop.json`; its other models are horizontal lines.
+        report: content of `closeloop.json`; its other models are horizontal lines, up to
+            `MAX_LINE` times the highest bar.
     """
     before, after = (report["error"][when]["rmse_db"] or 0.0 for when in ("before", "after"))
     kept = [(candidate["name"], candidate["heldout_rmse_db"]) for candidate in report["candidates"]
@@ -84,8 +86,9 @@ def waterfall_figure(report: dict) -> Figure:
         _connect(ax, len(names), after)
         _draw_bar(ax, len(names), 0.0, after, AFTER, f"{after:.2f} dB")
         names.append("after")
-    lines = [(value["rmse_db"], name_label(name), "--")
-             for name, value in report["baselines"].items() if value["rmse_db"] is not None]
+    highest = MAX_LINE * max(before, after, *levels)  # or the bars would be too low to be read
+    lines = [(value["rmse_db"], name_label(name), "--") for name, value in
+             report["baselines"].items() if (value["rmse_db"] or np.inf) <= highest]
     if report["error"]["noise_floor_db"] is not None:
         lines.append((report["error"]["noise_floor_db"], "noise of one\nmeasurement", ":"))
     top = 1.12 * max(before, after, *levels, *(value for value, *_ in lines))

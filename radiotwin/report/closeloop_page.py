@@ -20,7 +20,7 @@ FIGURES = (
     ("waterfall.png", "Error step by step",
      "RMSE on held-out links, which were used neither to choose nor to fit the model: the base "
      "alone, the change by each effect, and the result. Horizontal lines: other models, held out "
-     "in the same way."),
+     "in the same way, unless they are far worse."),
     ("residual_map.png", "Residual on the map",
      "Measured minus predicted level on held-out links, before and after. Red: less was measured "
      "than predicted. Purple: the effects that were found."),
