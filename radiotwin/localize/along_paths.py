@@ -9,6 +9,7 @@ the best of these and on the way down from there.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -26,6 +27,7 @@ from radiotwin.localize.estimate import TwinDevice, read_device
 from radiotwin.pieces import Piece, kept_with_name
 from radiotwin.progress import progress
 from radiotwin.scene.citymap import CityMap
+from radiotwin.threads import in_threads
 
 LINKS = 150  # of a device, about
 MIN_HEARD = 30  # of these; what is not heard says little, and fits many positions
@@ -205,8 +207,7 @@ class _Search:
         start_m = np.array([device.x_m, device.y_m])
         known_m = self._free(np.array(known).reshape(-1, 2))
         worth_m = known_m if len(known_m) else self._likely_cells(device)
-        for position_m in (*self._free(np.round(start_m)[None]), *worth_m):
-            self._try(position_m)
+        self._try([*self._free(np.round(start_m)[None]), *worth_m])
         if not self.tried:
             return device
         ranked_m = np.array(sorted(self.tried, key=self.tried.__getitem__))
@@ -236,13 +237,13 @@ class _Search:
 
     def _descend(self, from_m: np.ndarray) -> None:
         """Go to the best of the four neighbours, and again, with shorter and shorter steps."""
-        best, value = from_m, self._try(from_m)
+        best, (value,) = from_m, self._try([from_m])
         for step_m in STEPS_M:
             better = True
             while better:
                 cross = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
                 around_m = self._free(best + step_m * cross)
-                values = [self._try(position_m) for position_m in around_m]
+                values = self._try(around_m)
                 better = min(values, default=np.inf) < value
                 if better:
                     best, value = around_m[np.argmin(values)], min(values)
@@ -256,7 +257,7 @@ class _Search:
             ring = np.column_stack([np.cos(angles), np.sin(angles)])
             rings = np.vstack([best + away_m * ring for away_m in AROUND_M])
             around_m = self._free(np.round(rings))
-            values = [self._try(position_m) for position_m in around_m]
+            values = self._try(around_m)
             better = min(values, default=np.inf) < self.tried[best]
             if better:
                 self._descend(around_m[np.argmin(values)])
@@ -285,12 +286,16 @@ class _Search:
         assert isinstance(channel, ImagePaths)
         return channel.level_db(power, links.geometry)
 
-    def _try(self, position_m: np.ndarray) -> float:
-        key = float(position_m[0]), float(position_m[1])
-        if key not in self.tried:
-            links = self.by_paths.at(position_m)
-            self.tried[key] = self.by_paths.nll(links, self._paths_db(links))
-        return self.tried[key]
+    def _try(self, positions_m: Iterable[np.ndarray]) -> list[float]:
+        """Return the negative log-likelihood by paths of each position (2,) [nats]."""
+        keys = [(float(x_m), float(y_m)) for x_m, y_m in positions_m]
+        new = [key for key in dict.fromkeys(keys) if key not in self.tried]
+        self.tried.update(zip(new, in_threads(self._paths_nll, new), strict=True))
+        return [self.tried[key] for key in keys]
+
+    def _paths_nll(self, position_m: tuple[float, float]) -> float:
+        links = self.by_paths.at(np.array(position_m))
+        return self.by_paths.nll(links, self._paths_db(links))
 
     def _view(self, best: tuple[float, float]) -> ResidualView:
         """Return the links with the device where it was found."""

@@ -7,8 +7,10 @@ from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.links import prepare_links
 from radiotwin.localize import along_paths
 from radiotwin.measurements import Measurements
+from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import fit_links
 from radiotwin.twin.fit_paths import fit_paths, relocation_from
+from tests.worlds import RBM
 
 
 def found(twin, name):
@@ -54,3 +56,15 @@ def test_a_device_stays_where_the_law_is_too_uncertain_or_no_position_explains_i
         law = fit_links(links, scene, SegmentedLogDistance, 0)
         assert found(law, name)[1] > 100 or np.isinf(max_radius_m)
         assert fit_paths(links, scene, law, relocation_from(scene, max_radius_m)).devices == law.devices
+
+
+def test_as_many_threads_as_there_are_find_the_same_to_the_bit(narrow_street, monkeypatch):
+    scene = narrow_street.scene
+    links = prepare_links(narrow_street.measured, scene)
+    links = links.select(links.flight == 0)
+    law, twins = fit_links(links, scene, SegmentedLogDistance, 0), []
+    for count in (1, 3):
+        monkeypatch.setattr("radiotwin.threads.thread_count", lambda count=count: count)
+        twins.append(fit_paths(links, Scene.load(RBM), law, relocation_from(scene, 100.0)))
+    assert twins[0].devices == twins[1].devices
+    assert found(twins[0], narrow_street.name)[0].tolist() != found(law, narrow_street.name)[0].tolist()
