@@ -65,4 +65,4 @@ def _coverage(axes: Axes, rows: pd.DataFrame) -> None:
                   color=COLOURS[index])
     axes.axvspan(0.8, 0.97, color="black", alpha=0.1, linewidth=0, zorder=0)
     axes.set_yticks(range(len(families)), families, fontsize="small")
-    axes.set(xlabel="true parameters in their 90 % intervals", xlim=(0, 1.02))
+    axes.set(xlabel="truths in 90 % intervals", xlim=(0, 1.02))

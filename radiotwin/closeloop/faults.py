@@ -29,6 +29,7 @@ from radiotwin.closeloop.scoring import (
 )
 from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.base import Effect
+from radiotwin.effects.fold_model import AppliedEffect, FoldModel
 from radiotwin.links import LinkData, evidence_blocks
 from radiotwin.links.correlation import devices_move
 
@@ -74,6 +75,42 @@ def select_faults(result: SelectionResult, effects: list[Effect], links: LinkDat
         if kept is None:
             result.scores += refused
             return
+
+
+def drop_idle_faults(result: SelectionResult) -> None:
+    """Take back what the effects that were found later explain: an emitter is no episode.
+
+    Faults come first, and are held against no other effect.
+
+    Args:
+        result: is changed where a fault gains nothing any more on the links that it is fitted to.
+    """
+    for number in reversed(range(len(result.model.whole.effects))):
+        whole, applied = result.model.whole, result.model.whole.effects[number]
+        if not applied.effect.within_flights:
+            continue
+        alone = whole.with_effects([each for each in whole.effects if each is not applied])
+        gain = alone.fit().objective - result.model.fits[0].objective
+        if gain >= result.criteria.min_training_gain_nats:
+            continue
+        models = [_without(each, applied) for each in result.model.models]
+        result.model = result.model.extended(models, [each.fit() for each in models])
+        kept = [i for i, score in enumerate(result.scores) if score.kept][number]
+        result.scores[kept] = replace(result.scores[kept], kept=False,
+                                      reason="what was found later explains it")
+        del result.rivals[number]
+
+
+def _without(model: FoldModel, fault: AppliedEffect) -> FoldModel:
+    """Return a model without a fault; a fold has its own times of it, or has not found it."""
+    def same(other: AppliedEffect) -> bool:
+        return other.effect is fault.effect and all(
+            getattr(other.params, end) == getattr(fault.params, end)
+            for end in ("receiver", "flight"))
+
+    twins = [each for each in model.effects if same(each)]
+    drop = next((each for each in twins if each is fault), twins[0] if twins else None)
+    return model.with_effects([each for each in model.effects if each is not drop])
 
 
 def _within_flights(result: SelectionResult, links: LinkData, base: Base,

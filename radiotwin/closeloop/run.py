@@ -17,7 +17,7 @@ from radiotwin.closeloop.cross_validation import (
     training_parts,
 )
 from radiotwin.closeloop.effect_size import effect_size_db
-from radiotwin.closeloop.faults import select_faults
+from radiotwin.closeloop.faults import drop_idle_faults, select_faults
 from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.intervals import effect_parameters
 from radiotwin.closeloop.posterior import NONE, OTHER
@@ -177,6 +177,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     select_faults(selection, effects, links, bases[best], seed, on_progress)
     forward_selection(selection, [effect for effect in effects if not effect.within_flights], seed,
                       on_progress)
+    drop_idle_faults(selection)
     select_change_points(selection, links, bases[best], folds, seed, on_progress)
     on_progress("unknown devices again, beside the effects")
     selection.model = relocate_devices(selection.model)
