@@ -21,13 +21,6 @@ def limit_threads(count: int) -> None:
     threadpoolctl.threadpool_limits(count)
 
 
-def usable_cores() -> int:
-    """Return the number of cores that this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def keep_memory() -> None:
     """Let the C library keep freed memory for the next update, which saves an eighth of the time.
 

@@ -15,6 +15,7 @@ from rich.console import Console
 from scipy.constants import speed_of_light
 
 from radiotwin import llvm
+from radiotwin.threads import usable_cores
 
 GIB = 2**30
 MIN_MEMORY_GIB = 4  # twice what tracing scenes/rbm takes (docs/results.md)
@@ -107,8 +108,7 @@ def print_diagnosis(console: Console) -> Diagnosis:
 
 
 def _check_machine(diagnosis: Diagnosis) -> Rows:
-    affinity = getattr(os, "sched_getaffinity", None)  # missing on macOS and Windows
-    cores = len(affinity(0)) if affinity else os.cpu_count()
+    cores = usable_cores()
     memory_gib = _memory_gib()
     disk_gib = shutil.disk_usage(Path.cwd()).free / GIB
     if memory_gib is not None and memory_gib < MIN_MEMORY_GIB:

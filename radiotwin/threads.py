@@ -10,12 +10,17 @@ Result = TypeVar("Result")
 MOST = 4  # more wait for each other: the parts between run one at a time
 
 
+def usable_cores() -> int:
+    """Return the number of cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):  # missing on macOS and Windows
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def thread_count() -> int:
     """Return how many threads may run: the process's cores, no more than OMP_NUM_THREADS."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") \
-        else os.cpu_count() or 1
     limit = os.environ.get("OMP_NUM_THREADS", "")
-    return min(cores, MOST, max(int(limit), 1) if limit.isdigit() else MOST)
+    return min(usable_cores(), MOST, max(int(limit), 1) if limit.isdigit() else MOST)
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:

@@ -90,11 +90,13 @@ def drop_idle_faults(result: SelectionResult) -> None:
         if not applied.effect.within_flights:
             continue
         alone = whole.with_effects([each for each in whole.effects if each is not applied])
-        gain = alone.fit().objective - result.model.fits[0].objective
+        fit = alone.fit()
+        gain = fit.objective - result.model.fits[0].objective
         if gain >= result.criteria.min_training_gain_nats:
             continue
-        models = [_without(each, applied) for each in result.model.models]
-        result.model = result.model.extended(models, [each.fit() for each in models])
+        folds = [_without(each, applied) for each in result.model.folds]
+        fits = [fit, *(each.fit() for each in folds)]
+        result.model = result.model.extended([alone, *folds], fits)
         kept = [i for i, score in enumerate(result.scores) if score.kept][number]
         result.scores[kept] = replace(result.scores[kept], kept=False,
                                       reason="what was found later explains it")
@@ -102,14 +104,13 @@ def drop_idle_faults(result: SelectionResult) -> None:
 
 
 def _without(model: FoldModel, fault: AppliedEffect) -> FoldModel:
-    """Return a model without a fault; a fold has its own times of it, or has not found it."""
+    """Return a fold without a fault, of which it has times of its own, or none."""
     def same(other: AppliedEffect) -> bool:
         return other.effect is fault.effect and all(
             getattr(other.params, end) == getattr(fault.params, end)
             for end in ("receiver", "flight"))
 
-    twins = [each for each in model.effects if same(each)]
-    drop = next((each for each in twins if each is fault), twins[0] if twins else None)
+    drop = next((each for each in model.effects if same(each)), None)
     return model.with_effects([each for each in model.effects if each is not drop])
 
 

@@ -51,7 +51,7 @@ MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal 
 
 @dataclass(frozen=True)
 class _Flight:
-    """A receiver's flight, and what tells whether it is like others; NaN: not known.
+    """A receiver's flight with its levels and scatters; NaN: not known.
 
     Attributes:
         receiver, flight: which.
