@@ -21,8 +21,16 @@ from radiotwin.cells import (
 )
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
+from radiotwin.frames import (
+    FRAME_FILE,
+    between_frames,
+    is_same_frame,
+    place,
+    read_frame,
+    write_frame,
+)
 from radiotwin.inputs import is_within
-from radiotwin.tables import name_fault
+from radiotwin.tables import Origin, name_fault
 
 # Columns of the two files, as in docs/conventions.md.
 REQUIRED = ["flight", "receiver", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device"]
@@ -31,6 +39,8 @@ OPTIONAL = ["time_s", "heading_deg", "pitch_deg", "roll_deg", "quality"]
 DEVICE_REQUIRED = ["device", "x_m", "y_m", "z_m", "role"]
 DEVICE_OPTIONAL = ["frequency_hz", "tx_power_dbm", "azimuth_deg", "tilt_deg"]
 ROLES = ("anchor", "unknown")
+_RECEIVER_POSITION = ["receiver_x_m", "receiver_y_m", "receiver_z_m"]
+_DEVICE_POSITION = ["x_m", "y_m", "z_m"]
 _TEXT = {"flight", "receiver", "device", "role"}
 _MAY_BE_EMPTY = {"receiver_z_m", *LEVELS, *OPTIONAL}
 _DEVICE_MAY_BE_EMPTY = {"x_m", "y_m", "z_m", *DEVICE_OPTIONAL}
@@ -53,10 +63,12 @@ class Measurements:
     Attributes:
         table: one row per link, columns as in `measurements.csv`; NaN level = not detected.
         devices: one row per device, columns as in `devices.csv`; NaN x, y where unknown.
+        origin: of the local frame of both; None where it is not known.
     """
 
     table: pd.DataFrame
     devices: pd.DataFrame
+    origin: Origin | None = None
 
     @property
     def level_column(self) -> str:
@@ -71,8 +83,7 @@ class Measurements:
     @property
     def receiver_m(self) -> np.ndarray:
         """Receiver positions [m], (n, 3)."""
-        columns = ["receiver_x_m", "receiver_y_m", "receiver_z_m"]
-        return self.table[columns].to_numpy(dtype=float)
+        return self.table[_RECEIVER_POSITION].to_numpy(dtype=float)
 
     @cached_property
     def device_index(self) -> np.ndarray:
@@ -82,7 +93,7 @@ class Measurements:
     @property
     def device_m(self) -> np.ndarray:
         """Declared device positions [m], (k, 3); NaN where unknown."""
-        return self.devices[["x_m", "y_m", "z_m"]].to_numpy(dtype=float)
+        return self.devices[_DEVICE_POSITION].to_numpy(dtype=float)
 
     @property
     def is_anchor(self) -> np.ndarray:
@@ -100,16 +111,46 @@ class Measurements:
         Args:
             mask: (n,) bool.
         """
-        return Measurements(self.table[np.asarray(mask)].reset_index(drop=True), self.devices)
+        return Measurements(self.table[np.asarray(mask)].reset_index(drop=True), self.devices,
+                            self.origin)
+
+    def moved(self, position_m: Callable[[np.ndarray], np.ndarray],
+              origin: Origin | None) -> "Measurements":
+        """Return the same links in another frame.
+
+        Args:
+            position_m: converts (n, 3) positions [m] to that frame; NaN where unknown.
+            origin: of that frame.
+        """
+        return Measurements(_moved(self.table, _RECEIVER_POSITION, position_m),
+                            _moved(self.devices, _DEVICE_POSITION, position_m), origin)
+
+    def in_frame(self, origin: Origin) -> "Measurements":
+        """Return the same links in the frame about another origin, converted exactly.
+
+        Args:
+            origin: of that frame.
+
+        Raises:
+            BadInput: the origin of the links' own frame is not known.
+        """
+        here = self.origin
+        if here is None:
+            raise BadInput("the origin of the measurements' frame is not known; give it to "
+                           "Measurements, or move them")
+        return self.moved(lambda position_m: between_frames(position_m, here, origin), origin)
 
     def write(self, path: Path | str) -> None:
         """Write the links, and the devices to `devices.csv` in the same folder.
+
+        A known origin goes to `frame.toml` there.
 
         Args:
             path: `.csv`, `.csv.gz` or `.parquet`.
 
         Raises:
-            BadInput: `path` cannot be written, or the folder has a `devices.csv` of other devices.
+            BadInput: `path` cannot be written, or the folder has a `devices.csv` of other devices,
+                or a `frame.toml` of another frame.
         """
         path = Path(path)
         check_suffix(path)
@@ -117,6 +158,10 @@ class Measurements:
             raise BadInput(f"{path}: this name is for the devices' table, which is written beside "
                            "the links; give the links another name, such as measurements.csv")
         self._check_replaceable(path.parent / "devices.csv")
+        self._check_frame(path.parent)
+        if self.origin is not None:
+            with atomic_path(path.parent / FRAME_FILE) as frame:
+                write_frame(self.origin, frame)
         with atomic_path(path.parent / "devices.csv") as devices, atomic_path(path) as links:
             write_csv(self.devices, devices)
             if path.suffix == ".parquet":
@@ -124,6 +169,15 @@ class Measurements:
                 self.table.to_parquet(links, index=False)
             else:
                 write_csv(self.table, links)
+
+    def _check_frame(self, folder: Path) -> None:
+        """Refuse a folder whose tables are in another frame."""
+        there = read_frame(folder)
+        if there is not None and (self.origin is None or not is_same_frame(there, self.origin)):
+            raise BadInput(f"{folder / FRAME_FILE} says that tables of this folder are in the "
+                           f"frame about {place(there)}, and these are "
+                           + (f"about {place(self.origin)}" if self.origin else
+                              "in one of unknown origin") + "; choose another output folder")
 
     def _check_replaceable(self, path: Path) -> None:
         """Allow replacing a table of the same devices only; another one may be the only copy."""
@@ -145,6 +199,10 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
     Args:
         path: `.csv`, `.csv.gz` or `.parquet` with the columns of `REQUIRED` and one of `LEVELS`.
         devices_path: table of the devices; by default `devices.csv` in the same folder.
+
+    Returns:
+        links and devices in the frame that the `frame.toml` beside the links declares; devices of
+        another folder are converted from theirs.
 
     Raises:
         BadInput: names file, row and column of the first value that cannot be used.
@@ -173,8 +231,12 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
         raise BadInput(f"{path}: row {row + 2}, column device: {table['device'][row]!r} is not in "
                        f"{devices_path} (it has {_enumerate(devices['device'])}); add it there or "
                        "correct the name")
+    origin, of_devices = read_frame(path.parent), read_frame(devices_path.parent)
+    if origin is not None and of_devices is not None and not is_same_frame(origin, of_devices):
+        devices = _moved(devices, _DEVICE_POSITION,
+                         lambda position_m: between_frames(position_m, of_devices, origin))
     _check_spread(path, table, devices_path, devices)
-    return Measurements(table, devices)
+    return Measurements(table, devices, origin)
 
 
 def read_devices(path: Path | str) -> pd.DataFrame:
@@ -210,6 +272,12 @@ def read_devices(path: Path | str) -> pd.DataFrame:
         raise BadInput(f"{path}: row {row + 2}: anchor {devices['device'][row]!r} has no x_m, y_m; "
                        "fill them in or give it the role unknown")
     return devices
+
+
+def _moved(table: pd.DataFrame, columns: list[str],
+           position_m: Callable[[np.ndarray], np.ndarray]) -> pd.DataFrame:
+    moved_m = position_m(table[columns].to_numpy(dtype=float))
+    return table.assign(**dict(zip(columns, moved_m.T)))
 
 
 def _read_table(path: Path, required: list[str], optional: list[str],

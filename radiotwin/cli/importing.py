@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from radiotwin.cli.options import parse_origin
 from radiotwin.console import print_rows, say
-from radiotwin.errors import BadInput
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -77,7 +77,7 @@ def import_(
         "min_level": min_level, "max_level": max_level,
         "min_distance_m": min_distance_m, "max_distance_m": max_distance_m,
         "average_m": average_m, "average": average,
-        "origin": _origin(origin), "crs": crs, "devices": devices, "receivers": receivers,
+        "origin": parse_origin(origin), "crs": crs, "devices": devices, "receivers": receivers,
         "wide": [parse_columns(text) for text in wide] if wide else None}
     mapping = columns
     if columns is not None and "=" in columns and not columns.endswith(".toml"):
@@ -136,16 +136,3 @@ def _values(text: str | None) -> list[float | str] | None:
             number = math.nan
         values.append(number if math.isfinite(number) else part.strip())
     return values
-
-
-def _origin(text: str | None) -> dict[str, float] | None:
-    if text is None:
-        return None
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
-    if len(values) not in (2, 3):
-        raise BadInput(f"--origin {text!r} is not two or three numbers; give LATITUDE,LONGITUDE or "
-                       "LATITUDE,LONGITUDE,ALTITUDE in degrees and metres")
-    return dict(zip(("latitude_deg", "longitude_deg", "altitude_m"), values))

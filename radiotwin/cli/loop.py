@@ -5,7 +5,13 @@ from typing import Annotated, Any
 
 import typer
 
-from radiotwin.cli.options import DeviceTable, MeasurementFile, OptionalScene
+from radiotwin.cli.options import (
+    DeviceTable,
+    MeasurementFile,
+    OptionalScene,
+    Shift,
+    in_frame_of,
+)
 from radiotwin.console import notice, print_rows, say
 
 
@@ -32,6 +38,7 @@ def close_loop(
         metavar="DIR", help="Scene folder to write: SCENE with the missing obstacles that were "
                             "found, without the buildings that are gone, and with anchors where "
                             "they were found.")] = None,
+    shift: Shift = None,
     seed: Annotated[int, typer.Option(
         min=0, help="Seed of folds, fits and permutations.")] = 0,
 ) -> None:
@@ -52,8 +59,8 @@ def close_loop(
     from radiotwin.scene import Scene
     from radiotwin.twin import check_twin_target
 
-    data = read_measurements(measurements, devices)
     world = Scene.load(scene) if scene else None
+    data = in_frame_of(world, read_measurements(measurements, devices), shift)
     require_writable(out / "closeloop.json")
     check_twin_target(out / "twin")
     if write_scene is not None:
@@ -115,6 +122,7 @@ def locate(
     devices: DeviceTable = None,
     truth: Annotated[Path | None, typer.Option(
         help="Table of devices with their true positions, to report the errors.")] = None,
+    shift: Shift = None,
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="Table of the positions.")] = Path("located.csv"),
 ) -> None:
@@ -122,6 +130,7 @@ def locate(
 
     It works with or without a 3D map.
     """
+    from radiotwin.alignment import in_known_frame
     from radiotwin.cells import write_csv
     from radiotwin.files import atomic_path, require_writable
     from radiotwin.measurements import read_devices, read_measurements
@@ -131,11 +140,12 @@ def locate(
     from radiotwin.twin.locate import locate_file, position_errors
 
     data, known = read_measurements(measurements, devices), Twin.load(twin)
+    world = Scene.load(scene) if scene else None
+    data = in_frame_of(world, in_known_frame(data, known.origin, "the twin"), shift)
     true = read_devices(truth) if truth else None
     require_writable(out)
     unknown = int((data.devices["role"] == "unknown").sum())
     with progress("locating", total=unknown) as advance:
-        world = Scene.load(scene) if scene else None
         positions, notes = locate_file(data, known, world, lambda: advance(1))
     for note in notes:
         say(f"note: {note}")

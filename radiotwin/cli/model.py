@@ -13,6 +13,8 @@ from radiotwin.cli.options import (
     MeasurementFile,
     OnlyDevices,
     SceneOption,
+    Shift,
+    in_frame_of,
     split_names,
 )
 from radiotwin.console import notice, print_rows, result, say
@@ -49,6 +51,7 @@ def fit(
         help="An earlier twin, to start the search from.")] = None,
     allow_indoor: Annotated[bool, typer.Option(
         "--allow-indoor", help="Unknown devices may be inside buildings.")] = False,
+    shift: Shift = None,
     seed: FitSeed = 0,
 ) -> None:
     """Fit a twin: the channel and the unknown devices.
@@ -61,7 +64,8 @@ def fit(
     from radiotwin.twin import Twin, check_twin_target, fit_twin
 
     check_twin_target(out)
-    data, world = read_measurements(measurements, devices), Scene.load(scene)
+    world = Scene.load(scene)
+    data = in_frame_of(world, read_measurements(measurements, devices), shift)
     earlier = Twin.load(start) if start else None
     with keep_pieces() as pieces:
         twin = fit_twin(data, world, model=model, seed=seed, start=earlier,
@@ -167,6 +171,7 @@ def compare(
     also: Annotated[list[Path] | None, typer.Option(
         help="A twin's folder, or (with --truth) a radio map, to compare with the models; may be "
              "repeated.")] = None,
+    shift: Shift = None,
     seed: FitSeed = 0,
 ) -> None:
     """Compare all channel models on held-out flights.
@@ -185,7 +190,8 @@ def compare(
 
     require_writable(out / "compare.json")
     world = Scene.load(scene)
-    train, test = split_flights(read_measurements(measurements, devices), held_out)
+    data = in_frame_of(world, read_measurements(measurements, devices), shift)
+    train, test = split_flights(data, held_out)
     truth_map = read_truth(world, truth) if truth else None
     twins, maps = judge_also(also or [], truth_map, test.flights)
     models = (*DEFAULT_MODELS, *published_models(world.config.radio.frequency_hz),

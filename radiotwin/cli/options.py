@@ -1,9 +1,17 @@
 """Arguments and options that several commands share."""
 
+import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from radiotwin.errors import BadInput
+
+if TYPE_CHECKING:
+    from radiotwin.measurements import Measurements
+    from radiotwin.scene import Scene
+    from radiotwin.tables import Origin
 
 MeasurementFile = Annotated[Path, typer.Argument(
     metavar="MEASUREMENTS", help="measurements.csv, .csv.gz or .parquet, with devices.csv in the "
@@ -19,6 +27,9 @@ OptionalScene = Annotated[Path | None, typer.Option(
 PointsFile = Annotated[Path, typer.Option(
     help="CSV file with x_m, y_m, z_m; or latitude_deg, longitude_deg, z_m, where the scene has an "
          "origin.")]
+Shift = Annotated[str | None, typer.Option(
+    metavar="DX,DY", help="Metres to add to x and y of measurements and devices for the scene's "
+                          "frame; 0,0 says that it is theirs.")]
 OnlyDevices = Annotated[str | None, typer.Option(metavar="A,B,…", help="Only these devices.")]
 Quality = Annotated[str | None, typer.Option(help="fast, default or high [default].")]
 TargetDb = Annotated[float | None, typer.Option(
@@ -37,3 +48,65 @@ def split_names(text: str | None) -> list[str] | None:
         text: `A,B`; None or empty for all.
     """
     return text.split(",") if text else None
+
+
+def parse_origin(text: str | None) -> "Origin | None":
+    """Parse the origin of a frame.
+
+    Args:
+        text: `LATITUDE,LONGITUDE` or `LATITUDE,LONGITUDE,ALTITUDE`; None for none.
+
+    Raises:
+        BadInput: anything else, or a place that is not on the earth.
+    """
+    from pydantic import ValidationError
+
+    from radiotwin.tables import Origin
+
+    if text is None:
+        return None
+    values = _numbers(text)
+    if len(values) not in (2, 3):
+        raise BadInput(f"--origin {text!r} is not two or three numbers; give LATITUDE,LONGITUDE or "
+                       "LATITUDE,LONGITUDE,ALTITUDE in degrees and metres")
+    try:
+        return Origin.model_validate(dict(zip(Origin.model_fields, values)))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise BadInput(f"--origin {text!r}: {first['loc'][0]}: {first['msg']}") from None
+
+
+def in_frame_of(scene: "Scene | None", measurements: "Measurements",
+                shift: str | None) -> "Measurements":
+    """Return measurements in the frame of a scene; as they are where there is none.
+
+    Args:
+        scene: the 3D map.
+        measurements: as they were read.
+        shift: `DX,DY` [m]; None for none.
+
+    Raises:
+        BadInput: not two numbers, no scene, or frames that cannot be related.
+    """
+    from radiotwin.alignment import in_scene_frame
+
+    shift_m = None if shift is None else _numbers(shift)
+    if shift_m is not None and len(shift_m) != 2:
+        raise BadInput(f"--shift {shift!r} is not two numbers; give DX,DY in metres, such as "
+                       "12,-40")
+    if scene is None:
+        if shift_m is not None:
+            raise BadInput("--shift moves measurements into the frame of a scene, and none is "
+                           "given; add --scene, or leave it out")
+        return measurements
+    return in_scene_frame(measurements, scene,
+                          None if shift_m is None else (shift_m[0], shift_m[1]))
+
+
+def _numbers(text: str) -> list[float]:
+    """Return the finite numbers of a list; none of them where one is not."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        return []
+    return values if all(map(math.isfinite, values)) else []

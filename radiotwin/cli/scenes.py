@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from radiotwin.cli.options import SceneFolder
+from radiotwin.cli.options import SceneFolder, parse_origin
 from radiotwin.console import console, result, say
 from radiotwin.errors import BadInput
 
@@ -57,6 +57,10 @@ def build_scene(
     uavs: Annotated[int | None, typer.Option(
         min=0, help="UAVs to place near the middle [3].")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the placement [0].")] = None,
+    origin: Annotated[str | None, typer.Option(
+        metavar="LAT,LON[,ALT]", help="Where on the earth x = y = 0 is; ALT is the ground's "
+                                      "altitude [m] [of a map its middle, of a city model "
+                                      "unknown].")] = None,
 ) -> None:
     """Build a scene folder from a map or a city model.
 
@@ -65,7 +69,8 @@ def build_scene(
     from radiotwin.footprints import map_suffix
     from radiotwin.scene.report import print_report
 
-    common = _given(frequency_hz=frequency_hz, devices=devices, uavs=uavs, seed=seed)
+    common = _given(frequency_hz=frequency_hz, devices=devices, uavs=uavs, seed=seed,
+                    origin=parse_origin(origin))
     of_cities = _given(scale=scale, up=up)
     of_maps = _given(height_default=height_default, material_table=material_table,
                      overpass=overpass or None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import radiotwin
 from radiotwin.closeloop.blending import make_blend, needs_rest
@@ -31,7 +32,10 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     fitted = replace(EffectModel.of(model.whole, model.fits[0], causes_only=True),
                      **vars(_calibration(loop)), shadowing=shadowing,
                      blend=make_blend(model, loop.prediction, 0))
-    provenance = {"links": len(model.links), "radiotwin_version": radiotwin.__version__}
+    provenance: dict[str, Any] = {"links": len(model.links),
+                                  "radiotwin_version": radiotwin.__version__}
+    if loop.origin is not None:
+        provenance |= {"origin": loop.origin.model_dump()}
     if scene is not None:
         provenance |= {"scene": scene.config.name, "scene_hash": scene.content_hash()}
     # Devices whose position is too uncertain to be learnt from, too: a map with them is better.

@@ -35,6 +35,7 @@ from radiotwin.links import LinkData, prepare_links, residual_variables
 from radiotwin.links.limits import limits_to_explain
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
+from radiotwin.tables import Origin
 
 
 @dataclass(eq=False)
@@ -50,6 +51,7 @@ class Loop:
         dependences_before, dependences_after: of the held-out residual.
         seed: of what is still to be drawn.
         noise_floor_db: from links measured twice at one position; NaN where there are none.
+        origin: of the frame of the links; None where it is not known.
     """
 
     base: str
@@ -61,6 +63,7 @@ class Loop:
     dependences_after: list[ResidualDependence]
     seed: int
     noise_floor_db: float = np.nan
+    origin: Origin | None = None
 
     @property
     def after(self) -> CrossValidatedModel:
@@ -195,7 +198,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         on_progress("correlated_shadowing")
         add_shadowing(selection, seed)
     return Loop(best, links, folds, before, selection, dependences_before, dependences_after,
-                seed, _noise_floor_db(all_links, criteria))
+                seed, _noise_floor_db(all_links, criteria), measurements.origin)
 
 
 def _dependences(model: CrossValidatedModel, seed: int) -> list[ResidualDependence]:

@@ -106,8 +106,8 @@ def build_scene_from_map(
         source: `.osm`, `.osm.pbf`, `.geojson` or `.gpkg` file.
         out_folder: scene folder to write; a scene in it is replaced.
         map_options: how to read the map; None: the defaults.
-        options: frequency, devices, UAVs and seed; `bbox`, `scale`, `up` and `materials` are for
-            city models. None: the defaults.
+        options: frequency, devices, UAVs, seed and origin; `bbox`, `scale`, `up`, `materials` are
+            for city models. None: the defaults.
         check_only: write nothing.
 
     Returns:
@@ -131,7 +131,7 @@ def build_scene_from_map(
     FEATURES.check(len(found.features), path)
     features = _within(found.features, map_options.bbox_deg, path)
     SHAPES.check(len(features), path)
-    origin = _origin(features, map_options.bbox_deg)
+    origin = options.origin or _origin(features, map_options.bbox_deg)
     _check_sizes(features, origin, path)
     prisms, problems = make_prisms(features, origin, map_options.materials,
                                    map_options.default_height_m)

@@ -11,6 +11,7 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder
+from radiotwin.frames import FRAME_FILE
 from radiotwin.importing.averaging import average
 from radiotwin.importing.levels import LEVEL_COLUMN
 from radiotwin.importing.links import build_links
@@ -21,9 +22,11 @@ from radiotwin.importing.settings_file import write_settings
 from radiotwin.importing.source import Source, read_source
 from radiotwin.importing.tally import Tally
 from radiotwin.measurements import OPTIONAL, REQUIRED, Measurements
+from radiotwin.tables import Origin
 
 HASHED_AT_ONCE = 500_000  # rows; bounds the memory of that
-FILES = {"measurements.csv", "measurements.csv.gz", "devices.csv", "import.toml", "import.json"}
+FILES = {"measurements.csv", "measurements.csv.gz", "devices.csv", FRAME_FILE, "import.toml",
+         "import.json"}
 DECIMALS = {"_m": 3, "_db": 4, "_dbm": 4, "_deg": 4, "_s": 6}
 """End of a column's name -> decimals that are written; all finer than any measurement."""
 
@@ -32,8 +35,8 @@ def import_file(path: Path | str, settings: Settings, out: Path | str, compress:
                 on_progress: Callable[[str], None] = lambda step: None) -> dict[str, Any]:
     """Import a file of measurements into a folder.
 
-    The folder gets `measurements.csv`, `devices.csv`, `import.toml`, with which the import can be
-    repeated, and `import.json`, the report.
+    The folder gets `measurements.csv`, `devices.csv`, `frame.toml` where the frame's origin is
+    known, `import.toml`, with which the import can be repeated, and `import.json`, the report.
 
     Args:
         path: `.csv`, `.csv.gz`, `.parquet` or `.geojson`.
@@ -72,7 +75,7 @@ def import_file(path: Path | str, settings: Settings, out: Path | str, compress:
     if settings.average_m:
         on_progress("averaging")
         table = average(table, settings.average_m, settings.average)
-    measurements = _measurements(table, positioned.devices, settings)
+    measurements = _measurements(table, positioned.devices, settings, positioned.frame.origin)
     report = make_report(source, rows, readings, kept, tally, positioned, measurements, settings)
     on_progress("writing")
     used = settings.model_copy(update={"origin": positioned.frame.origin})
@@ -159,13 +162,14 @@ def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,
     return PositionedLinks(links, devices, positioned.device_m[keep], positioned.frame)
 
 
-def _measurements(table: pd.DataFrame, devices: pd.DataFrame, settings: Settings) -> Measurements:
+def _measurements(table: pd.DataFrame, devices: pd.DataFrame, settings: Settings,
+                  origin: Origin | None) -> Measurements:
     """Return the two tables with the columns in order and rounded."""
     level = LEVEL_COLUMN[str(settings.level_unit)]
     table = table.rename(columns={"level_db": level})
     order = ["time_s", *REQUIRED, level, *(name for name in OPTIONAL if name != "time_s")]
     table = table[[name for name in order if name in table]].reset_index(drop=True)
-    return Measurements(_rounded(table), _rounded(devices))
+    return Measurements(_rounded(table), _rounded(devices), origin)
 
 
 def _rounded(table: pd.DataFrame) -> pd.DataFrame:

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.errors import BadInput
+from radiotwin.frames import is_same_frame, place
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 
@@ -14,6 +15,7 @@ MIN_LINKS_OF_RECEIVER = 5
 CLOSE_M, MIN_POSITIONS = 0.1, 3  # so many positions so close to each other are hardly in metres
 MAX_NAMED = 5  # names in a message
 MAX_OUTSIDE = 0.5  # share of the links
+INDOORS = "it was indoors (see building_entry), or its position or the wall is off by metres"
 
 
 def refuse_empty_levels(level_db: np.ndarray, column: str) -> None:
@@ -29,6 +31,19 @@ def refuse_empty_levels(level_db: np.ndarray, column: str) -> None:
     if len(level_db) > MIN_LINKS_OF_RECEIVER and np.nanmin(level_db) == np.nanmax(level_db):
         raise BadInput(f"all levels are {np.nanmin(level_db):g}, so there is nothing to explain; "
                        f"check the column {column}")
+
+
+def require_one_frame(measurements: Measurements, scene: Scene | None) -> None:
+    """Check that measurements and scene are not known to be in different frames.
+
+    Raises:
+        BadInput: they are.
+    """
+    here, there = measurements.origin, None if scene is None else scene.config.origin
+    if here is not None and there is not None and not is_same_frame(here, there):
+        raise BadInput(f"the measurements are in the frame about {place(here)}, the scene is in "
+                       f"that about {place(there)}; convert them with "
+                       "radiotwin.alignment.in_scene_frame")
 
 
 def check_names(measurements: Measurements) -> list[str]:
@@ -90,11 +105,10 @@ def _off_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
             f"which goes from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) m: "
             "give measurements and scene in one frame, in metres; "
             "feet and degrees are not converted")
-    return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}: do measurements and "
-            f"scene share one frame and unit?{otherwise}"
-            for odd, where, otherwise in (
-                (inside, "inside a building", " If they do, it is indoors (see building_entry)"),
-                (outside, "outside the 3D map", "")) if odd.any()]
+    return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}"
+            for odd, where in ((inside, f"inside a building: {INDOORS}"),
+                               (outside, "outside the 3D map, where nothing is known to be built"))
+            if odd.any()]
 
 
 def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,

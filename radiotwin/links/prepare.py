@@ -12,6 +12,7 @@ from radiotwin.links.checks import (
     check_positions,
     find_fill_value,
     refuse_empty_levels,
+    require_one_frame,
     unheard_devices,
     useless_receivers,
 )
@@ -36,7 +37,11 @@ def join_links(measurements: Measurements, scene: Scene) -> LinkData:
 
     Returns:
         n links; positions of unknown devices are NaN in x and y, whatever the file gives.
+
+    Raises:
+        BadInput: measurements and scene are in different frames.
     """
+    require_one_frame(measurements, scene)
     device_m = measurements.device_m.copy()
     device_m[~measurements.is_anchor, :2] = np.nan
     return _link_data(measurements, measurements.table.reset_index(drop=True), scene,
@@ -60,11 +65,12 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
 
     Raises:
         BadInput: nothing that can be used is left, or positions or levels that cannot be what they
-            are said to be.
+            are said to be, or measurements and scene are in different frames.
     """
     table = measurements.table.reset_index(drop=True)
     level_db, receiver_m = measurements.level_db, measurements.receiver_m
     device_index = measurements.device_index
+    require_one_frame(measurements, scene)
     refuse_empty_levels(level_db, measurements.level_column)
     notes: list[str] = []
     keep = np.ones(len(table), dtype=bool)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from radiotwin.alignment import in_known_frame
 from radiotwin.budgets import MAP_VALUES, PAGE_MAPS, PAGE_VALUES
 from radiotwin.closeloop.result_file import read_report
 from radiotwin.compare import Comparison
@@ -188,7 +189,10 @@ def _tracks(run: Run, measurements: Path | None) -> pd.DataFrame | None:
     if found is not None:
         if measurements is None:
             _first(found.parent, "devices.csv")
-        links = read_measurements(found).table
+        measured = read_measurements(found)
+        if run.scene is not None:
+            measured = in_known_frame(measured, run.scene.config.origin, "the scene")
+        links = measured.table
     elif run.residuals is not None and "time_s" in run.residuals:
         links = run.residuals
     else:

@@ -65,6 +65,8 @@ class BuildOptions:
         devices: Number of devices to place on free ground.
         uavs: Number of UAVs to place near the middle.
         seed: Seed of the placement.
+        origin: Where on the earth the scene's x = y = 0 lies: of a map, where to put it (None: its
+            middle); of a city model, where its file has it (None: unknown).
     """
 
     frequency_hz: float = 2.4e9
@@ -75,6 +77,7 @@ class BuildOptions:
     devices: int = 0
     uavs: int = 3
     seed: int = 0
+    origin: Origin | None = None
 
     def check(self) -> None:
         """Raise BadInput for an impossible value."""
@@ -125,12 +128,16 @@ def build_scene(source: Path | str, out_folder: Path | str, options: BuildOption
         triangles = 0 if city.surfaces is None else len(city.surfaces.faces)
         return BuildReport(str(source), None, options.frequency_hz, len(city.names), triangles,
                            problems=_by_severity(city.problems))
+    if options.origin is not None and any(city.moved_m[:2]):
+        raise BadInput(f"{source} lies too far from its x = y = 0 for --origin to say where that "
+                       "is: it was moved to the middle; move it nearer, or write [origin] into "
+                       "scene.toml")
     extent = None
     if options.bbox is not None:
         corners = np.array(options.bbox) + np.tile(city.moved_m[:2], 2)
         x_min, y_min, x_max, y_max = corners.tolist()
         extent = make_extent((x_min, x_max, y_min, y_max))
-    declared = Declared(str(source), scene_name(source), extent, None,
+    declared = Declared(str(source), scene_name(source), extent, options.origin,
                         _provenance(city, str(source), options))
     return finish_scene(city, declared, out_folder, options, check_only)
 

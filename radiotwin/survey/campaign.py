@@ -65,7 +65,8 @@ def fly_survey(scene: Scene, truth: RadioMap, *, flights: int, pattern: str, see
                 longest = max(longest, len(index))
             start_s += slot_s * longest
             advance(1)
-    return Measurements(pd.concat(tables, ignore_index=True), declared_devices(scene))
+    return Measurements(pd.concat(tables, ignore_index=True), declared_devices(scene),
+                        scene.config.origin)
 
 
 def declared_devices(scene: Scene) -> pd.DataFrame:

@@ -14,6 +14,7 @@ from radiotwin.channel.base import MIN_DETECTED
 from radiotwin.channel.published import PublishedLaw
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkData, LinkGeometry, link_geometry
+from radiotwin.links.checks import INDOORS
 from radiotwin.localize import (
     DeviceEstimate,
     LocalizeSettings,
@@ -183,11 +184,11 @@ def _check_positions(links: LinkData, scene: Scene) -> None:
                        "its position, or the scene's frame")
     receiver_m, corners_m = links.receiver_m[:, :2], scene.city.vertices[:, :2]
     outside = (receiver_m < corners_m.min(axis=0)) | (receiver_m > corners_m.max(axis=0))
-    for odd, where in ((scene.city.inside(links.receiver_m), "inside buildings"),
+    for odd, where in ((scene.city.inside(links.receiver_m), f"inside a building: {INDOORS}"),
                        (outside.any(axis=1), "outside the 3D map")):
         if odd.any():
-            warnings.warn(f"{odd.sum()} of {len(odd)} receiver positions lie {where}: do "
-                          "measurements and scene share one frame and unit?", stacklevel=4)
+            warnings.warn(f"{odd.sum():,} of {len(odd):,} links have their receiver {where}",
+                          stacklevel=4)
 
 
 def level_of(links: LinkData) -> str:

@@ -8,6 +8,7 @@ import pandas as pd
 
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.errors import BadInput
+from radiotwin.geodesy import to_geographic
 from radiotwin.links import LinkData, prepare_links
 from radiotwin.localize import PositionEstimate, locate, misfit, whole_area
 from radiotwin.measurements import Measurements
@@ -51,8 +52,8 @@ def locate_file(measurements: Measurements, twin: Twin, scene: Scene | None,
         on_progress: called after each device.
 
     Returns:
-        a row a device: `device, x_m, y_m, radius_m` (of 90 % of the probability), `links`; and
-        notes on the data.
+        a row a device: `device, x_m, y_m, radius_m` (of 90 % of the probability), `links`, and
+        `latitude_deg, longitude_deg` where the frame's origin is known; and notes on the data.
 
     Raises:
         BadInput: a twin that cannot locate, no unknown device, links of another quantity than the
@@ -93,7 +94,11 @@ def locate_file(measurements: Measurements, twin: Twin, scene: Scene | None,
                           "x_m": [each.x_m for each in found], "y_m": [each.y_m for each in found],
                           "radius_m": [each.radius_m for each in found],
                           "links": [each.links for each in found]})
-    return table.round(1), notes
+    table = table.round(1)
+    if measurements.origin is not None:
+        east_deg, north_deg = to_geographic(measurements.origin, table["x_m"], table["y_m"])
+        table = table.assign(latitude_deg=north_deg.round(7), longitude_deg=east_deg.round(7))
+    return table, notes
 
 
 def _widening(model: EffectModel, links: LinkData, found: list[PositionEstimate]) -> float:

@@ -25,6 +25,7 @@ from radiotwin.map_file import MapStream
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
+from radiotwin.tables import Origin
 from radiotwin.twin.store import decode_twin, encode_twin, read_twin, write_twin
 
 CHUNK, CHUNK_WITH_EFFECTS = 200_000, 20_000  # links predicted at once: bounds memory
@@ -76,6 +77,12 @@ class Twin:
         if self.fitted is not None and self.fitted.shadowing is not None:
             return self.fitted.shadowing.field
         return None
+
+    @property
+    def origin(self) -> Origin | None:
+        """Of the frame of its positions; None where it is not known."""
+        known = self.provenance.get("origin")
+        return None if known is None else Origin.model_validate(known)
 
     @property
     def description(self) -> str:

@@ -14,7 +14,7 @@ from radiotwin.measurements import read_measurements
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "import"
 SAMPLES = Path(__file__).parents[1] / "importing" / "samples"
-FILES = ["devices.csv", "import.json", "import.toml", "measurements.csv"]
+FILES = ["devices.csv", "frame.toml", "import.json", "import.toml", "measurements.csv"]
 
 
 @pytest.fixture
@@ -135,7 +135,7 @@ def test_many_columns_of_levels_by_options(run, tmp_path):
     (GOOD, "--columns nowhere.toml", ["nowhere.toml does not exist"]),
     (GOOD, "--columns time", ["time does not exist", "latitude=lat"]),
     (GOOD, "--origin here", ["--origin 'here'", "LATITUDE,LONGITUDE"]),
-    (GOOD, "--origin 91,0", ["origin.latitude_deg", "91"]),
+    (GOOD, "--origin 91,0", ["--origin", "latitude_deg", "91"]),
     (GOOD, "--average mode", ["average", "mode", "median"]),
     (GOOD, "--devices data.csv", ["data.csv", "column 'device'", "missing"]),
     (GOOD, "-o data.csv", ["data.csv is a file"]),
