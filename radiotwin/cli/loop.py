@@ -29,8 +29,8 @@ def close_loop(
         help="Model whose residual is explained: twin, raytrace, log-distance; auto: the best of "
              "them.")] = "auto",
     hold_out: Annotated[str, typer.Option(
-        help="Unit of cross-validation: flight, block, device; auto: flight if there are enough.")
-        ] = "auto",
+        help="Unit of cross-validation: flight, block, quadrant, device; auto: flight if there are "
+             "enough, else block.")] = "auto",
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="Folder for closeloop.json, closeloop.html and figures.")
         ] = Path("closeloop"),

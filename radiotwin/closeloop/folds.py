@@ -10,7 +10,7 @@ from radiotwin.links import LinkData
 from radiotwin.links.correlation import moving_end_m
 from radiotwin.links.evidence import fitting_width_m
 
-WAYS = ("flight", "block", "device")
+WAYS = ("flight", "block", "quadrant", "device")
 MIN_FLIGHTS = 4  # that most devices and receivers must be in, for flights to be held out
 MAX_FOLDS = 6
 BLOCK_M = 60.0  # side of a block on the ground
@@ -55,6 +55,8 @@ def make_folds(links: LinkData, seed: int, by: str = "auto") -> Folds:
         by = "flight" if _flights_are_alike(links) else "block"
     if by == "flight":
         return Folds(by, deal_groups(_require_several(links.flight, by), MAX_FOLDS, rng))
+    if by == "quadrant":
+        return Folds(by, deal_groups(_require_several(_quadrants(links), by), MAX_FOLDS, rng))
     if by == "device":
         # A device whose position is to be found from its own links cannot be left out.
         known = np.isin(links.device, sorted(links.anchors))
@@ -82,6 +84,16 @@ def _blocks(links: LinkData) -> np.ndarray:
     stretch = np.empty(len(links), dtype=int)
     stretch[order] = np.arange(len(links)) * MAX_FOLDS * STRETCHES // len(links)
     return stretch
+
+
+def _quadrants(links: LinkData) -> np.ndarray:
+    """Return labels (n,) of the four parts of the area on either side of its middle link.
+
+    Each is a piece of ground that no other link is near to: what is learnt has to extrapolate.
+    """
+    end_m = moving_end_m(links)[:, :2]
+    east, north = (end_m > np.median(end_m, axis=0)).T
+    return 2 * east + north
 
 
 def _require_several(index: np.ndarray, by: str) -> np.ndarray:

@@ -4,7 +4,8 @@ Pattern of 3GPP TR 38.901 V17, Table 7.3-1: horizontally −min(12 (φ / φ_3dB)
 −min(12 ((θ − tilt) / θ_3dB)², A_max), together no less than −A_max. The maximum gain is the
 device's level and is fitted with it. With a 3D map each path has the gain of the direction in which
 it leaves the device. Power on paths that are not followed, which is fitted too, has the mean of the
-pattern.
+pattern. Where the paths over the map explain less than the straight line to the receiver, as over
+a map with guessed heights, the gain is that of the straight line.
 """
 
 from functools import partial
@@ -97,6 +98,8 @@ class SectorAntenna(GainEffect):
 
         devices: dict[DeviceIndex, SectorPattern] = Field(
             description="Pattern of each device, by index.")
+        straight: bool = Field(False, description=(
+            "Whether links leave along the straight line even where there is a 3D map."))
 
     def __init__(self) -> None:
         self._rays = LinkCache()
@@ -111,13 +114,19 @@ class SectorAntenna(GainEffect):
     def propose(self, view: ResidualView) -> list[Params]:
         known = {device for devices in view.found_params(self.name, "devices")
                  for device in devices}
-        found = _best_patterns(view, sorted(set(_eligible_devices(view.links)) - known))
+        devices = sorted(set(_eligible_devices(view.links)) - known)
+        ways = {straight: _best_patterns(view, devices, straight)
+                for straight in ([False, True] if view.links.city is not None else [False])}
+        straight = max(ways, key=lambda way: max((nats for _, nats in ways[way].values()),
+                                                 default=0.0))  # of equal ones the first
+        found = ways[straight]
         if not found:
             return []
         best = max(found, key=lambda device: found[device][1])
         # Sectors of one mast are supported by the evidence of all of them.
         mast = set(site_of(view.links, best)) & set(found)
-        return [self.Params(devices={device: found[device][0] for device in sorted(chosen)})
+        return [self.Params(devices={device: found[device][0] for device in sorted(chosen)},
+                            straight=straight)
                 for chosen in ([mast, {best}] if len(mast) > 1 else [{best}])]
 
     @override
@@ -126,14 +135,16 @@ class SectorAntenna(GainEffect):
         for device, pattern in params.devices.items():
             rows = np.flatnonzero(links.device == device)
             if len(rows):
-                rays = self._rays.get(links, device, partial(_Rays.of, links, rows))
+                rays = self._rays.get(links, (device, params.straight),
+                                      partial(_Rays.of, links, rows, params.straight))
                 offset_db[rows] = rays.offset_db(pattern)
         return Term(offset_db, one_hot(links.device, list(params.devices)),
                     np.full(len(params.devices), LEVEL_SD_DB))
 
     @override
     def variation(self, params: Params) -> Variation:
-        return vary_patterns(params.devices, lambda devices: self.Params(devices=devices))
+        return vary_patterns(params.devices,
+                             lambda devices: params.model_copy(update={"devices": devices}))
 
     @override
     def parameters(self, links: LinkData, params: Params,
@@ -142,7 +153,8 @@ class SectorAntenna(GainEffect):
         patterns_sd = np.reshape(estimate.params_sd, (len(params.devices), -1))
         for number, (device, pattern) in enumerate(params.devices.items()):
             name = links.device_names[device]
-            reported |= report_pattern(pattern, patterns_sd[number], name, links.city is not None)
+            reported |= report_pattern(pattern, patterns_sd[number], name,
+                                       links.city is not None and not params.straight)
             reported[f"gain_db[{name}]"] = Parameter.normal(
                 estimate.coefficients[number], estimate.coefficients_sd[number], "dB")
         return reported
@@ -163,7 +175,7 @@ class _Rays(NamedTuple):
     Attributes:
         power: (n, sectors) power gain of what leaves into each sector.
         azimuth_deg, elevation_deg: (n, sectors) its direction.
-        free: (n,) power gain in free space; 0 without a map, where the straight line is all.
+        free: (n,) power gain in free space; 0 where the straight line is all.
     """
 
     power: np.ndarray
@@ -172,12 +184,12 @@ class _Rays(NamedTuple):
     free: np.ndarray
 
     @classmethod
-    def of(cls, links: LinkData, rows: np.ndarray) -> "_Rays":
-        """Return those of some links, which are followed over the map."""
+    def of(cls, links: LinkData, rows: np.ndarray, straight: bool) -> "_Rays":
+        """Return those of some links, which are followed over the map unless they are straight."""
         links = links.select(rows)
-        if links.city is None:
+        if straight or links.city is None:
             return cls(np.ones((len(links), 1)), links.azimuth_deg[:, None],
-                       links.elevation_deg[:, None], free_space(links))
+                       links.elevation_deg[:, None], np.zeros(len(links)))
         ray = rays_of(links, "departures")
         power = np.linalg.norm(ray, axis=2)
         sine = ray[..., 2] / np.maximum(power, 1e-30)
@@ -193,8 +205,8 @@ class _Rays(NamedTuple):
                                   float(mean_gain))
 
 
-def _best_patterns(view: ResidualView,
-                   devices: list[int]) -> dict[int, tuple[SectorPattern, float]]:
+def _best_patterns(view: ResidualView, devices: list[int],
+                   straight: bool) -> dict[int, tuple[SectorPattern, float]]:
     """Return device -> best pattern and its gain [nats], of those that gain enough."""
     found = {}
     for device in devices:
@@ -202,15 +214,16 @@ def _best_patterns(view: ResidualView,
         rows = subsample(every, MAX_PROPOSE_LINKS)
         if not len(rows):
             continue
-        pattern, nats = _best_pattern(view, rows)
+        pattern, nats = _best_pattern(view, rows, straight)
         if nats * len(every) / len(rows) > MIN_NATS:
             found[device] = pattern, nats * len(every) / len(rows)
     return found
 
 
-def _best_pattern(view: ResidualView, rows: np.ndarray) -> tuple[SectorPattern, float]:
+def _best_pattern(view: ResidualView, rows: np.ndarray,
+                  straight: bool) -> tuple[SectorPattern, float]:
     """Return the pattern of a grid that fits links best, and its gain over a level alone [nats]."""
-    rays, residual_db = _Rays.of(view.links, rows), view.residual_db[rows]
+    rays, residual_db = _Rays.of(view.links, rows, straight), view.residual_db[rows]
     weight = view.weight[rows] * np.isfinite(view.links.level_db[rows])
 
     def nats(offset_db: np.ndarray) -> float:

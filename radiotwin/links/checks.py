@@ -15,6 +15,7 @@ MIN_LINKS_OF_RECEIVER = 5
 CLOSE_M, MIN_POSITIONS = 0.1, 3  # so many positions so close to each other are hardly in metres
 MAX_NAMED = 5  # names in a message
 MAX_OUTSIDE = 0.5  # share of the links
+GROUND_M, ROOFS = 0.5, 0.95  # above it something is built; share of its corners that are roofs
 INDOORS = "it was indoors (see building_entry), or its position or the wall is off by metres"
 
 
@@ -92,23 +93,47 @@ def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
     return [*notes.values(), *(_off_the_map(receiver_m, scene) if scene is not None else [])]
 
 
+def unmapped_ends(receiver_m: np.ndarray, device_m: np.ndarray, scene: Scene) -> np.ndarray:
+    """Return which links end off the 3D map and below its roofs, where nobody knows what is built.
+
+    Whether such a link has line of sight is not known. What ends above the roofs has a free way
+    there, wherever it is.
+
+    Args:
+        receiver_m: (n, 3) [m].
+        device_m: (n, 3) [m]; NaN where unknown.
+        scene: the 3D map.
+
+    Returns:
+        (n,) bool.
+    """
+    low_m, high_m, roof_m = _bounds_of(scene)
+    return np.any([((end_m[:, :2] < low_m) | (end_m[:, :2] > high_m)).any(axis=1)
+                   & (end_m[:, 2] < roof_m) for end_m in (receiver_m, device_m)], axis=0)
+
+
+def _bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the corners of the map, and the height that nearly all its roofs are below [m]."""
+    vertices_m = scene.city.vertices
+    built_m = vertices_m[vertices_m[:, 2] > GROUND_M, 2]
+    roof_m = float(np.quantile(built_m, ROOFS)) if len(built_m) else 0.0
+    return vertices_m[:, :2].min(axis=0), vertices_m[:, :2].max(axis=0), roof_m
+
+
 def _off_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
     known = np.isfinite(receiver_m).all(axis=1)
     inside = np.zeros(len(receiver_m), dtype=bool)
     inside[known] = scene.city.inside(receiver_m[known])
-    corners_m = scene.city.vertices[:, :2]
-    low, high = corners_m.min(axis=0), corners_m.max(axis=0)
-    outside = ((receiver_m[:, :2] < low) | (receiver_m[:, :2] > high)).any(axis=1)
+    low, high, _ = _bounds_of(scene)
+    outside = np.any((receiver_m[:, :2] < low) | (receiver_m[:, :2] > high), axis=1)
     if outside.mean() > MAX_OUTSIDE:
         raise BadInput(
             f"{outside.sum():,} of {len(outside):,} links have their receiver outside the 3D map, "
             f"which goes from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) m: "
             "give measurements and scene in one frame, in metres; "
             "feet and degrees are not converted")
-    return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}"
-            for odd, where in ((inside, f"inside a building: {INDOORS}"),
-                               (outside, "outside the 3D map, where nothing is known to be built"))
-            if odd.any()]
+    return [f"{inside.sum():,} of {len(inside):,} links have their receiver inside a building: "
+            f"{INDOORS}"] if inside.any() else []
 
 
 def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,

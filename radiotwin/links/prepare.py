@@ -14,6 +14,7 @@ from radiotwin.links.checks import (
     refuse_empty_levels,
     require_one_frame,
     unheard_devices,
+    unmapped_ends,
     useless_receivers,
 )
 from radiotwin.links.clocks import RESTART_NOTE
@@ -101,6 +102,10 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
         notes.append(f"{low_z.sum():,} receiver heights are empty and taken for "
                      f"{ASSUMED_HEIGHT_M} m")
         receiver_m = np.where(np.isnan(receiver_m), ASSUMED_HEIGHT_M, receiver_m)
+    if scene is not None and not to_locate:
+        leave_out(unmapped_ends(receiver_m, device_m[device_index], scene),
+                  "they end below the roofs and off the 3D map, where it is not known what is in "
+                  "the way; a scene built with a wider --bbox would keep them")
     flat = np.isnan(declared_z_m).sum()
     if flat:
         notes.append(f"{flat:,} device heights are empty and taken for {ASSUMED_HEIGHT_M} m")

@@ -259,8 +259,6 @@ def test_what_else_is_in_the_output_folder_stays(close_loop, tmp_path):
 IN_THE_CITY = {
     "nothing implausible": (lambda links, devices, hidden: (links, devices), []),
     "all links with line of sight": (lambda links, devices, hidden: (links[~hidden], devices), []),
-    "receivers in buildings": (lambda links, devices, hidden: (links.assign(receiver_z_m=2.0), devices),
-                               ["links have their receiver inside a building", "one frame and unit?"]),
     "receivers in degrees": (lambda links, devices, hidden: scaled(1e-5, 11.5, 48.0)(links, devices), ["degrees"]),
     "a device never detected": (lambda links, devices, hidden: never_detected(links, devices),
                                 ["device d1 was never detected"]),
@@ -281,7 +279,9 @@ def test_thin_data_with_a_map_gives_a_result_that_says_so(close_loop, small_scen
     (lambda links, devices, hidden: put("z_m", 0.5, [0], 1)(*put("x_m", 130, [0], 1)(*put("y_m", 170, [0], 1)(
         links, devices))), ["devices, row 2", "'d0'", "inside a building"]),
     (lambda links, devices, hidden: scaled(1 / 0.3048)(links, devices), ["outside the 3D map", "feet"]),
-], ids=["all links without line of sight", "empty heights", "no anchor", "an anchor in a building", "feet"])
+    (lambda links, devices, hidden: (links.assign(receiver_z_m=2.0), devices), ["not in one frame", "--shift=0,0"]),
+], ids=["all links without line of sight", "empty heights", "no anchor", "an anchor in a building", "feet",
+        "receivers in buildings"])
 def test_wrong_data_with_a_map_is_one_message(close_loop, small_scene, tmp_path, edit, parts):
     links, devices = edit(*in_the_city(small_scene))
     refused(tmp_path, close_loop(links, devices, f"--scene {small_scene.folder} --base twin"), *parts)

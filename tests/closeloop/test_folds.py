@@ -22,3 +22,15 @@ def test_flights_are_held_out_where_they_are_alike_and_blocks_of_ground_where_no
         assert len(np.unique(folds.index[(cell == square).all(axis=1)])) == 1
     sizes = np.bincount(folds.index)
     assert sizes.max() < 1.3 * sizes.min()
+
+
+def test_a_quadrant_is_held_out_as_a_whole(open_ground):
+    world = open_ground.fly(4)
+    links = prepare_links(open_ground.measured(world), None)
+    folds = make_folds(links, 0, "quadrant")
+    assert folds.by == "quadrant" and folds.count == 4
+    middle = np.median(world.receiver_m[:, :2], axis=0)
+    for east in (False, True):
+        for north in (False, True):
+            part = ((world.receiver_m[:, 0] > middle[0]) == east) & ((world.receiver_m[:, 1] > middle[1]) == north)
+            assert len(np.unique(folds.index[part])) == 1

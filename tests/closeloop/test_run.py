@@ -176,5 +176,5 @@ def test_devices_can_be_held_out(open_ground):
         assert not set(loop.links.device[mine]) & set(loop.links.device[~mine])
     report = make_report(loop)
     assert named(report)[0] == "receiver_gain_offset" and report["heldout"]["by"] == "device"
-    with pytest.raises(BadInput, match="allowed are auto, flight, block, device"):
+    with pytest.raises(BadInput, match="allowed are auto, flight, block, quadrant, device"):
         close_loop(open_ground.measured(world), base="log-distance", hold_out="colour")

@@ -133,3 +133,24 @@ def test_however_strong_a_signal_is_a_saturated_receiver_reads_its_level_of_satu
     around_db = [_compress(level_db + step_db, -80.0, smoothness)[0] for step_db in (0.5, -0.5)]
     np.testing.assert_allclose(slope, around_db[0] - around_db[1], atol=2e-3)
     assert (slope > 0).all()  # residuals are divided by it
+
+
+@pytest.mark.parametrize("straight", [True, False])
+def test_directions_are_those_of_the_paths_or_the_straight_line_whichever_explains_more(make_links, view, straight):
+    """Receivers behind a screen: a real antenna is heard off the wall, or, over a map that is wrong, straight."""
+    walls = [trimesh.creation.box(extents=extents) for extents in ([120, 2, 60], [2, 400, 60])]
+    for wall, middle in zip(walls, ([0, 20, 30], [100, 0, 30])):
+        wall.apply_translation(middle)
+    mesh = trimesh.util.concatenate(walls)
+    rng = np.random.default_rng(0)
+    receiver_m = np.column_stack([rng.uniform(-60, 80, 600), rng.uniform(30, 150, 600), np.full(600, 10.0)])
+    links = make_links([[0.0, 0, 10]], receiver_m, city=CityMap(mesh.vertices, mesh.faces))
+    x, y = receiver_m[:, 0], receiver_m[:, 1]
+    heard = np.degrees(np.arctan2(x, y)) if straight else np.degrees(np.arctan2(198 - x, y))  # mirrored at x = 99
+    off_deg = (heard - 20 + 180) % 360 - 180
+    level_db = rng.normal(0, 1, 600) - np.minimum(12 * (off_deg / 65) ** 2, 20)
+    heard = replace(links, level_db=level_db - level_db.mean())
+    (params,) = SectorAntenna().propose(view(heard, np.zeros(600), 1.5))
+    assert params.straight is straight
+    if straight:  # off the wall they leave within 40 degrees, which does not tell an azimuth
+        assert abs((params.devices[0].azimuth_deg - 20 + 180) % 360 - 180) <= 15
