@@ -88,7 +88,8 @@ def _require_fit(measurements: Measurements, scene: Scene) -> None:
     unknown = [what for what, origin in (("the measurements", measurements.origin),
                                          ("the scene", scene.config.origin)) if origin is None]
     proposed = best_shift(scene, receiver_m)
-    remedy = f"no translation within {SEARCHED_M:g} m makes them fit (feet and degrees are not converted)" \
+    remedy = f"no translation within {SEARCHED_M:g} m makes them fit (feet and degrees are not " \
+             "converted)" \
         if proposed is None else \
         f"--shift={proposed[0]:g},{proposed[1]:g} would make them fit best"
     raise BadInput(

@@ -18,6 +18,7 @@ from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
 from radiotwin.effects.ground_reflection import GroundReflection
 from radiotwin.effects.interference import Interference
 from radiotwin.effects.lock_loss import LockLoss
+from radiotwin.effects.mapped_vegetation import MappedVegetation
 from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.noise_floor import NoiseFloor
 from radiotwin.effects.path_strength import Diffraction, WallReflection
@@ -34,8 +35,8 @@ BUILT_IN: tuple[type[Effect], ...] = (
     DeviceGainOffset, ReceiverGainOffset, DeviceDrift, ReceiverDrift, ReceiverSaturation,
     NoiseFloor, DetectionLimit, SectorAntenna, TiltedDipole, BodyShadowing, ExcessAttenuation,
     DevicePositionError, ReceiverPositionError, ReceiverClockOffset, MissingObstacle,
-    RemovedObstacle, BuildingEntry, Foliage, WallReflection, Diffraction, GroundReflection,
-    Interference, LockLoss, FaultyFlight, Episode)
+    RemovedObstacle, BuildingEntry, Foliage, MappedVegetation, WallReflection, Diffraction,
+    GroundReflection, Interference, LockLoss, FaultyFlight, Episode)
 
 _registered: list[type[Effect]] = []
 

@@ -27,6 +27,7 @@ from radiotwin.footprints.solids import (
     find_overlaps,
     make_prisms,
 )
+from radiotwin.footprints.vegetation import make_vegetation, vegetation_fact
 from radiotwin.geodesy import to_local
 from radiotwin.inputs import check_input
 from radiotwin.scene import checks
@@ -39,6 +40,7 @@ from radiotwin.scene.problems import Problem
 from radiotwin.scene.report import BuildReport
 from radiotwin.scene.sources import scene_name, source_text
 from radiotwin.scene.surfaces import Surfaces
+from radiotwin.scene.vegetation import VegetationConfig
 from radiotwin.tables import Origin
 
 READERS: dict[str, Callable[[Path], MapFile]] = {
@@ -145,20 +147,23 @@ def build_scene_from_map(
     city, shape_of = _city(prisms, contacts, extent.bounds, map_options.materials, problems)
     table = building_table(prisms, shape_of)
     counts = height_counts(table)
+    vegetation = make_vegetation(found.vegetation, origin, extent.bounds)
     declared = Declared(str(source), map_name(source), extent, origin,
                         _provenance(str(source), counts, map_options, options),
                         _facts(table["building"].nunique(), len(city.names) - 1, counts, origin,
-                               map_options))
+                               map_options, vegetation), vegetation)
     return finish_scene(city, declared, out_folder, options, check_only, table)
 
 
 def _facts(
-    buildings: int, blocks: int, counts: dict[str, int], origin: Origin, map_options: MapOptions
+    buildings: int, blocks: int, counts: dict[str, int], origin: Origin, map_options: MapOptions,
+    vegetation: list[VegetationConfig],
 ) -> tuple[tuple[str, str], ...]:
     """Return lines for the report."""
     heights = ", ".join(f"{text}: {counts.get(key, 0):,}" for key, text in HEIGHT_SOURCES.items())
     return (("buildings", f"{buildings:,} in {blocks:,} blocks"),
             ("heights from", f"{heights} ({map_options.default_height_m:g} m)"),
+            *([("vegetation", vegetation_fact(vegetation))] if vegetation else []),
             ("origin", f"latitude {origin.latitude_deg}, longitude {origin.longitude_deg}"))
 
 

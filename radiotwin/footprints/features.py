@@ -12,12 +12,13 @@ BUILDING_KEYS = ("building", "building:part")  # tags of OpenStreetMap
 
 @dataclass(frozen=True, eq=False)
 class Feature:
-    """One building or part of a building.
+    """One building or part of a building, or an area or line of vegetation.
 
     Attributes:
         name: as in the file: `way/17`, `relation/3`, `feature 4`.
         tags: as in OpenStreetMap: `building`, `building:part`, `height`, `building:levels`, ….
-        area: polygons in longitude and latitude [degrees]; as in the file, so possibly invalid.
+        area: polygons, or the line of a row of trees, in longitude and latitude [degrees]; as in
+            the file, so possibly invalid.
     """
 
     name: str
@@ -32,15 +33,17 @@ class Feature:
 
 @dataclass
 class MapFile:
-    """Buildings of a map file.
+    """Buildings and vegetation of a map file.
 
     Attributes:
         features: buildings and parts, in the file's order.
+        vegetation: areas, and lines of trees, see `radiotwin.footprints.vegetation`.
         problems: parts of the file that could not be used, and why.
     """
 
     features: list[Feature]
     problems: list[Problem] = field(default_factory=list)
+    vegetation: list[Feature] = field(default_factory=list)
 
 
 def problems_of(names: Sequence[str], text: str, severity: Severity = "warning") -> list[Problem]:

@@ -15,8 +15,10 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from radiotwin.budgets import OUTLINE_CORNERS
+from radiotwin.errors import BadInput
 from radiotwin.footprints.features import Feature, MapFile, is_building, problems_of
 from radiotwin.footprints.outlines import OutlineBudget
+from radiotwin.footprints.vegetation import kind_of
 
 MIN_RING_NODES = 4  # a triangle, with the first node again at the end
 
@@ -63,7 +65,7 @@ class OsmElements:
 
 
 def assemble(elements: OsmElements) -> MapFile:
-    """Assemble the areas of buildings and building parts.
+    """Assemble the areas of buildings and building parts, and of vegetation.
 
     Args:
         elements: of a map file.
@@ -100,7 +102,48 @@ def assemble(elements: OsmElements) -> MapFile:
     problems = problems_of(incomplete, "building(s) lack nodes or ways, as where an extract was "
                                        "cut off: left out; take a larger extract")
     problems += problems_of(unclosed, "building(s) have an outline that is not closed: left out")
-    return MapFile(ways + relations, problems)
+    vegetation, unusable = _vegetation(elements)
+    problems += problems_of(unusable, "area(s) of vegetation are incomplete, not closed or too "
+                                      "intricate: left out")
+    return MapFile(ways + relations, problems, vegetation)
+
+
+def _vegetation(elements: OsmElements) -> tuple[list[Feature], list[str]]:
+    """Return areas of vegetation and rows of trees, and the names of those that are unusable."""
+    found: list[Feature] = []
+    unusable: list[str] = []
+    budget = OutlineBudget("the map")
+    ways: list[tuple[str, Way | Relation]] = [
+        (f"way/{number}", way) for number, way in elements.ways.items()]
+    for name, element in [*ways, *((f"relation/{number}", relation)
+                                   for number, relation in elements.relations.items())]:
+        kind = kind_of(element.tags)
+        if kind is None or is_building(element.tags):
+            continue
+        try:
+            area = _way_area(name, element, kind, elements) if isinstance(element, Way) \
+                else _relation_area(name, element, elements, budget)
+            if not isinstance(area, str):
+                budget.check(name, area)
+        except BadInput:  # a wood may have more corners than any building
+            area = "incomplete"
+        if isinstance(area, str):
+            unusable.append(name)
+        else:
+            found.append(Feature(name, element.tags, area))
+    return found, unusable
+
+
+def _way_area(name: str, way: Way, kind: str,
+              elements: OsmElements) -> BaseGeometry | Literal["incomplete"]:
+    closed = len(way.nodes) >= MIN_RING_NODES and way.nodes[0] == way.nodes[-1]
+    complete = all(node in elements.positions for node in way.nodes)
+    OUTLINE_CORNERS.check(len(way.nodes), name)
+    if not complete or not (closed or (kind == "tree_row" and len(way.nodes) > 1)):
+        return "incomplete"
+    if kind == "tree_row":
+        return shapely.LineString([elements.positions[node] for node in way.nodes])
+    return _polygon(way.nodes, elements)
 
 
 def _relation_tags(relation: Relation, elements: OsmElements) -> dict[str, str] | None:

@@ -1,7 +1,7 @@
 """Reader of `.osm.pbf` files, with libosmium [1].
 
-The file is read in several passes that keep only what belongs to buildings, so that an extract of
-a whole region needs little memory.
+The file is read in several passes that keep only what belongs to buildings and vegetation, so that
+an extract of a whole region needs little memory.
 
 [1] https://osmcode.org/pyosmium
 """
@@ -14,19 +14,20 @@ from radiotwin.budgets import FEATURES, VERTICES
 from radiotwin.errors import BadInput
 from radiotwin.footprints.features import BUILDING_KEYS
 from radiotwin.footprints.osm import OsmElements, Relation, Way
+from radiotwin.footprints.vegetation import TAGS, kind_of
 from radiotwin.inputs import check_input
 
 _IDS_PER_BLOCK = 100  # elements: 40 kB of the filter for each that is looked for
 
 
 def read_osm_pbf(path: Path) -> OsmElements:
-    """Read the elements that belong to buildings.
+    """Read the elements that belong to buildings and vegetation.
 
     Args:
         path: `.osm.pbf` file.
 
     Returns:
-        Buildings, their ways and their nodes.
+        Buildings and vegetation, their ways and their nodes.
 
     Raises:
         BadInput: pyosmium is not installed, no such file, or not a PBF file.
@@ -59,6 +60,7 @@ def read_osm_pbf(path: Path) -> OsmElements:
                        if member.type == "w"]
             elements.relations[relation.id] = Relation(members, dict(relation.tags))
         _add_ways(elements, matching(kinds.WAY, filters.KeyFilter(*BUILDING_KEYS)))
+        _add_ways(elements, matching(kinds.WAY, filters.TagFilter(*TAGS)))
         _drop_other_relations(elements)
         member_ids = {way for relation in elements.relations.values()
                        for way, _ in relation.members}
@@ -87,8 +89,9 @@ def _add_ways(elements: OsmElements, ways: Iterable[Any]) -> None:
 
 
 def _drop_other_relations(elements: OsmElements) -> None:
-    """Keep relations that are buildings themselves or, as in old maps, by their ways."""
+    """Keep vegetation, and buildings that are so themselves or, as in old maps, by their ways."""
     for number, relation in list(elements.relations.items()):
-        if not any(key in relation.tags for key in BUILDING_KEYS) and not any(
+        if kind_of(relation.tags) is None and not any(
+                key in relation.tags for key in BUILDING_KEYS) and not any(
                 way in elements.ways for way, role in relation.members if role != "inner"):
             del elements.relations[number]

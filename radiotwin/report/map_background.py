@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 
 from radiotwin.report.closeloop_data import LinkArrays
 from radiotwin.scene import Scene
-from radiotwin.scene.preview import height_grid
+from radiotwin.scene.preview import draw_vegetation, height_grid
 
 BUILDING_M = 2.0  # lowest height that is drawn as a building
 CELLS = 45  # along the longer side of the map
@@ -31,6 +31,7 @@ class MapBackground:
         self.receivers_move = len(positions) >= len(links.device_m)
         self.moving_m = receiver_m if self.receivers_move else device_m
         self._height_m: np.ndarray | None = None
+        self._scene = scene
         if scene is not None:
             self._height_m, self.bounds = height_grid(scene, 500)
         else:
@@ -78,6 +79,8 @@ class MapBackground:
             labelled: whether the y axis has labels.
         """
         x_min, x_max, y_min, y_max = self.bounds
+        if self._scene is not None:
+            draw_vegetation(ax, self._scene)
         if self._height_m is not None:
             building = self._height_m > BUILDING_M
             ax.imshow(np.where(building, 0.82, np.nan), origin="lower", extent=self.bounds,

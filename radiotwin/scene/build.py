@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from collections.abc import Mapping, Set
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,6 +43,7 @@ from radiotwin.scene.preview import draw_preview
 from radiotwin.scene.problems import Problem
 from radiotwin.scene.report import BuildReport, MaterialUse
 from radiotwin.scene.sources import find_source, scene_name, source_text
+from radiotwin.scene.vegetation import VegetationConfig
 from radiotwin.scene.writer import CityShape, write_city
 from radiotwin.tables import Origin
 
@@ -153,6 +154,7 @@ class Declared:
         origin: WGS84 position of the frame's origin, where it is known.
         provenance: Entries for `scene.toml`.
         facts: More lines for the report.
+        vegetation: Volumes of it.
     """
 
     source: str
@@ -161,6 +163,7 @@ class Declared:
     origin: Origin | None
     provenance: dict[str, str]
     facts: tuple[tuple[str, str], ...] = ()
+    vegetation: Sequence[VegetationConfig] = ()
 
 
 def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, options: BuildOptions,
@@ -258,6 +261,7 @@ def _plan(city: ImportedCity, declared: Declared, options: BuildOptions) -> _Pla
                                  np.random.default_rng(options.seed)),
         "uavs": place_uavs(options.uavs, extent, lattice, buildings),
         "provenance": declared.provenance,
+        "vegetation": list(declared.vegetation),
     }
     if declared.origin is not None:
         config |= {"origin": declared.origin, "crs": local_crs(declared.origin)}

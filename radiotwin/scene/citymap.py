@@ -16,6 +16,7 @@ import numpy as np
 from radiotwin.errors import RunFailed
 from radiotwin.scene.materials import Material
 from radiotwin.scene.reader import read_triangles
+from radiotwin.scene.vegetation import Vegetation
 
 SKIN_M = 0.01  # step past a surface before the next is looked for [m]
 GROUND_M = 0.05  # faces this close to z = 0 are the ground [m]
@@ -44,18 +45,21 @@ class CityMap:
         faces: (f, 3) indices of vertices, counter-clockwise seen from outside.
         materials: Of the city; by default one, a slab of concrete of `Material`'s thickness.
         material: (f,) row of `materials` of each face; None: all are of the first.
+        vegetation: Which no ray meets; None: there is none.
     """
 
     never_changes = True
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray,
                  materials: Sequence[Material] = (CONCRETE,),
-                 material: np.ndarray | None = None) -> None:
+                 material: np.ndarray | None = None,
+                 vegetation: Vegetation | None = None) -> None:
         self.vertices = np.asarray(vertices, dtype=float)
         self.faces = np.asarray(faces, dtype=int)
         self.materials = tuple(materials)
         self.material = np.zeros(len(self.faces), dtype=int) if material is None \
             else np.asarray(material, dtype=int)
+        self.vegetation = Vegetation.of(()) if vegetation is None else vegetation
         triangles = self.vertices[self.faces]
         self._scene = _embree_scene(triangles)
         self._normals = np.cross(triangles[:, 1] - triangles[:, 0],
@@ -63,11 +67,12 @@ class CityMap:
         self._top_m = float(self.vertices[:, 2].max()) + 1.0
 
     @classmethod
-    def from_xml(cls, xml_path: Path | str) -> "CityMap":
+    def from_xml(cls, xml_path: Path | str, vegetation: Vegetation | None = None) -> "CityMap":
         """Read the meshes that a scene folder's `city.xml` names, and what they are made of.
 
         Args:
             xml_path: The file.
+            vegetation: Of the scene.
 
         Raises:
             BadInput: No such file, malformed XML, a mesh that cannot be read, or one outside the
@@ -79,7 +84,7 @@ class CityMap:
         return cls(np.concatenate([mesh.vertices for mesh, _ in shapes]),
                    np.concatenate([mesh.faces + start for (mesh, _), start in zip(shapes, starts)]),
                    materials, np.repeat([materials.index(material) for _, material in shapes],
-                                        [len(mesh.faces) for mesh, _ in shapes]))
+                                        [len(mesh.faces) for mesh, _ in shapes]), vegetation)
 
     @cached_property
     def ground_material(self) -> Material:
@@ -95,11 +100,12 @@ class CityMap:
 
     def without(self, faces: np.ndarray) -> "CityMap":
         """Return the map without some faces, (f,) bool."""
-        return CityMap(self.vertices, self.faces[~faces], self.materials, self.material[~faces])
+        return CityMap(self.vertices, self.faces[~faces], self.materials, self.material[~faces],
+                       self.vegetation)
 
-    def state(self) -> tuple[np.ndarray, np.ndarray, tuple[Material, ...], np.ndarray]:
+    def state(self) -> tuple[Any, ...]:
         """Return all that decides the answers of a map, and what paths over it are."""
-        return self.vertices, self.faces, self.materials, self.material
+        return (self.vertices, self.faces, self.materials, self.material, self.vegetation.state())
 
     def line_of_sight(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
         """Return whether no surface lies between points.

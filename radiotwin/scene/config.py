@@ -23,6 +23,7 @@ from radiotwin.files import atomic_path
 from radiotwin.geodesy import local_crs
 from radiotwin.inputs import read_toml
 from radiotwin.scene.lattice import check_lattice
+from radiotwin.scene.vegetation import VegetationConfig
 from radiotwin.tables import MAX_COORDINATE_M, Metres, Number, Origin, Table
 
 ANTENNA_HEIGHT_M = 1.5  # of a device above the ground [m]: a person, a meter, a low pole
@@ -162,6 +163,7 @@ class SceneConfig(Table):
     devices: list[DeviceConfig] = []
     uavs: list[UavConfig] = []
     mission: MissionConfig = MissionConfig()
+    vegetation: list[VegetationConfig] = []
     provenance: dict[str, str] = {}
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False,

@@ -1,6 +1,6 @@
 """A picture of a scene from above."""
 
-from pathlib import Path
+import pathlib
 from typing import Any
 
 import numpy as np
@@ -10,12 +10,15 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LightSource
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path
 
 from radiotwin.files import atomic_path
 from radiotwin.scene import Scene
 
 Bounds = tuple[float, float, float, float]
 _GROUND_COLOUR = "#eef0ee"
+VEGETATION_COLOUR = "#7fb069"
 
 
 def height_grid(scene: Scene, cells: int = 1000) -> tuple[np.ndarray, Bounds]:
@@ -35,7 +38,7 @@ def height_grid(scene: Scene, cells: int = 1000) -> tuple[np.ndarray, Bounds]:
     return scene.city.height_at(*np.meshgrid(x_m, y_m)), scene.config.extent.bounds
 
 
-def draw_preview(scene: Scene, path: Path | str) -> None:
+def draw_preview(scene: Scene, path: pathlib.Path | str) -> None:
     """Write a picture of heights, devices and the UAVs' starts.
 
     Args:
@@ -48,6 +51,7 @@ def draw_preview(scene: Scene, path: Path | str) -> None:
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
     image = draw_heights(axes, height_m, bounds)
+    draw_vegetation(axes, scene)
     clipped = height_m.max() > image.norm.vmax
     figure.colorbar(image, ax=axes, label="height [m]", shrink=0.85, pad=0.02,
                     extend="max" if clipped else "neither")
@@ -83,6 +87,19 @@ def draw_heights(axes: Axes, height_m: np.ndarray, bounds: Bounds) -> AxesImage:
     axes.set_facecolor(_GROUND_COLOUR)
     axes.set(xlabel="x, east [m]", ylabel="y, north [m]", aspect="equal")
     return image
+
+
+def draw_vegetation(axes: Axes, scene: Scene) -> None:
+    """Draw declared vegetation.
+
+    Args:
+        axes: Axes in metres.
+        scene: Scene that declares it.
+    """
+    for each in scene.config.vegetation:
+        rings = [Path([*ring, ring[0]], closed=True) for ring in each.rings_m]
+        axes.add_patch(PathPatch(Path.make_compound_path(*rings), facecolor=VEGETATION_COLOUR,
+                                 edgecolor="none", alpha=0.45, zorder=1.5))
 
 
 def draw_devices(axes: Axes, scene: Scene) -> None:

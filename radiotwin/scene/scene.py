@@ -16,6 +16,7 @@ from radiotwin.inputs import open_input, read_bytes, require_within
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import DeviceConfig, SceneConfig, UavConfig, read_config
 from radiotwin.scene.lattice import Lattice
+from radiotwin.scene.vegetation import Vegetation
 
 if TYPE_CHECKING:
     from radiotwin.radiomap import RadioMap
@@ -64,8 +65,8 @@ class Scene:
 
     @cached_property
     def city(self) -> CityMap:
-        """3D map of the city."""
-        return CityMap.from_xml(self.xml_path)
+        """3D map of the city, with its vegetation."""
+        return CityMap.from_xml(self.xml_path, Vegetation.of(self.config.vegetation))
 
     @cached_property
     def lattice(self) -> Lattice:

@@ -1,0 +1,136 @@
+"""Vegetation that a scene declares: prisms from the ground to the tree tops."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from pydantic import Field, field_validator
+from shapely.geometry.base import BaseGeometry
+
+from radiotwin.budgets import VEGETATION_CORNERS
+from radiotwin.tables import Metres, Number, Table
+
+KINDS = ("wood", "park", "tree_row")
+PAIRS_AT_ONCE = 200_000  # of ways and areas; bounds the memory
+
+
+class VegetationConfig(Table):
+    """One area of vegetation, declared in `scene.toml`.
+
+    Attributes:
+        name: as in the map.
+        kind: one of `KINDS`.
+        height_m: of the tree tops above the ground [m].
+        rings_m: x, y of the corners of the outline, then of each clearing [m].
+    """
+
+    name: str = Field(min_length=1, max_length=200)
+    kind: str
+    height_m: Number = Field(gt=0, le=150)
+    rings_m: list[list[tuple[Metres, Metres]]] = Field(min_length=1)
+
+    @field_validator("kind")
+    @classmethod
+    def _known(cls, kind: str) -> str:
+        if kind not in KINDS:
+            raise ValueError(f"is {kind!r}; allowed are {', '.join(KINDS)}")
+        return kind
+
+    @field_validator("rings_m")
+    @classmethod
+    def _rings(cls, rings_m: list) -> list:
+        if any(len(ring) < 3 for ring in rings_m):
+            raise ValueError("a ring has fewer than 3 corners")
+        VEGETATION_CORNERS.check(sum(map(len, rings_m)), "an area of vegetation")
+        return rings_m
+
+
+@dataclass(frozen=True, eq=False)
+class Vegetation:
+    """Areas of vegetation that do not overlap.
+
+    Attributes:
+        areas: (k,) polygons [m]; where declared ones overlap, the higher one has it.
+        height_m: (k,) [m].
+        kind: (k,) of each, of `KINDS`.
+    """
+
+    areas: np.ndarray
+    height_m: np.ndarray
+    kind: np.ndarray
+
+    @classmethod
+    def of(cls, declared: Sequence[VegetationConfig]) -> "Vegetation":
+        """Return what is declared, without overlaps."""
+        VEGETATION_CORNERS.check(sum(len(ring) for each in declared for ring in each.rings_m),
+                                 "the vegetation")
+        areas, heights_m, kinds = [], [], []
+        taken: BaseGeometry = shapely.MultiPolygon()
+        for each in sorted(declared, key=lambda one: -one.height_m):
+            outline, *holes = each.rings_m
+            area = shapely.make_valid(shapely.Polygon(outline, holes))
+            parts = [part for part in shapely.get_parts(shapely.get_parts(
+                shapely.difference(area, taken))) if part.geom_type == "Polygon"]
+            taken = shapely.union(taken, area)
+            areas += parts
+            heights_m += [each.height_m] * len(parts)
+            kinds += [each.kind] * len(parts)
+        return cls(np.array(areas, dtype=object), np.array(heights_m, dtype=float),
+                   np.array(kinds, dtype=str))
+
+    def __len__(self) -> int:
+        """Return the number of areas."""
+        return len(self.areas)
+
+    def state(self) -> tuple[list[bytes], np.ndarray, list[str]]:
+        """Return all that decides the answers."""
+        return [area.wkb for area in self.areas], self.height_m, self.kind.tolist()
+
+    def of_kind(self, kind: str) -> "Vegetation":
+        """Return the areas of one kind."""
+        own = self.kind == kind
+        return Vegetation(self.areas[own], self.height_m[own], self.kind[own])
+
+    def metres_through(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
+        """Return the length of each straight way that is in vegetation.
+
+        Args:
+            a_m: (n, 3) where they begin [m].
+            b_m: (n, 3) where they end [m].
+
+        Returns:
+            (n,) [m].
+        """
+        through_m = np.zeros(len(a_m))
+        for height_m in np.unique(self.height_m):
+            areas = self.areas[self.height_m == height_m]
+            rows, low_a_m, low_b_m = _below(a_m, b_m, height_m)
+            tree = shapely.STRtree(areas)
+            step = max(1, PAIRS_AT_ONCE // len(areas))
+            for start in range(0, len(rows), step):
+                part = slice(start, start + step)
+                flat = np.asarray(shapely.linestrings(
+                    np.stack([low_a_m[part, :2], low_b_m[part, :2]], axis=1)))
+                way, area = tree.query(flat, predicate="intersects")
+                flat_m = shapely.length(shapely.intersection(flat[way], areas[area]))
+                whole_m = shapely.length(flat[way])
+                long_m = np.linalg.norm(low_b_m[part] - low_a_m[part], axis=1)[way]
+                share = np.where(whole_m > 1e-6, flat_m / np.maximum(whole_m, 1e-6), 1.0)
+                np.add.at(through_m, rows[part][way], share * long_m)
+        return through_m
+
+
+def _below(a_m: np.ndarray, b_m: np.ndarray,
+           height_m: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which ways (m,) have a part between the ground and a height, and its ends (m, 3)."""
+    rise_m = b_m[:, 2] - a_m[:, 2]
+    flat = np.abs(rise_m) < 1e-9
+    slope = np.where(flat, 1.0, rise_m)
+    at_top, at_ground = (height_m - a_m[:, 2]) / slope, -a_m[:, 2] / slope
+    first = np.where(flat, 0.0, np.clip(np.minimum(at_top, at_ground), 0.0, 1.0))
+    last = np.where(flat, 1.0, np.clip(np.maximum(at_top, at_ground), 0.0, 1.0))
+    level = flat & (a_m[:, 2] >= 0) & (a_m[:, 2] <= height_m)
+    rows = np.flatnonzero(np.where(flat, level, last > first))
+    way_m = (b_m - a_m)[rows]
+    return rows, a_m[rows] + first[rows, None] * way_m, a_m[rows] + last[rows, None] * way_m

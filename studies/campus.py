@@ -1,0 +1,273 @@
+"""A real campus with its real map, from the raw files to causes: `campus` and `readings`.
+
+The folder `RADIOTWIN_DATA` (default: `shared/data` beside the checkout) holds `duke_cbrs` with
+`raw.csv.gz`, `sites.csv`, `import.toml` and `map.osm`; docs/real-data.md says where they come from.
+"""
+
+import gzip
+import shutil
+import tempfile
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from scipy.stats import t as student
+
+from radiotwin import BadInput, Loop, Measurements, Scene, close_loop, make_report
+from radiotwin.alignment import in_scene_frame
+from radiotwin.channel.log_distance import LogDistance
+from radiotwin.channel.regression_kriging import RegressionKriging
+from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
+from radiotwin.closeloop.baselines import BOOSTING, EXTRA_TREES, Part, law_db, trees_db
+from radiotwin.closeloop.corrected_twin import corrected_twin
+from radiotwin.footprints import MapOptions, build_scene_from_map
+from radiotwin.importing import import_file, read_settings
+from radiotwin.links import LinkData, prepare_links
+from radiotwin.measurements import read_measurements
+from radiotwin.scene.build import BuildOptions
+from studies.closeloop import counted, summary
+from studies.closeloop_real import (
+    DATA,
+    azimuth_errors_deg,
+    explained,
+    permuted,
+    turned_rmse_db,
+)
+from studies.runner import Study
+from studies.tables import markdown, number
+
+BBOX_DEG = (35.9924, -78.9427, 36.0078, -78.9288)  # of the campus: south, west, north, east
+HEIGHT_DEFAULT_M, FREQUENCY_HZ = 14.0, 3.6e9
+SPLITS = {"block": "60 m blocks", "quadrant": "a quadrant of the area", "device": "a sector"}
+BASES = ("twin", "raytrace", "log-distance")
+CONTROLS = {"mirrored": "map mirrored", "shifted": "map shifted by 50 m",
+            "permuted": "levels permuted within each sector"}
+SHIFT_M = 50.0
+COVERAGE = 0.9
+READINGS = (250, 500, 1000, 2000, 4000)
+LEAST_M = 60.0  # side of the squares that few drives are drawn by
+
+
+def campus() -> tuple[Measurements, Scene]:
+    """Return the readings in the scene's frame, and the scene, both from the raw files.
+
+    Raises:
+        BadInput: the files are not there.
+    """
+    source = DATA / "duke_cbrs"
+    if not (source / "map.osm").is_file():
+        raise BadInput(f"{source / 'map.osm'} is not there: docs/real-data.md says where to get "
+                       "it; name the folder above it in RADIOTWIN_DATA")
+    with tempfile.TemporaryDirectory() as name, warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        folder = Path(name)
+        for each in ("sites.csv", "import.toml", "map.osm"):
+            shutil.copy(source / each, folder / each)
+        with gzip.open(source / "raw.csv.gz") as raw, (folder / "raw.csv").open("wb") as target:
+            shutil.copyfileobj(raw, target)
+        import_file(folder / "raw.csv", read_settings(folder / "import.toml", {}, folder),
+                    folder / "measured")
+        build_scene_from_map(folder / "map.osm", folder / "scene",
+                             MapOptions(BBOX_DEG, HEIGHT_DEFAULT_M),
+                             BuildOptions(frequency_hz=FREQUENCY_HZ))
+        scene = Scene.load(folder / "scene")
+        measured = in_scene_frame(read_measurements(folder / "measured" / "measurements.csv"),
+                                  scene)
+        _ = scene.city, scene.content_hash()  # read before the folder goes
+        return measured, scene
+
+
+def campus_cases(seed: int) -> dict[str, dict]:
+    """Return every base held out every way, and controls over a wrong map or wrong levels."""
+    cases = {f"{split}-{base}": {"split": split, "base": base, "control": None}
+             for split in SPLITS for base in BASES}
+    return cases | {control: {"split": "block", "base": "twin", "control": control}
+                    for control in CONTROLS}
+
+
+def find_on_campus(seed: int, settings: dict) -> dict:
+    """Close the loop on all readings."""
+    measured, scene = campus()
+    measured = _controlled(measured, settings["control"], seed)
+    has_map = settings["base"] != "log-distance"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        loop = close_loop(measured, scene if has_map else None, settings["base"], seed,
+                          hold_out=settings["split"])
+        report = make_report(loop)
+    error = report["error"]
+    result = summary(report) | {
+        "links": len(loop.links), "before_db": error["before"]["rmse_db"],
+        "named_db": explained(loop).rmse_db(), "named_bias_db": _bias_db(loop),
+        "after_db": error["after"]["rmse_db"], "after_bias_db": error["after"]["bias_db"],
+        "combined_db": error["combined"]["rmse_db"], "coverage": coverage(loop),
+        "baselines_db": {name: scores["rmse_db"] for name, scores in report["baselines"].items()},
+        "probabilities": report["posterior"], "notes": report["notes"],
+        "effects": [{"name": effect["name"], "parameters": effect["parameters"]}
+                    for effect in report["effects"]],
+        "azimuth_error_deg": azimuth_errors_deg(report)}
+    if settings["control"] is None and settings["split"] == "block":
+        result["turned_by_180_db"] = turned_rmse_db(loop)
+    return result
+
+
+def _controlled(measured: Measurements, control: str | None, seed: int) -> Measurements:
+    """Return measurements with what a control does; what moves them is the same as moving the map.
+
+    Only the x of both ends is mirrored, so that distances stay.
+    """
+    if control == "permuted":
+        return permuted(measured, seed)
+    if control == "shifted":
+        return measured.moved(lambda position_m: position_m + [SHIFT_M, 0.0, 0.0], measured.origin)
+    if control == "mirrored":
+        return measured.moved(lambda position_m: position_m * [-1.0, 1.0, 1.0], measured.origin)
+    return measured
+
+
+def _bias_db(loop: Loop) -> float:
+    model = explained(loop)
+    return float(np.nanmean(model.links.level_db - model.held_out_mean_db))
+
+
+def coverage(loop: Loop) -> float:
+    """Return the share of held-out readings within their central 90 % interval."""
+    mean_db, scale_db = loop.after.held_out_reading
+    half = student.ppf(0.5 + COVERAGE / 2, loop.after.whole.dof)
+    error_db = np.abs(loop.links.level_db - mean_db)
+    known = np.isfinite(error_db)
+    return float((error_db[known] <= half * scale_db[known]).mean())
+
+
+def campus_table(rows: pd.DataFrame) -> str:
+    """Return errors by split and base, azimuths, and the controls."""
+    by_name = rows.set_index("name")
+    named = [name for name in campus_cases(0) if name in by_name.index]
+    parts = [markdown(
+        ["held out", "base", "base alone [dB]", "named effects", "mean error", "with the rest",
+         "combined", "best of the others", "in 90 %", "named"],
+        [[SPLITS[split], f"`{base}`", *(number(row[key], 2) for key in (
+            "before_db", "named_db", "named_bias_db", "after_db", "combined_db")),
+          _best(row["baselines_db"]), f"{100 * row['coverage']:.0f} %", counted(row["named"])]
+         for name in named if name not in CONTROLS
+         for split, _, base in [name.partition("-")] for row in [by_name.loc[name]]],
+        "A campus with its map", ": RMSE of held-out readings")]
+    found = [(name, by_name.loc[name]) for name in named if name.startswith("block-")]
+    sectors = sorted({each for _, row in found for each in row["azimuth_error_deg"]})
+    parts.append(markdown(
+        ["base", *sectors, "turned by 180° [dB]"],
+        [[f"`{name.removeprefix('block-')}`",
+          *(number(row["azimuth_error_deg"].get(each, np.nan), 0) for each in sectors),
+          number(row["turned_by_180_db"], 2)] for name, row in found],
+        "Azimuths found", ": how far off [°]"))
+    parts.append(markdown(
+        ["control", "base alone [dB]", "named effects", "combined", "named"],
+        [[CONTROLS[name], *(number(by_name.loc[name][key], 2)
+                            for key in ("before_db", "named_db", "combined_db")),
+          counted(by_name.loc[name]["named"])] for name in named if name in CONTROLS],
+        "Controls", ", base `twin`, 60 m blocks"))
+    return "\n\n".join(parts)
+
+
+def _best(baselines_db: dict[str, float]) -> str:
+    name = min(baselines_db, key=baselines_db.__getitem__)
+    return f"{number(baselines_db[name], 2)} (`{name}`)"
+
+
+def readings_cases(seed: int) -> dict[str, dict]:
+    """Return numbers of readings, scattered over the campus, and of few drives."""
+    return {f"{way}-{count}": {"way": way, "count": count}
+            for way in ("scattered", "drives") for count in READINGS}
+
+
+def learn_from_few(seed: int, settings: dict) -> dict:
+    """Learn from some readings, and predict all others."""
+    measured, scene = campus()
+    rng = np.random.default_rng(seed)
+    chosen = _drawn(measured, settings["way"], settings["count"], rng)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        links = prepare_links(measured, scene)
+        rows = _rows_of(links, measured, chosen)
+        test = np.setdiff1d(np.arange(len(links)), rows)
+        level_db = links.level_db[test]
+        loop = close_loop(measured.select(np.isin(np.arange(len(measured.table)), chosen)), scene,
+                          "twin", seed)
+        twin = corrected_twin(loop, scene)
+        predicted = {"twin": twin.predict(links.select(test)).mean_db}
+        few = replace(links, limit_db=np.full(len(links), -np.inf))
+        for kind in (LogDistance, SegmentedLogDistance, RegressionKriging):
+            predicted[kind.name] = law_db(kind, few, rows, test)
+        for name in (EXTRA_TREES, BOOSTING):
+            predicted[name] = trees_db(name, Part(few), rows, test, seed)
+    report = summary(make_report(loop))
+    return report | {"learnt": len(rows), "rmse_db": {
+        name: float(np.sqrt(np.nanmean((level_db - mean_db) ** 2)))
+        for name, mean_db in predicted.items()}}
+
+
+def _drawn(measured: Measurements, way: str, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return rows of the readings that are learnt from: any, or all of some squares of ground."""
+    order = rng.permutation(len(measured.table))
+    if way == "scattered":
+        return np.sort(order[:count])
+    cell = np.floor(measured.receiver_m[:, :2] / LEAST_M).astype(int)
+    square = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    rank = rng.permutation(square.max() + 1)[square]
+    return np.sort(np.lexsort((order, rank))[:count])
+
+
+def _rows_of(links: LinkData, measured: Measurements, chosen: np.ndarray) -> np.ndarray:
+    """Return rows of prepared links that are those of the measurements; some were left out."""
+    def keys(receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarray) -> list[tuple]:
+        return list(zip(*np.round(receiver_m[:, :2].T, 3), device, level_db))
+
+    names = np.array(links.device_names)
+    wanted = set(keys(measured.receiver_m[chosen],
+                      measured.table["device"].to_numpy()[chosen], measured.level_db[chosen]))
+    return np.flatnonzero([key in wanted for key in keys(
+        links.receiver_m, names[links.device], links.level_db)])
+
+
+def readings_table(rows: pd.DataFrame) -> str:
+    """Return errors by number of readings."""
+    models = list(rows.iloc[0]["rmse_db"])
+    parts = []
+    for way, title in (("scattered", "Readings scattered over the campus"),
+                       ("drives", "Readings of some squares of 60 m")):
+        own = rows[rows["name"].str.startswith(way)]
+        grouped = own.groupby(own["name"].str.rpartition("-")[2].astype(int))
+        parts.append(markdown(
+            ["readings", *(f"`{name}`" for name in models)],
+            [[f"{count:,}", *(number(np.mean([each[name] for each in group["rmse_db"]]), 2)
+                              for name in models)] for count, group in grouped],
+            title, ": RMSE of all others [dB]"))
+    return "\n\n".join(parts)
+
+
+def readings_figure(rows: pd.DataFrame) -> dict[str, Figure]:
+    """Return the learning curves."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    for axes, way in zip(figure.subplots(1, 2, sharey=True), ("scattered", "drives")):
+        own = rows[rows["name"].str.startswith(way)]
+        for name in rows.iloc[0]["rmse_db"]:
+            error_db = own.groupby(own["name"].str.rpartition("-")[2].astype(int))["rmse_db"].apply(
+                lambda group, name=name: np.mean([each[name] for each in group]))
+            axes.plot(error_db.index, error_db, marker="o", label=name.replace("_", " "),
+                      linewidth=2.5 if name == "twin" else 1.2)
+        axes.set(xscale="log", xlabel="readings learnt from", title={
+            "scattered": "scattered over the campus", "drives": "all of some 60 m squares"}[way])
+        axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.axes[0].set_ylabel("RMSE of all other readings [dB]")
+    return {"readings": figure}
+
+
+STUDIES = {
+    "campus": Study("What does the loop make of a real campus with its real map?", find_on_campus,
+                    campus_cases, campus_table, seeds=1),
+    "readings": Study("How many readings does a twin of a real campus need?", learn_from_few,
+                      readings_cases, readings_table, readings_figure, seeds=2)}
