@@ -8,6 +8,8 @@ import gzip
 import shutil
 import tempfile
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -51,8 +53,9 @@ READINGS = (250, 500, 1000, 2000, 4000)
 LEAST_M = 60.0  # side of the squares that few drives are drawn by
 
 
-def campus() -> tuple[Measurements, Scene]:
-    """Return the readings in the scene's frame, and the scene, both from the raw files.
+@contextmanager
+def campus() -> Iterator[tuple[Measurements, Scene]]:
+    """Make the readings in the scene's frame, and the scene, both from the raw files.
 
     Raises:
         BadInput: the files are not there.
@@ -62,7 +65,7 @@ def campus() -> tuple[Measurements, Scene]:
         raise BadInput(f"{source / 'map.osm'} is not there: docs/real-data.md says where to get "
                        "it; name the folder above it in RADIOTWIN_DATA")
     with tempfile.TemporaryDirectory() as name, warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+        warnings.simplefilter("ignore")  # of positions indoors and the like: they are in the notes
         folder = Path(name)
         for each in ("sites.csv", "import.toml", "map.osm"):
             shutil.copy(source / each, folder / each)
@@ -76,8 +79,7 @@ def campus() -> tuple[Measurements, Scene]:
         scene = Scene.load(folder / "scene")
         measured = in_scene_frame(read_measurements(folder / "measured" / "measurements.csv"),
                                   scene)
-        _ = scene.city, scene.content_hash()  # read before the folder goes
-        return measured, scene
+        yield measured, scene
 
 
 def campus_cases(seed: int) -> dict[str, dict]:
@@ -90,11 +92,9 @@ def campus_cases(seed: int) -> dict[str, dict]:
 
 def find_on_campus(seed: int, settings: dict) -> dict:
     """Close the loop on all readings."""
-    measured, scene = campus()
-    measured = _controlled(measured, settings["control"], seed)
     has_map = settings["base"] != "log-distance"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with campus() as (measured, scene):
+        measured = _controlled(measured, settings["control"], seed)
         loop = close_loop(measured, scene if has_map else None, settings["base"], seed,
                           hold_out=settings["split"])
         report = make_report(loop)
@@ -185,11 +185,9 @@ def readings_cases(seed: int) -> dict[str, dict]:
 
 def learn_from_few(seed: int, settings: dict) -> dict:
     """Learn from some readings, and predict all others."""
-    measured, scene = campus()
     rng = np.random.default_rng(seed)
-    chosen = _drawn(measured, settings["way"], settings["count"], rng)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with campus() as (measured, scene):
+        chosen = _drawn(measured, settings["way"], settings["count"], rng)
         links = prepare_links(measured, scene)
         rows = _rows_of(links, measured, chosen)
         test = np.setdiff1d(np.arange(len(links)), rows)
