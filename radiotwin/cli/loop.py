@@ -35,9 +35,9 @@ def close_loop(
         "--out", "-o", help="Folder for closeloop.json, closeloop.html and figures.")
         ] = Path("closeloop"),
     write_scene: Annotated[Path | None, typer.Option(
-        metavar="DIR", help="Scene folder to write: SCENE with the missing obstacles that were "
-                            "found, without the buildings that are gone, and with anchors where "
-                            "they were found.")] = None,
+        metavar="DIR", help="Scene folder to write: SCENE with the missing obstacles and the "
+                            "antennas that were found, without the buildings that are gone, and "
+                            "with anchors where they were found.")] = None,
     shift: Shift = None,
     seed: Annotated[int, typer.Option(
         min=0, help="Seed of folds, fits and permutations.")] = 0,
@@ -85,8 +85,8 @@ def close_loop(
     if write_scene is not None and world is not None:
         changes = write_corrected_scene(loop, world, write_scene)
         say(f"wrote {write_scene}: {'; '.join(changes)}" if changes else
-            f"{write_scene} is not written: no building and no anchor was found to be wrong in "
-            f"{scene}")
+            f"{write_scene} is not written: no building, no anchor and no antenna was found to "
+            f"be wrong in {scene}")
 
 
 def _print(report: dict[str, Any]) -> None:

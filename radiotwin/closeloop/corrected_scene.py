@@ -1,4 +1,7 @@
-"""The declared scene corrected by what the loop found: boxes, removed buildings, moved anchors."""
+"""The declared scene corrected by what the loop found.
+
+Boxes are added, buildings taken out, anchors moved, and antennas declared.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -6,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from radiotwin.closeloop.corrected_antennas import FOLDER as ANTENNAS
+from radiotwin.closeloop.corrected_antennas import with_antennas, write_antenna
 from radiotwin.closeloop.run import Loop
 from radiotwin.effects.boxes import Box
 from radiotwin.effects.missing_obstacle import MissingObstacle
@@ -16,7 +21,7 @@ from radiotwin.files import atomic_folder, require_writable
 from radiotwin.inputs import is_within
 from radiotwin.links import site_of
 from radiotwin.scene import Scene
-from radiotwin.scene.build import check_target
+from radiotwin.scene.build import SCENE_FILES, check_target
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import SceneConfig, write_config
 from radiotwin.scene.materials import itu_material, traceable
@@ -25,6 +30,7 @@ from radiotwin.scene.preview import draw_preview
 from radiotwin.scene.reader import read_city
 from radiotwin.scene.writer import CityShape, write_city
 
+CONTENT = SCENE_FILES | {ANTENNAS}  # of a corrected scene
 BOX_MATERIAL = "concrete"  # the likeliest of a building of unknown material
 CLEARANCE_M = 0.5  # between walls and positions that are known to be outside [m]
 MAX_SHIFT_M = 60.0  # by which a device is moved out of a building [m]
@@ -49,12 +55,12 @@ def check_corrected_target(folder: Path, scene: Scene | None, report_folder: Pat
         if is_within(other, folder):
             raise BadInput(f"--write-scene {folder}: {what} is in {other}, which the corrected "
                            "scene would replace; choose another folder")
-    check_target(folder)
+    check_target(folder, CONTENT)
     require_writable(folder / "scene.toml")
 
 
 def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
-    """Write a copy of the scene with boxes added, buildings removed and anchors moved.
+    """Write a copy of the scene with boxes, without buildings, with anchors and antennas as found.
 
     Args:
         loop: whose accepted effects are the corrections.
@@ -83,16 +89,19 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
                f"stands at ({box.x_m:.0f}, {box.y_m:.0f}) m" for box in boxes]
     changes += ["the building at ({:.0f}, {:.0f}) m, {:.0f} m high, is taken out".format(
         *centres_m[building]) for building in gone]
-    changes += moves
+    config, antennas, found = with_antennas(config, loop, scene)
+    changes += moves + found
     if not changes:
         return []
-    check_target(folder)
+    check_target(folder, CONTENT)
     earlier = config.provenance.get("corrected")
     corrected = "; ".join(([earlier] if earlier else []) + changes)
     provenance = config.provenance | {"corrected": corrected}
     with atomic_folder(folder) as temporary:
         _write_city(scene, temporary, keep, boxes)
         scene.copy_antennas(temporary)
+        for file, pattern in antennas.items():
+            write_antenna(pattern, temporary / file)
         write_config(config.model_copy(update={"provenance": provenance}), temporary / "scene.toml")
         draw_preview(Scene.load(temporary), temporary / "preview.png")
     return changes

@@ -12,6 +12,7 @@ from radiotwin.effects.gain_drift import ReceiverDrift
 from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.position_errors import DevicePositionError
 from radiotwin.effects.removed_obstacle import RemovedObstacle, buildings
+from radiotwin.effects.sector_antenna import SectorAntenna
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
 from radiotwin.scene.materials import itu_material
@@ -94,6 +95,51 @@ def test_an_anchor_is_where_it_was_found(small_scene, tmp_path):
     assert new.device_m[0] == pytest.approx(small_scene.device_m[0] + (5, 20, 0))
     assert (new.device_m[1:] == small_scene.device_m[1:]).all()
     assert new.xml_path.read_bytes() == small_scene.xml_path.read_bytes()
+
+
+SECTOR = {"azimuth_deg": 205.0, "beamwidth_deg": 60.0, "front_to_back_db": 25.0, "tilt_deg": -8.0,
+          "vertical_beamwidth_deg": 12.0}
+
+
+def sector_dbi(azimuth_deg, elevation_deg):
+    """Attenuation of 3GPP TR 38.901, Table 7.3-1, written out, without the gain of its maximum."""
+    off = (np.asarray(azimuth_deg) - 205.0 + 180) % 360 - 180
+    horizontal, vertical = (12 * (off / 60) ** 2).clip(max=25), (12 * ((elevation_deg + 8.0) / 12) ** 2).clip(max=25)
+    return -(horizontal + vertical).clip(max=25)
+
+
+def rays(azimuth_deg, elevation_deg):
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    return np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation), np.sin(elevation)], -1)
+
+
+def test_an_antenna_that_was_found_is_declared(small_scene, tmp_path):
+    name = small_scene.config.devices[0].device
+    changes = write_corrected_scene(loop_of(small_scene, (SectorAntenna, {"devices": {0: SECTOR}})), small_scene,
+                                    tmp_path / "new")
+    assert changes == [f"{name} has a sector antenna that looks to 205° and is 60° wide"]
+    antenna, *others = Scene.load(tmp_path / "new").device_antennas
+    assert others == [None] * len(others)
+    azimuth, elevation = np.meshgrid(np.arange(0, 360, 10.0), np.arange(-88.0, 89.0, 4.0))
+    gain_dbi = antenna.gain_dbi(rays(azimuth, elevation))
+    peak_dbi = antenna.gain_dbi(rays(205.0, -8.0))
+    np.testing.assert_allclose(gain_dbi - peak_dbi, sector_dbi(azimuth, elevation), atol=0.15)
+    weight = np.cos(np.radians(elevation))
+    assert 10 * np.log10((weight * 10 ** (gain_dbi / 10)).sum() / weight.sum()) == pytest.approx(0, abs=0.1)
+    again = write_corrected_scene(loop_of(small_scene, (SectorAntenna, {"devices": {1: SECTOR}})), small_scene,
+                                  tmp_path / "new")
+    assert len(again) == 1 and Scene.load(tmp_path / "new").device_antennas[0] is None
+
+
+def test_an_anchor_that_the_scene_lacks_is_declared_with_its_antenna(small_scene, tmp_path):
+    loop = loop_of(small_scene, (SectorAntenna, {"devices": {0: SECTOR}}))
+    loop.after.whole.links.device_names = ["mast"]
+    write_corrected_scene(loop, small_scene, tmp_path / "new")
+    first, last = small_scene.config.devices[0], Scene.load(tmp_path / "new").config.devices[-1]
+    assert (last.device, last.x_m, last.y_m, last.z_m, last.role) == ("mast", first.x_m, first.y_m, first.z_m, "anchor")
+    loop.after.whole.links.device_m = np.array([[1e5, 0.0, 30.0]])
+    (told,) = write_corrected_scene(loop, small_scene, tmp_path / "far")
+    assert "mast has a sector antenna, and is not in the scene" in told
 
 
 def test_positions_that_cannot_be_are_moved_to_the_nearest_that_can(small_scene, tmp_path):
