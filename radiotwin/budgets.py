@@ -104,6 +104,8 @@ SEARCH_FOLDERS = Budget("SEARCH_FOLDERS", 100, "folders to search", "a Mitsuba f
 FEATURES = Budget("FEATURES", 5_000_000, "buildings", "a map file, before it is cut to a box")
 OUTLINE_CORNERS = Budget("OUTLINE_CORNERS", 20_000, "corners", "one building of a map")
 VEGETATION_CORNERS = Budget("VEGETATION_CORNERS", 50_000, "corners", "all vegetation of a scene")
+VEGETATION_MEETINGS = Budget("VEGETATION_MEETINGS", 200_000, "meetings of its outlines",
+                             "all vegetation of a scene")
 CROSSINGS = Budget("CROSSINGS", 2_000, "crossings of outlines with themselves", "a map")
 OVERLAPS = Budget("OVERLAPS", 20_000, "pairs of buildings that overlap", "a map")
 PART_PAIRS = Budget("PART_PAIRS", 2_000_000, "pairs of a part and a building around it", "a map")

@@ -147,7 +147,8 @@ def build_scene_from_map(
     city, shape_of = _city(prisms, contacts, extent.bounds, map_options.materials, problems)
     table = building_table(prisms, shape_of)
     counts = height_counts(table)
-    vegetation = make_vegetation(found.vegetation, origin, extent.bounds)
+    vegetation, unusable = make_vegetation(found.vegetation, origin, extent.bounds)
+    city.problems.extend(unusable)
     declared = Declared(str(source), map_name(source), extent, origin,
                         _provenance(str(source), counts, map_options, options),
                         _facts(table["building"].nunique(), len(city.names) - 1, counts, origin,

@@ -1,4 +1,4 @@
-"""Download of an area's buildings from OpenStreetMap's database (Overpass API [1]).
+"""Download of an area's buildings and vegetation from OpenStreetMap's database (Overpass API [1]).
 
 [1] https://wiki.openstreetmap.org/wiki/Overpass_API
 """
@@ -14,6 +14,7 @@ from radiotwin.budgets import FILE_BYTES
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.files import atomic_file
 from radiotwin.footprints.features import BUILDING_KEYS
+from radiotwin.footprints.vegetation import TAGS
 
 SERVER = "https://overpass-api.de/api/interpreter"
 TIMEOUT_S = 180  # [s], the default of Overpass itself
@@ -24,7 +25,7 @@ MAX_AREA_KM2 = 100.0  # [km²], chosen so that one request does not burden a pub
 def download_osm(
     path: Path, bbox_deg: tuple[float, float, float, float], server: str = SERVER
 ) -> None:
-    """Download the buildings of an area to an `.osm` file.
+    """Download the buildings and the vegetation of an area to an `.osm` file.
 
     Args:
         path: `.osm` file that does not exist yet.
@@ -50,8 +51,9 @@ def download_osm(
                        f"server, {MAX_AREA_KM2:g} km² are allowed; make --bbox smaller, or "
                        "download an extract (.osm.pbf)")
     box = ",".join(f"{value:.7f}" for value in bbox_deg)
-    selectors = "".join(f'{kind}["{key}"]({box});' for kind in ("way", "relation")
-                        for key in BUILDING_KEYS)
+    wanted = [*(f'["{key}"]' for key in BUILDING_KEYS),
+              *(f'["{key}"="{value}"]' for key, value in TAGS)]
+    selectors = "".join(f"{kind}{each}({box});" for kind in ("way", "relation") for each in wanted)
     query = f"[out:xml][timeout:{TIMEOUT_S}];({selectors});(._;>;);out body;"
     request = urllib.request.Request(
         server, urllib.parse.urlencode({"data": query}).encode(),

@@ -12,9 +12,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import shapely
 
-from radiotwin.footprints.features import Feature
+from radiotwin.budgets import VEGETATION_CORNERS
+from radiotwin.footprints.features import Feature, problems_of
 from radiotwin.footprints.heights import parse_length_m
 from radiotwin.geodesy import to_local
+from radiotwin.scene.problems import Problem
 from radiotwin.scene.vegetation import VegetationConfig
 from radiotwin.tables import Origin
 
@@ -40,7 +42,8 @@ def kind_of(tags: Mapping[str, str]) -> str | None:
 
 
 def make_vegetation(features: Sequence[Feature], origin: Origin,
-                    box_m: tuple[float, float, float, float]) -> list[VegetationConfig]:
+                    box_m: tuple[float, float, float, float]
+                    ) -> tuple[list[VegetationConfig], list[Problem]]:
     """Make volumes from areas and lines.
 
     Args:
@@ -49,7 +52,8 @@ def make_vegetation(features: Sequence[Feature], origin: Origin,
         box_m: (x_min, x_max, y_min, y_max) that they are cut to [m].
 
     Returns:
-        a volume for each polygon that is left; several may share a name.
+        a volume for each polygon that is left, of which several may share a name, and what was left
+        out.
     """
     x_min, x_max, y_min, y_max = box_m
     box = shapely.box(x_min, y_min, x_max, y_max)
@@ -71,7 +75,24 @@ def make_vegetation(features: Sequence[Feature], origin: Origin,
                 found.append(VegetationConfig(name=feature.name, kind=kind,
                                               height_m=_height_m(feature.tags, kind),
                                               rings_m=rings_m))
-    return found
+    return _largest(found)
+
+
+def _largest(found: list[VegetationConfig]) -> tuple[list[VegetationConfig], list[Problem]]:
+    """Return as many areas as a scene may declare, the largest first, and a warning of the rest."""
+    size_m2 = [_area_m2(each) for each in found]
+    order = sorted(range(len(found)), key=lambda row: -size_m2[row])
+    corners = np.cumsum([sum(map(len, found[row].rings_m)) for row in order])
+    kept = int(np.searchsorted(corners, VEGETATION_CORNERS.limit, side="right"))
+    names = [found[row].name for row in order[kept:]]
+    return ([found[row] for row in sorted(order[:kept])],
+            problems_of(names, "area(s) of vegetation, the smallest ones, are left out: a scene "
+                               f"may have {VEGETATION_CORNERS.limit:,} corners of them; take a "
+                               "smaller --bbox"))
+
+
+def _area_m2(declared: VegetationConfig) -> float:
+    return shapely.Polygon(declared.rings_m[0], declared.rings_m[1:]).area
 
 
 def vegetation_fact(declared: Sequence[VegetationConfig]) -> str:
@@ -82,7 +103,7 @@ def vegetation_fact(declared: Sequence[VegetationConfig]) -> str:
     """
     area_m2 = dict.fromkeys(HEIGHT_M, 0.0)
     for each in declared:
-        area_m2[each.kind] += shapely.Polygon(each.rings_m[0], each.rings_m[1:]).area
+        area_m2[each.kind] += _area_m2(each)
     kinds = ", ".join(f"{kind.replace('_', ' ')}: {total / 1e4:,.1f} ha"
                       for kind, total in area_m2.items() if total)
     return f"{len(declared):,} areas ({kinds}), which paths are not traced through"

@@ -56,7 +56,7 @@ def draw_preview(scene: Scene, path: pathlib.Path | str) -> None:
     figure.colorbar(image, ax=axes, label="height [m]", shrink=0.85, pad=0.02,
                     extend="max" if clipped else "neither")
     draw_devices(axes, scene)
-    if scene.config.devices or scene.config.uavs:
+    if scene.config.devices or scene.config.uavs or scene.config.vegetation:
         figure.legend(loc="outside lower center", ncols=3, frameon=False)
     axes.set_title(f"{scene.config.name}   ({scene.config.radio.frequency_hz / 1e9:g} GHz)")
     with atomic_path(path) as temporary:
@@ -96,10 +96,11 @@ def draw_vegetation(axes: Axes, scene: Scene) -> None:
         axes: Axes in metres.
         scene: Scene that declares it.
     """
-    for each in scene.config.vegetation:
+    for number, each in enumerate(scene.config.vegetation):
         rings = [Path([*ring, ring[0]], closed=True) for ring in each.rings_m]
         axes.add_patch(PathPatch(Path.make_compound_path(*rings), facecolor=VEGETATION_COLOUR,
-                                 edgecolor="none", alpha=0.45, zorder=1.5))
+                                 edgecolor="none", alpha=0.45, zorder=1.5,
+                                 label="" if number else "vegetation"))
 
 
 def draw_devices(axes: Axes, scene: Scene) -> None:

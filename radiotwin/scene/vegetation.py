@@ -8,11 +8,11 @@ import shapely
 from pydantic import Field, field_validator
 from shapely.geometry.base import BaseGeometry
 
-from radiotwin.budgets import VEGETATION_CORNERS
+from radiotwin.budgets import VEGETATION_CORNERS, VEGETATION_MEETINGS
 from radiotwin.tables import Metres, Number, Table
 
 KINDS = ("wood", "park", "tree_row")
-PAIRS_AT_ONCE = 200_000  # of ways and areas; bounds the memory
+SIDES_AT_ONCE, WORK_AT_ONCE = 64, 5_000_000  # of outlines; ways by corners: bound the memory
 
 
 class VegetationConfig(Table):
@@ -42,7 +42,6 @@ class VegetationConfig(Table):
     def _rings(cls, rings_m: list) -> list:
         if any(len(ring) < 3 for ring in rings_m):
             raise ValueError("a ring has fewer than 3 corners")
-        VEGETATION_CORNERS.check(sum(map(len, rings_m)), "an area of vegetation")
         return rings_m
 
 
@@ -62,9 +61,15 @@ class Vegetation:
 
     @classmethod
     def of(cls, declared: Sequence[VegetationConfig]) -> "Vegetation":
-        """Return what is declared, without overlaps."""
-        VEGETATION_CORNERS.check(sum(len(ring) for each in declared for ring in each.rings_m),
-                                 "the vegetation")
+        """Return what is declared, without overlaps.
+
+        Args:
+            declared: areas; an outline that crosses itself is taken apart.
+
+        Raises:
+            BadInput: they have too many corners, or their outlines meet too often.
+        """
+        _require_few_meetings([ring for each in declared for ring in each.rings_m])
         areas, heights_m, kinds = [], [], []
         taken: BaseGeometry = shapely.MultiPolygon()
         for each in sorted(declared, key=lambda one: -one.height_m):
@@ -107,7 +112,7 @@ class Vegetation:
             areas = self.areas[self.height_m == height_m]
             rows, low_a_m, low_b_m = _below(a_m, b_m, height_m)
             tree = shapely.STRtree(areas)
-            step = max(1, PAIRS_AT_ONCE // len(areas))
+            step = max(1, WORK_AT_ONCE // int(shapely.get_num_coordinates(areas).sum()))
             for start in range(0, len(rows), step):
                 part = slice(start, start + step)
                 flat = np.asarray(shapely.linestrings(
@@ -119,6 +124,22 @@ class Vegetation:
                 share = np.where(whole_m > 1e-6, flat_m / np.maximum(whole_m, 1e-6), 1.0)
                 np.add.at(through_m, rows[part][way], share * long_m)
         return through_m
+
+
+def _require_few_meetings(rings: list) -> None:
+    """Check, before geometry is computed from rings, how many corners and meetings they have."""
+    corners = sum(map(len, rings))
+    VEGETATION_CORNERS.check(corners, "the vegetation")
+    if not corners:
+        return
+    sides = np.asarray(shapely.linestrings(np.concatenate(
+        [np.stack([ring, [*ring[1:], ring[0]]], axis=1) for ring in rings])))
+    tree, found = shapely.STRtree(sides), 0
+    for start in range(0, len(sides), SIDES_AT_ONCE):
+        part = sides[start:start + SIDES_AT_ONCE]
+        # Each meets itself and the two beside it; both of a pair find it
+        found += max(tree.query(part, predicate="intersects").shape[1] - 3 * len(part), 0)
+        VEGETATION_MEETINGS.check(found // 2, "the vegetation")
 
 
 def _below(a_m: np.ndarray, b_m: np.ndarray,

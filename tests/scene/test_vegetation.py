@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from radiotwin.errors import BadInput
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
 
 SQUARE = [(0.0, 0.0), (100.0, 0.0), (100.0, 100.0), (0.0, 100.0)]
@@ -65,3 +66,22 @@ def test_what_no_vegetation_has_is_refused(wrong):
 def test_an_outline_that_crosses_itself_is_repaired():
     bow = [(0.0, 0.0), (100.0, 100.0), (100.0, 0.0), (0.0, 100.0)]
     np.testing.assert_allclose(through([wood(bow)], [(25, -50, 5), (25, 150, 5)]), 50)
+
+
+def comb(teeth, upright):
+    """An outline with many teeth, which crosses that of a comb across it at each of them."""
+    x = np.arange(teeth) * 0.1
+    points = [(value, 0.0 if i % 2 else 100.0) for i, value in enumerate(x)] + [(x[-1], -5.0), (0.0, -5.0)]
+    return points if upright else [(y, value) for value, y in points]
+
+
+@pytest.mark.parametrize("declared", [[wood(comb(5000, True)), wood(comb(5000, False))], [wood(comb(60_000, True))]],
+                         ids=["combs", "corners"])
+def test_what_would_fill_the_memory_is_refused_before(declared):
+    with pytest.raises(BadInput, match="the vegetation"):
+        Vegetation.of(declared)
+
+
+def test_woods_that_share_a_border_are_not_refused():
+    strips = [wood([(10.0 * i, 0.0), (10.0 * i + 10, 0.0), (10.0 * i + 10, 500.0), (10.0 * i, 500.0)]) for i in range(300)]
+    assert through(strips, [(-50, 50, 5), (5000, 50, 5)]) == pytest.approx([3000])
