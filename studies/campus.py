@@ -1,4 +1,4 @@
-"""A real campus with its real map, from the raw files to causes: `campus` and `readings`.
+"""A real campus with its real map, from the raw files to causes: `campus`.
 
 The folder `RADIOTWIN_DATA` (default: `shared/data` beside the checkout) holds `duke_cbrs` with
 `raw.csv.gz`, `sites.csv`, `import.toml` and `map.osm`; docs/real-data.md says where they come from.
@@ -10,24 +10,16 @@ import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 from scipy.stats import t as student
 
 from radiotwin import BadInput, Loop, Measurements, Scene, close_loop, make_report
 from radiotwin.alignment import in_scene_frame
-from radiotwin.channel.log_distance import LogDistance
-from radiotwin.channel.regression_kriging import RegressionKriging
-from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.closeloop.baselines import BOOSTING, EXTRA_TREES, Part, law_db, trees_db
-from radiotwin.closeloop.corrected_twin import corrected_twin
 from radiotwin.footprints import MapOptions, build_scene_from_map
 from radiotwin.importing import import_file, read_settings
-from radiotwin.links import LinkData, prepare_links
 from radiotwin.measurements import read_measurements
 from radiotwin.scene.build import BuildOptions
 from studies.closeloop import counted, summary
@@ -49,8 +41,6 @@ CONTROLS = {"mirrored": "map mirrored", "shifted": "map shifted by 50 m",
             "permuted": "levels permuted within each sector"}
 SHIFT_M = 50.0
 COVERAGE = 0.9
-READINGS = (250, 500, 1000, 2000, 4000)
-LEAST_M = 60.0  # side of the squares that few drives are drawn by
 
 
 @contextmanager
@@ -177,95 +167,5 @@ def _best(baselines_db: dict[str, float]) -> str:
     return f"{number(baselines_db[name], 2)} (`{name}`)"
 
 
-def readings_cases(seed: int) -> dict[str, dict]:
-    """Return numbers of readings, scattered over the campus, and of few drives."""
-    return {f"{way}-{count}": {"way": way, "count": count}
-            for way in ("scattered", "drives") for count in READINGS}
-
-
-def learn_from_few(seed: int, settings: dict) -> dict:
-    """Learn from some readings, and predict all others."""
-    rng = np.random.default_rng(seed)
-    with campus() as (measured, scene):
-        chosen = _drawn(measured, settings["way"], settings["count"], rng)
-        links = prepare_links(measured, scene)
-        rows = _rows_of(links, measured, chosen)
-        test = np.setdiff1d(np.arange(len(links)), rows)
-        level_db = links.level_db[test]
-        loop = close_loop(measured.select(np.isin(np.arange(len(measured.table)), chosen)), scene,
-                          "twin", seed)
-        twin = corrected_twin(loop, scene)
-        predicted = {"twin": twin.predict(links.select(test)).mean_db}
-        few = replace(links, limit_db=np.full(len(links), -np.inf))
-        for kind in (LogDistance, SegmentedLogDistance, RegressionKriging):
-            predicted[kind.name] = law_db(kind, few, rows, test)
-        for name in (EXTRA_TREES, BOOSTING):
-            predicted[name] = trees_db(name, Part(few), rows, test, seed)
-    report = summary(make_report(loop))
-    return report | {"learnt": len(rows), "rmse_db": {
-        name: float(np.sqrt(np.nanmean((level_db - mean_db) ** 2)))
-        for name, mean_db in predicted.items()}}
-
-
-def _drawn(measured: Measurements, way: str, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return rows of the readings that are learnt from: any, or all of some squares of ground."""
-    order = rng.permutation(len(measured.table))
-    if way == "scattered":
-        return np.sort(order[:count])
-    cell = np.floor(measured.receiver_m[:, :2] / LEAST_M).astype(int)
-    square = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
-    rank = rng.permutation(square.max() + 1)[square]
-    return np.sort(np.lexsort((order, rank))[:count])
-
-
-def _rows_of(links: LinkData, measured: Measurements, chosen: np.ndarray) -> np.ndarray:
-    """Return rows of prepared links that are those of the measurements; some were left out."""
-    def keys(receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarray) -> list[tuple]:
-        return list(zip(*np.round(receiver_m[:, :2].T, 3), device, level_db))
-
-    names = np.array(links.device_names)
-    wanted = set(keys(measured.receiver_m[chosen],
-                      measured.table["device"].to_numpy()[chosen], measured.level_db[chosen]))
-    return np.flatnonzero([key in wanted for key in keys(
-        links.receiver_m, names[links.device], links.level_db)])
-
-
-def readings_table(rows: pd.DataFrame) -> str:
-    """Return errors by number of readings."""
-    models = list(rows.iloc[0]["rmse_db"])
-    parts = []
-    for way, title in (("scattered", "Readings scattered over the campus"),
-                       ("drives", "Readings of some squares of 60 m")):
-        own = rows[rows["name"].str.startswith(way)]
-        grouped = own.groupby(own["name"].str.rpartition("-")[2].astype(int))
-        parts.append(markdown(
-            ["readings", *(f"`{name}`" for name in models)],
-            [[f"{count:,}", *(number(np.mean([each[name] for each in group["rmse_db"]]), 2)
-                              for name in models)] for count, group in grouped],
-            title, ": RMSE of all others [dB]"))
-    return "\n\n".join(parts)
-
-
-def readings_figure(rows: pd.DataFrame) -> dict[str, Figure]:
-    """Return the learning curves."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    for axes, way in zip(figure.subplots(1, 2, sharey=True), ("scattered", "drives")):
-        own = rows[rows["name"].str.startswith(way)]
-        for name in rows.iloc[0]["rmse_db"]:
-            error_db = own.groupby(own["name"].str.rpartition("-")[2].astype(int))["rmse_db"].apply(
-                lambda group, name=name: np.mean([each[name] for each in group]))
-            axes.plot(error_db.index, error_db, marker="o", label=name.replace("_", " "),
-                      linewidth=2.5 if name == "twin" else 1.2)
-        axes.set(xscale="log", xlabel="readings learnt from", title={
-            "scattered": "scattered over the campus", "drives": "all of some 60 m squares"}[way])
-        axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
-    figure.axes[0].set_ylabel("RMSE of all other readings [dB]")
-    return {"readings": figure}
-
-
-STUDIES = {
-    "campus": Study("What does the loop make of a real campus with its real map?", find_on_campus,
-                    campus_cases, campus_table, seeds=1),
-    "readings": Study("How many readings does a twin of a real campus need?", learn_from_few,
-                      readings_cases, readings_table, readings_figure, seeds=2)}
+STUDIES = {"campus": Study("What does the loop make of a real campus with its real map?",
+                           find_on_campus, campus_cases, campus_table, seeds=1)}

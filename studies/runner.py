@@ -28,7 +28,8 @@ MODULES = {"models": "models", "curve": "learning", "federation": "learning", "t
            "real": "closeloop_real", "tracer": "tracer", "speed": "speed", "load": "load",
            "kill": "kill", "paths": "path_list", "engine": "engine",
            "impossible": "impossible", "accuracy": "tracer",
-           "campus": "campus", "readings": "campus",
+           "campus": "campus", "readings": "campus_learning",
+           "away": "campus_learning", "terms": "campus_terms",
            "maps": "wrong_maps", "foreign": "foreign", "calibration": "calibration"}
 """Name of a study -> its module in this package."""
 Run = Callable[[int, dict], dict]

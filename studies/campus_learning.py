@@ -1,0 +1,171 @@
+"""What is learnt from a part of a real campus says of the rest: `readings` and `away`.
+
+Each row is a user who has these readings and no others: base, effects and combination are learnt
+from them alone, with blocks of them held out, and so are the other models.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from radiotwin import Measurements, Scene, close_loop, make_report
+from radiotwin.channel.log_distance import LogDistance
+from radiotwin.channel.regression_kriging import RegressionKriging
+from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
+from radiotwin.closeloop.baselines import BOOSTING, EXTRA_TREES, Part, law_db, trees_db
+from radiotwin.closeloop.corrected_twin import corrected_twin
+from radiotwin.links import LinkData, prepare_links
+from studies.campus import campus
+from studies.closeloop import counted, summary
+from studies.closeloop_real import AZIMUTHS_DEG, azimuth_errors_deg
+from studies.runner import Study
+from studies.tables import markdown, number
+
+READINGS = (250, 500, 1000, 2000, 4000)
+SQUARE_M = 60.0  # side of the squares that few drives are drawn by
+QUADRANTS = ("south-west", "north-west", "south-east", "north-east")
+TWIN, NAMED = "twin", "named effects alone"
+
+
+def learn_from(measured: Measurements, scene: Scene, learnt: np.ndarray, seed: int) -> dict:
+    """Learn from a mask (n,) of readings, and predict all others.
+
+    Returns:
+        what was named, and `rmse_db` of the others by model.
+    """
+    links = prepare_links(measured, scene)
+    rows = _rows_of(links, measured, np.flatnonzero(learnt))
+    test = np.setdiff1d(np.arange(len(links)), rows)
+    loop = close_loop(measured.select(learnt), scene, "twin", seed, hold_out="block")
+    twin = corrected_twin(loop, scene)
+    assert twin.fitted is not None
+    named = replace(twin, fitted=replace(twin.fitted, shadowing=None, blend=None))
+    others = links.select(test)
+    predicted = {TWIN: twin.predict(others).mean_db, NAMED: named.predict(others).mean_db}
+    unlimited = replace(links, limit_db=np.full(len(links), -np.inf))
+    for kind in (LogDistance, SegmentedLogDistance, RegressionKriging):
+        predicted[kind.name] = law_db(kind, unlimited, rows, test)
+    for name in (EXTRA_TREES, BOOSTING):
+        predicted[name] = trees_db(name, Part(unlimited), rows, test, seed)
+    report = make_report(loop)
+    return summary(report) | {
+        "learnt": len(rows), "others": len(test), "azimuth_error_deg": azimuth_errors_deg(report),
+        "rmse_db": {name: float(np.sqrt(np.nanmean((others.level_db - mean_db) ** 2)))
+                    for name, mean_db in predicted.items()}}
+
+
+def _rows_of(links: LinkData, measured: Measurements, chosen: np.ndarray) -> np.ndarray:
+    """Return rows of prepared links that are those of the measurements; some were left out."""
+    def keys(receiver_m: np.ndarray, device: np.ndarray, level_db: np.ndarray) -> list[tuple]:
+        return list(zip(*np.round(receiver_m[:, :2].T, 3), device, level_db))
+
+    names = np.array(links.device_names)
+    wanted = set(keys(measured.receiver_m[chosen],
+                      measured.table["device"].to_numpy()[chosen], measured.level_db[chosen]))
+    return np.flatnonzero([key in wanted for key in keys(
+        links.receiver_m, names[links.device], links.level_db)])
+
+
+def away_cases(seed: int) -> dict[str, dict]:
+    """Return quadrants of the area and sectors of which nothing is learnt."""
+    return {f"quadrant-{each}": {"left_out": each} for each in QUADRANTS} | {
+        f"sector-{each}": {"left_out": each} for each in AZIMUTHS_DEG}
+
+
+def learn_elsewhere(seed: int, settings: dict) -> dict:
+    """Learn from all but a quadrant or a sector, and predict that."""
+    left_out = settings["left_out"]
+    with campus() as (measured, scene):
+        if left_out in QUADRANTS:
+            end_m = measured.receiver_m[:, :2]
+            east, north = (end_m > np.median(end_m, axis=0)).T
+            out = 2 * east + north == QUADRANTS.index(left_out)
+        else:
+            out = measured.table["device"].to_numpy() == left_out
+        return learn_from(measured, scene, ~out, seed)
+
+
+def away_table(rows: pd.DataFrame) -> str:
+    """Return errors by what was left out, and those of all quadrants and all sectors."""
+    models = list(rows.iloc[0]["rmse_db"])
+    by_name = rows.set_index("name")
+    names = [name for name in away_cases(0) if name in by_name.index]
+    lines = [[name.replace("-", " ", 1), f"{by_name.loc[name]['others']:,}",
+              *(number(by_name.loc[name]["rmse_db"][model], 2) for model in models),
+              counted(by_name.loc[name]["named"])] for name in names]
+    for kind in ("quadrant", "sector"):
+        own = by_name.loc[[name for name in names if name.startswith(kind)]]
+        if len(own):
+            squares = [np.average([each[model] ** 2 for each in own["rmse_db"]],
+                                  weights=own["others"]) for model in models]
+            lines.append([f"**all {kind}s**", f"{own['others'].sum():,}",
+                          *(number(np.sqrt(each), 2) for each in squares), ""])
+    return markdown(["left out", "readings", *(f"`{name}`" for name in models), "named"], lines,
+                    "Where nothing was measured", ": RMSE [dB]")
+
+
+def readings_cases(seed: int) -> dict[str, dict]:
+    """Return numbers of readings, scattered over the campus, and of few drives."""
+    return {f"{way}-{count}": {"way": way, "count": count}
+            for count in READINGS for way in ("scattered", "drives")}
+
+
+def learn_from_few(seed: int, settings: dict) -> dict:
+    """Learn from some readings, and predict all others."""
+    with campus() as (measured, scene):
+        chosen = _drawn(measured, settings["way"], settings["count"], np.random.default_rng(seed))
+        return learn_from(measured, scene, np.isin(np.arange(len(measured.table)), chosen), seed)
+
+
+def _drawn(measured: Measurements, way: str, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return rows of the readings that are learnt from: any, or all of some squares of ground."""
+    order = rng.permutation(len(measured.table))
+    if way == "scattered":
+        return np.sort(order[:count])
+    cell = np.floor(measured.receiver_m[:, :2] / SQUARE_M).astype(int)
+    square = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    rank = rng.permutation(square.max() + 1)[square]
+    return np.sort(np.lexsort((order, rank))[:count])
+
+
+def readings_table(rows: pd.DataFrame) -> str:
+    """Return errors by number of readings."""
+    models = list(rows.iloc[0]["rmse_db"])
+    parts = []
+    for way, title in (("scattered", "Readings scattered over the campus"),
+                       ("drives", "Readings of some squares of 60 m")):
+        own = rows[rows["name"].str.startswith(way)]
+        grouped = own.groupby(own["name"].str.rpartition("-")[2].astype(int))
+        parts.append(markdown(
+            ["readings", *(f"`{name}`" for name in models)],
+            [[f"{count:,}", *(number(np.mean([each[name] for each in group["rmse_db"]]), 2)
+                              for name in models)] for count, group in grouped],
+            title, ": RMSE of all others [dB]"))
+    return "\n\n".join(parts)
+
+
+def readings_figure(rows: pd.DataFrame) -> dict[str, Figure]:
+    """Return the learning curves."""
+    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    for axes, way in zip(figure.subplots(1, 2, sharey=True), ("scattered", "drives")):
+        own = rows[rows["name"].str.startswith(way)]
+        for name in rows.iloc[0]["rmse_db"]:
+            error_db = own.groupby(own["name"].str.rpartition("-")[2].astype(int))["rmse_db"].apply(
+                lambda group, name=name: np.mean([each[name] for each in group]))
+            axes.plot(error_db.index, error_db, marker="o", label=name.replace("_", " "),
+                      linewidth=2.5 if name == "twin" else 1.2)
+        axes.set(xscale="log", xlabel="readings learnt from", title={
+            "scattered": "scattered over the campus", "drives": "all of some 60 m squares"}[way])
+        axes.grid(alpha=0.3)
+    axes.legend(fontsize=8)
+    figure.axes[0].set_ylabel("RMSE of all other readings [dB]")
+    return {"readings": figure}
+
+
+STUDIES = {
+    "readings": Study("How many readings does a twin of a real campus need?", learn_from_few,
+                      readings_cases, readings_table, readings_figure, seeds=2),
+    "away": Study("What does a twin say where nothing was measured?", learn_elsewhere, away_cases,
+                  away_table, seeds=1)}

@@ -1,0 +1,110 @@
+"""What each part of the physics brings on a real campus, by least squares: `terms`.
+
+Levels of the sectors, and the coefficients of each term, are fitted to the links outside a fold.
+The antennas are told (published azimuths), so that no search has a part in the answer.
+"""
+
+import numpy as np
+import pandas as pd
+
+from radiotwin.channel.followed_paths import interaction_gains
+from radiotwin.closeloop.folds import make_folds
+from radiotwin.effects.sector_antenna import SectorPattern, sector_pattern_db
+from radiotwin.links import LinkData, prepare_links
+from studies.campus import SPLITS, campus
+from studies.closeloop_real import AZIMUTHS_DEG
+from studies.runner import Study
+from studies.tables import markdown, number
+
+DIFFUSE_DB, DIFFUSE_EXPONENT = -125.0, 3.0  # power beside the paths, at 100 m
+POSITION_SD_M, DRAWS = 6.0, 16  # of a phone's receiver, for the chance of line of sight
+WAYS = ("block", "quadrant")
+
+
+def by_class(values: np.ndarray, los: np.ndarray) -> np.ndarray:
+    """Return (n, 2) columns: the values of links with line of sight, and of those without."""
+    return np.column_stack([values * los, values * (1 - los)])
+
+
+def terms_of(links: LinkData, seed: int) -> dict[str, np.ndarray]:
+    """Return columns (n, …) of each term, by name."""
+    city = links.city
+    assert city is not None
+    los, decades = links.los.astype(float), np.log10(links.distance_m / 100)
+    device_m = links.device_m[links.device]
+    pattern_db = np.zeros(len(links))
+    for row, name in enumerate(links.device_names):
+        own = links.device == row
+        pattern_db[own] = sector_pattern_db(
+            links.azimuth_deg[own], np.zeros(own.sum()),
+            SectorPattern(azimuth_deg=float(AZIMUTHS_DEG[name])))
+    rng, seen = np.random.default_rng(seed), np.zeros((2, len(links)))
+    for _ in range(DRAWS):
+        there_m = links.receiver_m + np.append(
+            rng.normal(0, POSITION_SD_M, (len(links), 2)), np.zeros((len(links), 1)), axis=1)
+        outdoors = ~city.inside(there_m)
+        seen += outdoors, outdoors & city.line_of_sight(device_m, there_m)
+    chance = np.where(seen[0] > 0, seen[1] / np.maximum(seen[0], 1), los)
+    gains = interaction_gains(links.geometry)
+    diffuse = 10 ** (DIFFUSE_DB / 10) * (links.distance_m / 100) ** -DIFFUSE_EXPONENT
+    level_db = {kinds: 10 * np.log10(gains[:, :kinds].sum(axis=1) + diffuse) for kinds in (2, 3)}
+    return {
+        "sector": (links.device[:, None] == np.arange(len(links.device_names))).astype(float),
+        "distance": decades[:, None],
+        "LoS class": np.column_stack([los, decades * los]),
+        "antenna": pattern_db[:, None],
+        "elevation": links.elevation_deg[:, None],
+        "metres inside": np.log1p(city.metres_inside(device_m, links.receiver_m))[:, None],
+        "woods and parks": np.log1p(city.vegetation.metres_through(device_m, links.receiver_m)
+                                    )[:, None],
+        "indoors": city.inside(links.receiver_m)[:, None].astype(float),
+        "chance of LoS": np.column_stack([chance, decades * chance]),
+        "reflections": by_class(level_db[2], los),
+        "reflections, diffraction": by_class(level_db[3], los)}
+
+
+MODELS: dict[str, tuple[str, ...]] = {
+    "log-distance": ("distance",),
+    "+ LoS class": ("distance", "LoS class"),
+    "+ antenna": ("distance", "antenna"),
+    "+ antenna, LoS class": ("distance", "antenna", "LoS class"),
+    **{f"+ antenna, LoS class, {extra}": ("distance", "antenna", "LoS class", extra)
+       for extra in ("elevation", "metres inside", "woods and parks", "indoors", "chance of LoS",
+                     "reflections", "reflections, diffraction")},
+    "+ antenna, reflections, diffraction": ("distance", "antenna", "reflections, diffraction"),
+    "+ all": ("distance", "antenna", "LoS class", "elevation", "metres inside", "woods and parks",
+              "indoors", "chance of LoS", "reflections, diffraction")}
+
+
+def fit_terms(seed: int, settings: dict) -> dict:
+    """Return held-out errors of each model, by split."""
+    with campus() as (measured, scene):
+        links = prepare_links(measured, scene)
+        terms = terms_of(links, seed)
+    level_db, found = links.level_db, {}
+    for way in WAYS:
+        fold = make_folds(links, seed, way).index
+        found[way] = {name: _rmse_db(np.column_stack([terms["sector"], *(
+            terms[each] for each in columns)]), level_db, fold) for name, columns in MODELS.items()}
+    return {"links": len(links), "los": float(links.los.mean()), "rmse_db": found}
+
+
+def _rmse_db(columns: np.ndarray, level_db: np.ndarray, fold: np.ndarray) -> float:
+    error_db = np.full(len(level_db), np.nan)
+    for number_ in np.unique(fold):
+        out = fold == number_
+        weights = np.linalg.lstsq(columns[~out], level_db[~out], rcond=None)[0]
+        error_db[out] = level_db[out] - columns[out] @ weights
+    return float(np.sqrt(np.mean(error_db**2)))
+
+
+def terms_table(rows: pd.DataFrame) -> str:
+    """Return errors by model and split."""
+    found = rows.iloc[0]["rmse_db"]
+    return markdown(["model", *(SPLITS[way] for way in WAYS)],
+                    [[name, *(number(found[way][name], 2) for way in WAYS)] for name in MODELS],
+                    "What each part brings", ": least squares told the azimuths, RMSE [dB]")
+
+
+STUDIES = {"terms": Study("What does each part of the physics bring on a real campus?", fit_terms,
+                          lambda seed: {"all": {}}, terms_table, seeds=1)}
