@@ -132,9 +132,9 @@ def best_shift(scene: Scene, receiver_m: np.ndarray) -> tuple[float, float] | No
         column = np.rint((receiver_m[:, 0] + east_m - x_m[0]) / cell_m).astype(int)
         row = np.rint((receiver_m[:, 1] + north_m - y_m[0]) / cell_m).astype(int)
         on_map = (column >= 0) & (column < len(x_m)) & (row >= 0) & (row < len(y_m))
-        place = column[on_map], row[on_map]
-        density = expected[place]
-        excess = built[place].sum() - density.sum() + (~on_map).sum()
+        cells = column[on_map], row[on_map]
+        density = expected[cells]
+        excess = built[cells].sum() - density.sum() + (~on_map).sum()
         return float(excess / np.sqrt((density * (1 - density)).sum() + 1.0))
 
     best = (0.0, 0.0)
