@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -159,10 +160,12 @@ class Measurements:
                            "the links; give the links another name, such as measurements.csv")
         self._check_replaceable(path.parent / "devices.csv")
         self._check_frame(path.parent)
-        if self.origin is not None:
-            with atomic_path(path.parent / FRAME_FILE) as frame:
+        with ExitStack() as together:
+            if self.origin is not None:
+                frame = together.enter_context(atomic_path(path.parent / FRAME_FILE))
                 write_frame(self.origin, frame)
-        with atomic_path(path.parent / "devices.csv") as devices, atomic_path(path) as links:
+            devices = together.enter_context(atomic_path(path.parent / "devices.csv"))
+            links = together.enter_context(atomic_path(path))
             write_csv(self.devices, devices)
             if path.suffix == ".parquet":
                 require_pyarrow(path)

@@ -59,8 +59,9 @@ def close_loop(
     from radiotwin.scene import Scene
     from radiotwin.twin import check_twin_target
 
+    data = read_measurements(measurements, devices)
     world = Scene.load(scene) if scene else None
-    data = in_frame_of(world, read_measurements(measurements, devices), shift)
+    data = in_frame_of(world, data, shift)
     require_writable(out / "closeloop.json")
     check_twin_target(out / "twin")
     if write_scene is not None:

@@ -64,8 +64,8 @@ def fit(
     from radiotwin.twin import Twin, check_twin_target, fit_twin
 
     check_twin_target(out)
-    world = Scene.load(scene)
-    data = in_frame_of(world, read_measurements(measurements, devices), shift)
+    data, world = read_measurements(measurements, devices), Scene.load(scene)
+    data = in_frame_of(world, data, shift)
     earlier = Twin.load(start) if start else None
     with keep_pieces() as pieces:
         twin = fit_twin(data, world, model=model, seed=seed, start=earlier,
