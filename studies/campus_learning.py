@@ -158,6 +158,8 @@ def readings_figure(rows: pd.DataFrame) -> dict[str, Figure]:
                       linewidth=2.5 if name == "twin" else 1.2)
         axes.set(xscale="log", xlabel="readings learnt from", title={
             "scattered": "scattered over the campus", "drives": "all of some 60 m squares"}[way])
+        axes.set_xticks(READINGS, [f"{count:,}" for count in READINGS])
+        axes.minorticks_off()
         axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     figure.axes[0].set_ylabel("RMSE of all other readings [dB]")
