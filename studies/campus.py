@@ -5,11 +5,13 @@ The folder `RADIOTWIN_DATA` (default: `shared/data` beside the checkout) holds `
 """
 
 import gzip
+import re
 import shutil
 import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -38,14 +40,22 @@ HEIGHT_DEFAULT_M, FREQUENCY_HZ = 14.0, 3.6e9
 SPLITS = {"block": "60 m blocks", "quadrant": "a quadrant of the area", "device": "a sector"}
 BASES = ("twin", "raytrace", "log-distance")
 CONTROLS = {"mirrored": "map mirrored", "shifted": "map shifted by 50 m",
-            "permuted": "levels permuted within each sector"}
+            "permuted": "levels permuted within each sector",
+            "permuted-all": "levels permuted over all sectors"}
+LACKING = {"no-heights": "a map without heights: 14 m everywhere",
+           "one-phone": "the readings of one phone", "thinned": "one reading in each 10 m cell"}
+PHONE, CELL_M = "Pixel", 10.0
+HEIGHT_TAG = re.compile(r'<tag k="(building:)?(min_)?(height|levels?|min_level)" [^>]*>')
 SHIFT_M = 50.0
 COVERAGE = 0.9
 
 
 @contextmanager
-def campus() -> Iterator[tuple[Measurements, Scene]]:
+def campus(heights: bool = True) -> Iterator[tuple[Measurements, Scene]]:
     """Make the readings in the scene's frame, and the scene, both from the raw files.
+
+    Args:
+        heights: False: leave heights and storeys out of the map.
 
     Raises:
         BadInput: the files are not there.
@@ -59,6 +69,9 @@ def campus() -> Iterator[tuple[Measurements, Scene]]:
         folder = Path(name)
         for each in ("sites.csv", "import.toml", "map.osm"):
             shutil.copy(source / each, folder / each)
+        if not heights:
+            path = folder / "map.osm"
+            path.write_text(HEIGHT_TAG.sub("", path.read_text("utf-8")), "utf-8")
         with gzip.open(source / "raw.csv.gz") as raw, (folder / "raw.csv").open("wb") as target:
             shutil.copyfileobj(raw, target)
         import_file(folder / "raw.csv", read_settings(folder / "import.toml", {}, folder),
@@ -77,13 +90,13 @@ def campus_cases(seed: int) -> dict[str, dict]:
     cases = {f"{split}-{base}": {"split": split, "base": base, "control": None}
              for split in SPLITS for base in BASES}
     return cases | {control: {"split": "block", "base": "twin", "control": control}
-                    for control in CONTROLS}
+                    for control in CONTROLS | LACKING}
 
 
 def find_on_campus(seed: int, settings: dict) -> dict:
     """Close the loop on all readings."""
     has_map = settings["base"] != "log-distance"
-    with campus() as (measured, scene):
+    with campus(heights=settings["control"] != "no-heights") as (measured, scene):
         measured = _controlled(measured, settings["control"], seed)
         loop = close_loop(measured, scene if has_map else None, settings["base"], seed,
                           hold_out=settings["split"])
@@ -109,8 +122,19 @@ def _controlled(measured: Measurements, control: str | None, seed: int) -> Measu
 
     Only the x of both ends is mirrored, so that distances stay.
     """
+    table = measured.table
     if control == "permuted":
         return permuted(measured, seed)
+    if control == "permuted-all":
+        levels = np.random.default_rng(seed).permutation(table[measured.level_column].to_numpy())
+        return replace(measured, table=table.assign(**{measured.level_column: levels}))
+    if control == "one-phone":
+        return replace(measured, table=table[table["receiver"] == PHONE].reset_index(drop=True))
+    if control == "thinned":
+        cell = np.floor(table[["receiver_x_m", "receiver_y_m"]] / CELL_M)
+        kept = ~cell.assign(device=table["device"]).sample(
+            frac=1.0, random_state=seed).duplicated().sort_index()
+        return replace(measured, table=table[kept].reset_index(drop=True))
     if control == "shifted":
         return measured.moved(lambda position_m: position_m + [SHIFT_M, 0.0, 0.0], measured.origin)
     if control == "mirrored":
@@ -142,7 +166,7 @@ def campus_table(rows: pd.DataFrame) -> str:
         [[SPLITS[split], f"`{base}`", *(number(row[key], 2) for key in (
             "before_db", "named_db", "named_bias_db", "after_db", "combined_db")),
           _best(row["baselines_db"]), f"{100 * row['coverage']:.0f} %", counted(row["named"])]
-         for name in named if name not in CONTROLS
+         for name in named if name not in CONTROLS | LACKING
          for split, _, base in [name.partition("-")] for row in [by_name.loc[name]]],
         "A campus with its map", ": RMSE of held-out readings")]
     found = [(name, by_name.loc[name]) for name in named if name.startswith("block-")]
@@ -153,12 +177,16 @@ def campus_table(rows: pd.DataFrame) -> str:
           *(number(row["azimuth_error_deg"].get(each, np.nan), 0) for each in sectors),
           number(row["turned_by_180_db"], 2)] for name, row in found],
         "Azimuths found", ": how far off [°]"))
-    parts.append(markdown(
-        ["control", "base alone [dB]", "named effects", "combined", "named"],
-        [[CONTROLS[name], *(number(by_name.loc[name][key], 2)
-                            for key in ("before_db", "named_db", "combined_db")),
-          counted(by_name.loc[name]["named"])] for name in named if name in CONTROLS],
-        "Controls", ", base `twin`, 60 m blocks"))
+    for title, words in (("Controls", CONTROLS), ("Less to learn from", LACKING)):
+        parts.append(markdown(
+            [title.lower(), "links", "base alone [dB]", "named effects", "combined",
+             "best of the others", "azimuths off by up to [°]", "named"],
+            [[words[name], str(row["links"]), *(number(row[key], 2) for key in (
+                "before_db", "named_db", "combined_db")), _best(row["baselines_db"]),
+              number(max(map(abs, row["azimuth_error_deg"].values()), default=np.nan), 0),
+              counted(row["named"])]
+             for name in named if name in words for row in [by_name.loc[name]]],
+            title, ", base `twin`, 60 m blocks"))
     return "\n\n".join(parts)
 
 
