@@ -178,6 +178,8 @@ def campus_table(rows: pd.DataFrame) -> str:
           number(row["turned_by_180_db"], 2)] for name, row in found],
         "Azimuths found", ": how far off [°]"))
     for title, words in (("Controls", CONTROLS), ("Less to learn from", LACKING)):
+        if not set(words) & set(named):
+            continue
         parts.append(markdown(
             [title.lower(), "links", "base alone [dB]", "named effects", "combined",
              "best of the others", "azimuths off by up to [°]", "named"],
