@@ -6,8 +6,12 @@ explains, and the effect was found with that part missing.
 
 from __future__ import annotations
 
+import warnings
+from dataclasses import replace
+
 import numpy as np
 
+from radiotwin.closeloop.bases import Base
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.effects.arrays import subsample
 from radiotwin.effects.effect_model import EffectModel
@@ -15,6 +19,8 @@ from radiotwin.effects.fold_model import FoldModel
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.links import LinkData
 from radiotwin.localize import position_log_likelihood
+from radiotwin.localize.estimate import TwinDevice
+from radiotwin.scene.citymap import CityMap
 
 RADII_M = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0)  # of circles around a position, that are tried
 DIRECTIONS = 12
@@ -23,27 +29,74 @@ MAX_LINKS = 300  # of a device
 MIN_LINKS = 10
 
 
-def relocate_devices(model: CrossValidatedModel) -> CrossValidatedModel:
+def relocate_devices(model: CrossValidatedModel, links: LinkData, base: Base
+                     ) -> CrossValidatedModel:
     """Return the model with unknown devices moved to where its effects make their links likeliest.
 
-    Each fold moves them by its own training links, then its levels are fitted again.
+    Each fold moves them by its own training links, then its levels are fitted again. Where paths
+    are followed, devices are located anew over the map that the effects have changed.
 
     Args:
         model: base and effects.
+        links: n links as the base was given them.
+        base: that the model began with; it must not remember earlier positions.
 
     Returns:
         the moved one where that makes held-out links likelier, else the same. The same, too, where
-        all devices are known, or where paths would have to be followed from every position.
+        all devices are known, or where paths are followed and the map is as it was.
     """
-    links = model.links
     unknown = [device for device in range(len(links.device_names)) if device not in links.anchors]
-    if not unknown or not model.whole.effects or model.whole.channel.follows_paths:
+    if not unknown or not model.whole.effects:
         return model
-    moved = [_relocated(each, fit, unknown)
-             for each, fit in zip(model.models, model.fits, strict=True)]
-    found = model.extended(moved, [each.fit() for each in moved])
+    twin = model.twin
+    if not model.whole.channel.follows_paths:
+        moved = [_relocated(each, fit, unknown)
+                 for each, fit in zip(model.models, model.fits, strict=True)]
+        twin = replace(twin, devices=_with_positions(twin.devices, moved[0].links.device_m))
+    elif _corrected_map(model.whole) is not links.city:
+        located = [_located_anew(each, links, model.index != number, base)
+                   for number, each in enumerate(model.models, start=-1)]
+        moved, devices = [each for each, _ in located], located[0][1]
+        twin = replace(twin, devices=devices)
+    else:
+        return model
+    found = replace(model.extended(moved, [each.fit() for each in moved]), twin=twin)
     gain = model.held_out_nll - found.held_out_nll
     return found if np.nansum(gain) > 0 else model
+
+
+def _with_positions(devices: list[TwinDevice], device_m: np.ndarray) -> list[TwinDevice]:
+    """Return located devices of unknown position where they are now (k, 3) [m]."""
+    return [replace(each, x_m=float(x_m), y_m=float(y_m))
+            if each.role == "unknown" and each.located else each
+            for each, (x_m, y_m, _) in zip(devices, device_m, strict=True)]
+
+
+def _corrected_map(model: FoldModel) -> CityMap | None:
+    """Return the map with what effects add to it and take from it."""
+    city = model.links.city
+    for each in model.effects:
+        city = each.effect.corrected_map(city, each.params) if city is not None else None
+    return city
+
+
+def _located_anew(model: FoldModel, links: LinkData, mine: np.ndarray,
+                  base: Base) -> tuple[FoldModel, list[TwinDevice]]:
+    """Return one model with its devices where its base, over the corrected map, has them.
+
+    Args:
+        model: with effects.
+        links: n links as the base was given them.
+        mine: (n,) bool, those that it learns from.
+        base: locates.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the base has warned already
+        twin = base.fit(links.with_city(_corrected_map(model)).select(mine))
+    moved = FoldModel.build(model.links, model.channel, model.dof, device_m=base.device_m(twin),
+                            train=mine)
+    return moved.with_effects([moved.apply(each.effect, each.params) for each in model.effects]), \
+        twin.devices
 
 
 def _relocated(model: FoldModel, fit: FitResult, unknown: list[int]) -> FoldModel:

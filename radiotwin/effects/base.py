@@ -31,6 +31,7 @@ from radiotwin.links import LinkData
 
 if TYPE_CHECKING:
     from radiotwin.effects.residual_view import LevelAt, ResidualView
+    from radiotwin.scene.citymap import CityMap
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,6 +159,10 @@ class Effect(ABC):
     def exact(self, params: Any) -> Any | None:
         """Return the same, asking the channel for exact levels; None where nothing changes."""
         return None
+
+    def corrected_map(self, city: CityMap, params: Any) -> CityMap:
+        """Return the map as the effect has it; by default the same object."""
+        return city
 
     def neg_log_prior(self, params: Any) -> float:
         """Return how much less likely parameters are than the likeliest, before data [nats].

@@ -14,7 +14,7 @@ from radiotwin.channel.base import ANY_LEVEL_SD_DB
 from radiotwin.effects.arrays import subsample
 from radiotwin.effects.base import Effect
 from radiotwin.effects.fold_model import AppliedEffect, FoldModel, response
-from radiotwin.effects.params import Variation
+from radiotwin.effects.params import NEAR_SHARE, Variation
 from radiotwin.inference import censored_regression
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.links import LinkData
@@ -23,6 +23,9 @@ from radiotwin.pieces import Piece, kept
 EVALUATIONS = 25  # of the objective for each number, in one descent
 DESCENTS = 2  # a simplex that has collapsed too early starts anew
 MAX_LINKS, MAX_LINKS_OF_MEMBER = 5000, 1500  # that numbers are refined on
+EXACT_EVALUATIONS, MAX_EXACT_LINKS = 8, 1500  # the same where each follows paths, which is slow
+MIN_EXACT_GAIN_NATS = 10.0  # that exact levels must gain to be refined on, and each descent
+MAX_EXACT_DESCENTS = 3  # the objective is rough, as paths open and close: a simplex stops early
 MAX_PROPOSALS = 2  # of one effect that are fitted
 MIN_GAIN_NATS = 5.0  # that a proposal must gain to be refined
 OUTSIDE_NATS = 10.0  # penalty of a step outside the bounds
@@ -94,7 +97,48 @@ def _best_addition(model: FoldModel, effect: Effect, result: FitResult,
     if best is None or result.objective - best[1].objective < MIN_GAIN_NATS:
         return best
     refined = _refine(*best)
-    return with_exact_levels(*refined) if effect.always_exact else refined
+    if not effect.always_exact:
+        return refined
+    exact = with_exact_levels(*refined)
+    if like is not None and like == effect.exact(like):
+        near = _near(model, effect, result, like)
+        return near if near[1].objective < exact[1].objective else exact
+    before = result.objective
+    for _ in range(MAX_EXACT_DESCENTS):
+        if exact[1] is refined[1] or before - exact[1].objective < MIN_EXACT_GAIN_NATS:
+            break
+        before = exact[1].objective
+        exact = _refine(*exact, evaluations=EXACT_EVALUATIONS, descents=1,
+                        max_links=MAX_EXACT_LINKS)
+    return exact
+
+
+def _near(model: FoldModel, effect: Effect, result: FitResult,
+          like: Any) -> tuple[FoldModel, FitResult]:
+    """Return the best fit to a fold around the parameters that were found on all links.
+
+    Each number by itself a share of its step to both sides, and all that gain together: every fold
+    asks for the same exact levels, which are kept.
+    """
+    def fitted(params: Any) -> tuple[FoldModel, FitResult]:
+        tried = model.with_effects([*model.effects, model.apply(effect, params)])
+        return tried, tried.fit(result)
+
+    variation, best = effect.variation(like), fitted(like)
+    if variation is None:
+        return best
+    start, numbers = best[1].objective, variation.values.copy()
+    for number, step in enumerate(variation.steps):
+        least = start
+        for shift in (-NEAR_SHARE * step, NEAR_SHARE * step):
+            values = variation.values.copy()
+            values[number] += shift
+            moved = fitted(variation.params(np.clip(values, variation.low, variation.high)))
+            if moved[1].objective < least:
+                least, numbers[number] = moved[1].objective, values[number]
+            best = min(best, moved, key=lambda each: each[1].objective)
+    together = fitted(variation.params(np.clip(numbers, variation.low, variation.high)))
+    return min(best, together, key=lambda each: each[1].objective)
 
 
 def with_exact_levels(model: FoldModel, result: FitResult) -> tuple[FoldModel, FitResult]:
@@ -114,15 +158,24 @@ def with_exact_levels(model: FoldModel, result: FitResult) -> tuple[FoldModel, F
     return model, result
 
 
-def _refine(model: FoldModel, result: FitResult) -> tuple[FoldModel, FitResult]:
-    """Vary the last effect's parameters for a better fit to the training links."""
+def _refine(model: FoldModel, result: FitResult, evaluations: int = EVALUATIONS,
+            descents: int = DESCENTS, max_links: int = MAX_LINKS) -> tuple[FoldModel, FitResult]:
+    """Vary the last effect's parameters for a better fit to the training links.
+
+    Args:
+        model: what is learnt from.
+        result: its fit.
+        evaluations: of the objective for each number, in one descent.
+        descents: one after the other.
+        max_links: that the objective is of.
+    """
     last = model.effects[-1]
     variation = last.effect.variation(last.params)
     if variation is None or not len(variation.values):
         return model, result
     if variation.members is not None:
         return _refine_members(model, result, last, variation)
-    rows = subsample(np.flatnonzero(model.train), MAX_LINKS)
+    rows = subsample(np.flatnonzero(model.train), max_links)
     design_effect = model.view(result).design_effect * len(rows) / max(model.train.sum(), 1)
     small = model.restrict(rows, model.effects[:-1])
     rest = small.regression()
@@ -146,8 +199,8 @@ def _refine(model: FoldModel, result: FitResult) -> tuple[FoldModel, FitResult]:
                      + OUTSIDE_NATS * outside)
 
     numbers = variation.values
-    for _ in range(DESCENTS):
-        numbers = _descend(objective, numbers, variation.steps)
+    for _ in range(descents):
+        numbers = _descend(objective, numbers, variation.steps, evaluations)
     return _better(model, result, last, variation, numbers)
 
 
@@ -206,15 +259,15 @@ def _refine_members(model: FoldModel, result: FitResult, last: AppliedEffect,
     return _better(model, result, last, variation, numbers)
 
 
-def _descend(objective: Callable[[np.ndarray], float], values: np.ndarray,
-             steps: np.ndarray) -> np.ndarray:
+def _descend(objective: Callable[[np.ndarray], float], values: np.ndarray, steps: np.ndarray,
+             evaluations: int = EVALUATIONS) -> np.ndarray:
     """Minimise by Brent's method, or that of Nelder and Mead (1965) for more than one number."""
     if len(values) == 1:
         around = (values[0] - steps[0], values[0] + steps[0])
         return minimize_scalar(lambda value: objective(np.array([value])), around, method="brent",
-                               options={"xtol": 1e-3, "maxiter": EVALUATIONS}).x[None]
+                               options={"xtol": 1e-3, "maxiter": evaluations}).x[None]
     simplex = np.vstack([values, values + np.diag(steps)])
-    options = {"initial_simplex": simplex, "maxfev": EVALUATIONS * len(simplex), "xatol": 1e-2,
+    options = {"initial_simplex": simplex, "maxfev": evaluations * len(simplex), "xatol": 1e-2,
                "fatol": 0.1}
     return minimize(objective, values, method="Nelder-Mead", options=options).x
 

@@ -55,6 +55,7 @@ class MissingObstacle(GainEffect):
     name = "missing_obstacle"
     figure = "links"
     repeatable = True
+    always_exact = True
     confused_with = ("foliage", "antenna_pattern", "device_position_error")
 
     class Params(EffectParams):
@@ -118,18 +119,28 @@ class MissingObstacle(GainEffect):
     @override
     def variation(self, params: Params) -> Variation:
         x_m, y_m = params.box[:2]
+        # With exact levels, what reaches the shadow is on paths that are followed.
+        count = len(params.box) + (not params.exact)
+
+        def changed(numbers: np.ndarray) -> MissingObstacle.Params:
+            values = [*numbers.tolist(), params.scattered_db][:len(params.box) + 1]
+            return params.model_copy(update={"box": Box(*values[:-1]), "scattered_db": values[-1]})
+
         return Variation(
-            np.array([*params.box, params.scattered_db]),
-            np.array([6.0, 6.0, 8.0, 8.0, 8.0, 20.0, 4.0]),
-            np.array([x_m - 60, y_m - 60, 4.0, 4.0, 3.0, -90.0, -20.0]),
-            np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0, 10.0]),
-            lambda numbers: self.Params(box=Box(*numbers[:-1].tolist()),
-                                        scattered_db=float(numbers[-1])))
+            np.array([*params.box, params.scattered_db])[:count],
+            np.array([6.0, 6.0, 8.0, 8.0, 8.0, 20.0, 4.0])[:count],
+            np.array([x_m - 60, y_m - 60, 4.0, 4.0, 3.0, -90.0, -20.0])[:count],
+            np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0, 10.0])[:count], changed,
+            follows_paths=params.exact)
 
     @override
     def neg_log_prior(self, params: Params) -> float:
         # Links that all pass below the roof only bound its height from below.
         return 0.5 * (params.box.height_m / HEIGHT_SCALE_M) ** 2
+
+    @override
+    def corrected_map(self, city: CityMap, params: Params) -> CityMap:
+        return _with_box(city, params.box)
 
     @override
     def parameters(self, links: LinkData, params: Params,
@@ -140,8 +151,8 @@ class MissingObstacle(GainEffect):
         return {name: Parameter(float(value), float(low), float(high), units.get(name, "m"),
                                 allowed=Allowed(float(least), float(most)))
                 for name, value, low, high, least, most in zip(
-                    (*Box._fields, "scattered_db"), variation.values, *reach, variation.low,
-                    variation.high, strict=True)}
+                    (*Box._fields, "scattered_db")[:len(variation.values)], variation.values,
+                    *reach, variation.low, variation.high, strict=True)}
 
     @override
     def like(self, params: Params, other: Params) -> Params:

@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo
 
 QUANTILE_90 = 1.645  # standard deviations to each side of a normal distribution's 90 % interval
+NEAR_SHARE = 0.5  # of a step: grid on which folds search where each value follows paths
 
 
 def _within(end: str) -> AfterValidator:
@@ -164,6 +165,9 @@ class Variation:
         params: numbers (r,) -> parameters.
         members: indices of numbers that belong together and act on links of their own, such as
             those of one device; each group is refined by itself. None: all act on the same links.
+        follows_paths: whether each value is judged on paths that are followed anew. That is slow
+            and rough, so folds search on a grid (`NEAR_SHARE`), and what lies between its points
+            is uncertain.
     """
 
     values: np.ndarray
@@ -172,6 +176,12 @@ class Variation:
     high: np.ndarray
     params: Callable[[np.ndarray], Any]
     members: list[np.ndarray] | None = None
+    follows_paths: bool = False
+
+    @property
+    def resolution_sd(self) -> np.ndarray:
+        """Standard deviation (r,) of what the search leaves open: uniform within the grid."""
+        return self.steps * (NEAR_SHARE / np.sqrt(12) if self.follows_paths else 0.0)
 
 
 def quantities(params: type[EffectParams] | EffectParams) -> dict[str, dict[str, Any]]:

@@ -105,7 +105,8 @@ class DevicePositionError(GainEffect):
         return Variation(
             np.array(params.move_m), np.full(2, 6.0), np.full(2, -MAX_MOVE_M),
             np.full(2, MAX_MOVE_M),
-            lambda move_m: self.Params(device=params.device, move_m=tuple(move_m.tolist())))
+            lambda move_m: params.model_copy(update={"move_m": tuple(move_m.tolist())}),
+            follows_paths=params.exact)
 
     @override
     def parameters(self, links: LinkData, params: Params,

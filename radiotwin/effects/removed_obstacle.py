@@ -34,6 +34,7 @@ class RemovedObstacle(GainEffect):
     figure = "links"
     nlos_only = True
     repeatable = True
+    always_exact = True
     confused_with = ("device_position_error",)
 
     class Params(EffectParams):
@@ -85,6 +86,10 @@ class RemovedObstacle(GainEffect):
     @override
     def exact(self, params: Params) -> Params:
         return params.model_copy(update={"exact": True})
+
+    @override
+    def corrected_map(self, city: CityMap, params: Params) -> CityMap:
+        return _without(city, params.building)[0]
 
     @override
     def parameters(self, links: LinkData, params: Params,

@@ -46,8 +46,11 @@ def estimates(model: FoldModel, result: FitResult) -> list[Estimate]:
         clusterings.append(links.flight)
     covariance = scores.covariance(clusterings)
     first, found = len(result.coefficients), []
-    for own, of_effect in zip(model.coefficient_slices, secants, strict=True):
+    for own, of_effect, variation in zip(model.coefficient_slices, secants, variations,
+                                         strict=True):
         sd = np.sqrt(np.diag(covariance))[first:first + len(of_effect)]
+        if variation is not None:
+            sd = np.hypot(sd, variation.resolution_sd)
         sides = np.reshape([each.sides for each in of_effect], (-1, 2)).T
         found.append(Estimate(result.coefficients[own], covariance[own, own], sd * sides))
         first += len(of_effect)

@@ -152,7 +152,7 @@ def _locate(links: LinkData, scene: Scene, channel: ChannelModel, unknown: np.nd
     rows = np.isin(links.device, unknown) & (known | np.isfinite(links.level_db))
     measured = links.receiver_m[rows], links.device[rows], links.level_db[rows], channel
     options: dict[str, Any] = {
-        "devices": unknown, "bounds": scene.config.extent.bounds, "city": scene.city,
+        "devices": unknown, "bounds": scene.config.extent.bounds, "city": links.city,
         "z_m": links.device_m[unknown, 2], "limit_db": limit_db, "seed": seed,
         "start_m": start_m, "settings": settings}
     names = [links.device_names[index] for index in unknown]

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from radiotwin.closeloop.bases import make_bases
 from radiotwin.closeloop.relocate import relocate_devices
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.gain_offsets import ReceiverGainOffset
@@ -29,7 +30,7 @@ def misplaced(seed, device=1):
 
 def test_a_device_moves_to_where_it_is_in_every_fold():
     before = misplaced(3)
-    after = relocate_devices(before)
+    after = relocate_devices(before, before.links, make_bases(None, 0)["twin"])
     for each in after.models:
         assert np.hypot(*(each.links.device_m[1, :2] - MASTS_M[1, :2])) < 0.5 * np.hypot(*WRONG_M)
     assert after.rmse_db() < before.rmse_db()
@@ -38,4 +39,4 @@ def test_a_device_moves_to_where_it_is_in_every_fold():
 
 def test_known_devices_stay():
     model = fitted(drive(3), ReceiverGainOffset())
-    assert relocate_devices(model) is model
+    assert relocate_devices(model, model.links, make_bases(None, 0)["twin"]) is model

@@ -52,7 +52,8 @@ def test_a_missing_building_is_in_the_map_that_the_channel_predicts_over(links):
     np.testing.assert_allclose(effect.term(links, params, channel).offset_db, [-30.0, 0.0], atol=0.01)
     assert channel.links == 2
     variation = effect.variation(params)
-    assert not variation.params(variation.values).exact  # it is refined quickly
+    assert variation.params(variation.values) == params  # refined on what the channel says of each box
+    assert len(variation.values) == 6 and len(effect.variation(params.model_copy(update={"exact": False})).values) == 7
 
 
 def test_a_moved_anchor_has_the_level_of_its_true_position(links):
