@@ -22,15 +22,18 @@ def test_the_site_builds(tmp_path):
          str(tmp_path / "site")], cwd=tmp_path, capture_output=True, text=True,
         env=os.environ | {"EXECUTE_EXAMPLES": "false", "NO_MKDOCS_2_WARNING": "1"})
     assert result.returncode == 0, result.stderr
-    reference = (tmp_path / "site" / "reference" / "index.html").read_text(encoding="utf-8")
+    reference = (tmp_path / "site" / "reference.html").read_text(encoding="utf-8")
     for name in ("radiotwin.twin.fit_twin", "radiotwin.twin.Twin.predict", "radiotwin.radiomap.RadioMap.read",
                  "radiotwin.closeloop.criteria.SelectionCriteria", "marl.parallel_env.HarvestEnv",
                  "radiotwin.footprints.build.build_scene_from_map"):
         assert f'id="{name}"' in reference
-    results = (tmp_path / "site" / "results" / "index.html").read_text(encoding="utf-8")
+    results = (tmp_path / "site" / "results.html").read_text(encoding="utf-8")
     for picture in re.findall(r'<img [^>]*src="([^"]+)"', results):
-        assert (tmp_path / "site" / "results" / picture).is_file(), picture
-    assert "rt.trace_map" in (tmp_path / "site" / "examples" / "city_to_map" / "index.html").read_text(encoding="utf-8")
+        assert (tmp_path / "site" / picture).is_file(), picture
+    for path in (tmp_path / "site").rglob("*.html"):  # pages work from a file, without a network
+        loaded = re.findall(r'<(?:script|img|iframe)[^>]* src="([^"]+)"', path.read_text(encoding="utf-8"))
+        assert not [each for each in loaded if each.startswith(("http:", "https:", "//"))], path
+    assert "rt.trace_map" in (tmp_path / "site" / "examples" / "city_to_map.html").read_text(encoding="utf-8")
 
 
 def test_every_criterion_is_documented_with_its_default():
