@@ -29,14 +29,15 @@ FIGURES = (
      "position of the moving end."),
     ("drivers.png", "Dependence of the residual",
      "Mean held-out residual over the variables that it depends on most, with one standard error. "
-     "Dashed: contribution of the effects to the prediction."),
+     "Dashed: contribution of the effects to the prediction. The diffraction parameter (ν of ITU-R "
+     "P.526) says how far the map reaches into the straight line: above 0 it blocks it."),
 )
 KINDS = {"los": "", "device": "device ", "receiver": "receiver ", "flight": "flight "}
 GROUPS = {"los": "with line of sight", "nlos": "without line of sight"}
 COLUMNS = {"n": "links", "bias_db": "bias [dB]", "std_db": "standard deviation [dB]",
            "correlation": "correlation", "rmse_db": "RMSE [dB]", "mae_db": "MAE [dB]",
            "nll": "−log-likelihood [nats]"}
-CARDS = (("rmse_db", "RMSE", " dB"), ("bias_db", "bias", " dB"),
+CARDS = (("rmse_db", "RMSE, before and after", " dB"), ("bias_db", "bias", " dB"),
          ("std_db", "standard deviation", " dB"), ("correlation", "correlation", ""))
 MAX_NAMED = 4  # variables in a sentence
 MAX_ROWS = 40  # groups with more members are left out of the tables
@@ -102,6 +103,12 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
 
 def _cards(report: dict) -> list[tuple[str, str]]:
     cards = []
+    combined = report["error"].get("combined")
+    if combined and report["baselines"]:
+        best = min(report["baselines"], key=lambda name: report["baselines"][name]["rmse_db"])
+        cards.append(("best prediction, RMSE", f"{words.number(combined['rmse_db'])} dB"))
+        cards.append((f"{name_label(best)} alone",
+                      f"{words.number(report['baselines'][best]['rmse_db'])} dB"))
     for key, label, unit in CARDS:
         before, after = (words.number(report["error"][when].get(key))
                          for when in ("before", "after"))

@@ -90,7 +90,7 @@ def number(value: float | None) -> str:
         return "–"
     if isinstance(value, int):
         text = f"{value:,}"
-    elif 0.0005 < abs(value) < 0.1:
+    elif 0.005 <= abs(value) < 0.1:
         text = f"{value:.2g}"
     else:
         text = f"{value:.2f}" if abs(value) < 1000 else f"{value:,.0f}"
@@ -108,7 +108,8 @@ def _effect(report: dict) -> str:
     error, causes = report["error"], cause_names(report)
     explained = [each["heldout_rmse_db"] for each in report["candidates"]
                  if each["kept"] and each["name"] not in INTERPOLATIONS]
-    after = explained[-1] if explained else error["after"]["rmse_db"]
+    interpolated = any(each["name"] in INTERPOLATIONS for each in report["effects"])
+    after = explained[-1] if explained and interpolated else error["after"]["rmse_db"]
     it = "it" if len(causes) == 1 else "them"
     text = (f"The model lacked {join_names(causes)}. With {it} the RMSE on held-out links falls "
             f"from {number(error['before']['rmse_db'])} to {number(after)} dB.")

@@ -98,7 +98,8 @@ def device_layer(run: Run) -> list[dict]:
         else:
             radius_m = device.credible_radius_m
             entry |= {"estimate": position_m, "located": bool(device.located),
-                      "radius_m": radius_m if np.isfinite(radius_m) else None}
+                      "radius_m": radius_m if np.isfinite(radius_m) else None,
+                      "second": list(device.second_mode) if device.second_mode else None}
     return list(devices.values())
 
 

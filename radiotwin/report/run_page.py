@@ -21,6 +21,7 @@ from radiotwin.report.layers import (
 )
 from radiotwin.report.run_folder import Run
 
+ROUGH_M = 100.0  # 90 % radius above which a device is not said to be found
 SCALES = {"gain": "viridis", "sigma": "cividis", "error": "coolwarm", "link": "coolwarm_r"}
 SCRIPTS = (("pythreejs", "three.js"), ("radiotwin.report", "stage.js"),
            ("radiotwin.report", "overlay.js"), ("radiotwin.report", "viewer.js"))
@@ -99,11 +100,22 @@ def _estimates(run: Run) -> Table | None:
             continue
         error_m = np.hypot(estimate[0] - true[0], estimate[1] - true[1]) if true else np.nan
         radius_m = np.nan if device["radius_m"] is None else device["radius_m"]
-        rows.append([device["name"],
-                     "yes" if device["located"] else "no: the data do not determine its position",
-                     float(estimate[0]), float(estimate[1]), float(error_m), radius_m])
-    columns = ("device", "located", "x [m]", "y [m]", "error [m]", "90 % radius [m]")
+        rows.append([device["name"], _how_sure(device), float(estimate[0]), float(estimate[1]),
+                     float(error_m), radius_m])
+    columns = ("device", "position", "x [m]", "y [m]", "error [m]", "90 % radius [m]")
     return Table(columns, rows, text_columns=2) if rows else None
+
+
+def _how_sure(device: dict) -> str:
+    """Say in words how far the data determine a device's position."""
+    if not device["located"] or device["radius_m"] is None:
+        return "not determined by these data"
+    rough = device["radius_m"] > ROUGH_M
+    text = "a region, no place" if rough else "found"
+    if device["second"]:
+        x_m, y_m, weight = device["second"]
+        text += f"; or near ({x_m:.0f}, {y_m:.0f}) m with {100 * weight:.0f} %"
+    return text
 
 
 def _facts(run: Run) -> list[str]:

@@ -103,7 +103,13 @@ def test_the_city_turns_and_zooms(opened, path, pixels):
     page.mouse.up()
     turned = pixels(page)
     far_m = page.evaluate("stage.far")
+    page.mouse.wheel(0, 300)  # scrolls the page
+    page.wait_for_timeout(300)
+    assert page.evaluate("[stage.far, scrollY > 0]") == [far_m, True]
+    page.evaluate("scrollTo(0, 0)")
+    page.keyboard.down("Control")
     page.mouse.wheel(0, -400)
+    page.keyboard.up("Control")
     for _ in range(100):
         page.wait_for_timeout(50)
         if page.evaluate("stage.far") < 0.9 * far_m:
@@ -162,3 +168,25 @@ def test_a_city_like_munich_is_small_and_quick(opened, run, tmp_path):
     page = opened(tmp_path / "page.html")
     # 3 to 5 seconds on two busy cores without a graphics card (1.7 seconds of computing); tests share theirs.
     assert float(page.evaluate("document.body.dataset.readyMs")) < 60_000
+
+
+def test_keys_turn_and_zoom_and_print_has_the_picture(opened, path):
+    page = opened(path)
+    page.focus("#viewer")
+    turn, far_m = page.evaluate("[stage.turn, stage.far]")
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("+")
+    assert page.evaluate("stage.turn") < turn and page.evaluate("stage.far") < far_m
+    ticks = [float(text.replace("−", "-")) for text in page.locator("#control-colours span").all_inner_texts()]
+    assert len(ticks) >= 3 and ticks == sorted(ticks)
+    page.pdf()
+    assert page.evaluate("document.querySelector('.printed').naturalWidth") > 100
+
+
+@pytest.mark.parametrize("width", [375, 1280])
+def test_nothing_is_wider_than_the_page(opened, path, width):
+    page = opened(path)
+    page.set_viewport_size({"width": width, "height": 800})
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.emulate_media(color_scheme="dark")
+    assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(20, 25, 30)"

@@ -25,6 +25,13 @@ function label(context, text, [x, y], colour = INK) {
   context.fillText(text, x, y);
 }
 
+function ring(context, [x, y]) {
+  context.beginPath();
+  context.arc(x, y, 5, 0, 2 * Math.PI);
+  Object.assign(context, {strokeStyle: FOUND, lineWidth: 2});
+  context.stroke();
+}
+
 function mark(context, kind, [x, y], size, colour) {
   context.beginPath();
   if (kind === "cross") {
@@ -60,16 +67,22 @@ function drawAxes(context, stage) {
   write("y, north [m]", x1 + 6 * off, (y0 + y1) / 2);
 }
 
+function circle(context, stage, [x, y, z], radius, dashes) {
+  context.setLineDash(dashes);
+  path(context, stage, Array.from({length: 97}, (_, n) => [x + radius * Math.cos(n * Math.PI / 48),
+                                                           y + radius * Math.sin(n * Math.PI / 48), z]), FOUND, 1);
+  context.setLineDash([]);
+}
+
 function drawDevices(context, stage) {
-  const [x0, x1, y0, y1] = stage.data.bounds, most = Math.max(x1 - x0, y1 - y0) / 4;
   const {devices} = stage.data;
-  for (const {estimate, true: position, radius_m: radius} of devices) {
+  for (const {estimate, true: position, radius_m: radius, located, second} of devices) {
     if (!estimate) continue;
     const [x, y, z] = estimate;
     if (position) path(context, stage, [position, estimate], FOUND, 1.5);
-    if (radius > 0 && radius < most)  // a larger circle would hide the city
-      path(context, stage, Array.from({length: 49}, (_, n) => [x + radius * Math.cos(n * Math.PI / 24),
-                                                               y + radius * Math.sin(n * Math.PI / 24), z]), FOUND, 1);
+    if (radius > 0) circle(context, stage, estimate, radius, located ? [] : [6, 5]);
+    const place = second && stage.pixel(second[0], second[1], z);
+    if (place) ring(context, place);
     const at = stage.pixel(x, y, z);
     if (at) mark(context, "cross", at, 5, FOUND);
   }

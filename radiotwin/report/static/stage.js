@@ -168,19 +168,45 @@ class Stage {
         const apart = pointer => Math.hypot(pointer.clientX - other.clientX, pointer.clientY - other.clientY);
         this.zoom(apart(before) / Math.max(apart(event), 1));
       } else if (event.buttons & 2 || event.shiftKey) this.pan(dx, dy);
-      else {
-        this.turn -= 0.006 * dx;
-        this.lift = Math.min(Math.max(this.lift + 0.006 * dy, 0.05), Math.PI / 2 - 1e-3);
-      }
+      else this.rotate(dx, dy);
       pointers.set(event.pointerId, event);
       this.redraw();
     });
     this.container.addEventListener("contextmenu", event => event.preventDefault());
     this.container.addEventListener("wheel", event => {
+      if (!event.ctrlKey && !event.metaKey) return;  // the page scrolls
       event.preventDefault();
       this.zoom(Math.exp(0.001 * event.deltaY));
       this.redraw();
     }, {passive: false});
+    this.container.addEventListener("keydown", event => this.press(event));
+    window.addEventListener("beforeprint", () => this.print());
+  }
+
+  press(event) {
+    const [dx, dy] = {ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1]}[event.key] ?? [0, 0];
+    if (dx || dy) event.shiftKey ? this.pan(-30 * dx, -30 * dy) : this.rotate(15 * dx, 15 * dy);
+    else if (event.key === "+" || event.key === "=") this.zoom(0.9);
+    else if (event.key === "-") this.zoom(1.1);
+    else return;
+    event.preventDefault();
+    this.redraw();
+  }
+
+  rotate(dx, dy) {
+    this.turn -= 0.006 * dx;
+    this.lift = Math.min(Math.max(this.lift + 0.006 * dy, 0.05), Math.PI / 2 - 1e-3);
+  }
+
+  // What is on the canvases as one picture: browsers print WebGL as nothing.
+  print() {
+    this.draw();
+    const both = document.createElement("canvas"), [glass] = this.container.getElementsByTagName("canvas");
+    Object.assign(both, {width: this.overlay.width, height: this.overlay.height});
+    const context = both.getContext("2d");
+    for (const each of [glass, this.overlay]) context.drawImage(each, 0, 0, both.width, both.height);
+    this.printed ??= this.container.appendChild(Object.assign(new Image(), {className: "printed", alt: ""}));
+    this.printed.src = both.toDataURL();
   }
 
   zoom(factor) { this.far = Math.min(Math.max(this.far * factor, 5), 1e5); }

@@ -52,6 +52,12 @@ function chooseView() {
   drawView();
 }
 
+function ticksBetween(low, high) {
+  const step = roundStep(high - low), ticks = [];
+  for (let at = Math.ceil(low / step) * step; at <= high; at += step) ticks.push(Number(at.toFixed(6)));
+  return ticks;
+}
+
 function drawView() {
   const shown = view();
   if (!shown) return;
@@ -67,12 +73,18 @@ function drawView() {
     stage.showDots(links.flatMap(n => [data.links.x[n], data.links.y[n], data.links.z[n]]),
                    links.flatMap(n => colourOf(scale, share(data.links[shown.links][n] / 100)).map(part => part / 255)));
   }
-  const bar = control("colours"), stops = data.scales[scale].map(colour => `rgb(${colour})`);
-  bar.style.background = scale === "los" ? `linear-gradient(to right, ${stops[0]} 50%, ${stops.at(-1)} 50%)`
-                                         : `linear-gradient(to right, ${stops})`;
-  control("title").textContent = shown.map ? shown.field.title : "measured − predicted [dB]";
-  control("low").textContent = scale === "los" ? "no" : low.toFixed(0).replace("-", "−");
-  control("high").textContent = scale === "los" ? "yes" : high.toFixed(0).replace("-", "−");
+  const bar = control("colours"), stops = data.scales[scale].map(colour => `rgb(${colour})`), los = scale === "los";
+  bar.style.background = los ? `linear-gradient(to right, ${stops[0]} 50%, ${stops.at(-1)} 50%)`
+                             : `linear-gradient(to right, ${stops})`;
+  const title = shown.map ? shown.field.title : "measured − predicted [dB]";
+  control("title").textContent = title;
+  const ticks = los ? [[0.25, "no"], [0.75, "yes"]] : ticksBetween(low, high).map(at => [share(at), at.toString().replace("-", "−")]);
+  bar.replaceChildren(...ticks.map(([at, text]) => {
+    const tick = Object.assign(document.createElement("span"), {textContent: text});
+    tick.style.left = `${100 * at}%`;
+    return tick;
+  }));
+  bar.setAttribute("aria-label", `${title}, from ${ticks[0]?.[1]} to ${ticks.at(-1)?.[1]}`);
   control("legend").textContent = !shown.map ? DOTS : scale === "los" ? "" : HOLES;
   stage.redraw();
 }
@@ -142,6 +154,7 @@ function play() {
     }, PLAY_MS);
   }
   control("play").textContent = player ? "❚❚" : "▶";
+  control("play").setAttribute("aria-label", player ? "pause" : "play");
 }
 
 // The level under the pointer
