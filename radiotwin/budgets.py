@@ -116,6 +116,8 @@ MAP_VALUES = Budget("MAP_VALUES", 500_000_000, "values", "one variable of a radi
 MAP_AXIS = Budget("MAP_AXIS", 20_000_000, "coordinates", "one axis of a radio map")
 MAP_CHUNKS = Budget("MAP_CHUNKS", 1_000_000, "pieces", "a variable as HDF5 stores it")
 MAP_ATTRIBUTES = Budget("MAP_ATTRIBUTES", 1_000, "attributes", "one variable")
+COVERAGE_CELLS = Budget("COVERAGE_CELLS", 25_000_000, "cells",
+                        "a coverage map: 40 bytes each in memory")
 MAP_PICTURES = Budget("MAP_PICTURES", 2_000, "pictures", "a KMZ file")
 # Paths
 PATHS = Budget("PATHS", 5_000_000, "paths", "a list of paths: 630 bytes each in memory")

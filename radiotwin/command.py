@@ -14,8 +14,8 @@ import typer
 from radiotwin import progress
 from radiotwin.console import collected, console
 
-TABLES = ("build-scene", "import", "fit", "compare", "close-loop", "locate", "demo", "doctor",
-          "cache")
+TABLES = ("build-scene", "import", "fit", "compare", "coverage", "close-loop", "locate", "demo",
+          "doctor", "cache")
 """Commands of `radiotwin` that print tables."""
 QUIET = Annotated[bool, typer.Option(
     "--quiet", "-q", help="Print nothing but warnings and errors.")]

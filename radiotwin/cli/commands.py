@@ -6,7 +6,7 @@ Heavy packages are imported inside the commands, so that `--help` answers at onc
 import typer
 
 from radiotwin import __version__
-from radiotwin.cli import importing, loop, model, report, scenes, tools, world
+from radiotwin.cli import coverage, importing, loop, model, report, scenes, tools, world
 from radiotwin.command import add_output_options
 from radiotwin.console import show_warnings_plainly
 
@@ -17,7 +17,7 @@ app = typer.Typer(
     help="Radio digital twins of cities, learnt from measurements. Build, trace and survey a "
          "scene; fit a twin to the measurements; map and compare it.")
 
-for module in (scenes, world, importing, model, loop, report, tools):
+for module in (scenes, world, importing, model, coverage, loop, report, tools):
     module.add_commands(app)
 add_output_options(app)
 

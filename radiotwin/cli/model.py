@@ -123,15 +123,24 @@ def map_(
     require_writable(out)
     radio_map = RadioMap.read(twin) if is_map else Twin.load(twin).map_stream(world)
     if is_map:
-        _check_scene(twin, radio_map.attributes, world)
+        check_scene(twin, radio_map.attributes, world)
     radio_map = select(radio_map, split_names(devices), _altitudes(altitudes))
     write_map(radio_map, world, out, exporters)
     say(f"wrote {out}: {len(radio_map.devices)} devices on {radio_map.lattice.shape} positions "
         "(z, y, x)")
 
 
-def _check_scene(path: Path, attributes: dict[Any, Any], scene: "Scene") -> None:
-    """Refuse a map of another city, which would get the outlines and the origin of this one."""
+def check_scene(path: Path, attributes: dict[Any, Any], scene: "Scene") -> None:
+    """Refuse a map of another city, which would get the outlines and the origin of this one.
+
+    Args:
+        path: of the map.
+        attributes: of the map.
+        scene: that is given with it.
+
+    Raises:
+        BadInput: their origins differ.
+    """
     origin = scene.config.origin
     for name, value in ({} if origin is None else origin.model_dump()).items():
         of_map = attributes.get(f"origin_{name}", value)

@@ -103,6 +103,45 @@ def in_frame_of(scene: "Scene | None", measurements: "Measurements",
                           None if shift_m is None else (shift_m[0], shift_m[1]))
 
 
+def parse_numbers(option: str, text: str, count: int | None = None) -> list[float]:
+    """Parse a list of numbers.
+
+    Args:
+        option: that has it, for the message.
+        text: `A,B,…`.
+        count: of them; None: at least one.
+
+    Raises:
+        BadInput: they are not so many finite numbers.
+    """
+    values = _numbers(text)
+    if not values or (count is not None and len(values) != count):
+        wanted = "numbers" if count is None else f"{count} numbers"
+        raise BadInput(f"{option} {text!r} is not {wanted} with commas between them")
+    return values
+
+
+def parse_bounds(option: str, text: str) -> tuple[float, float, float, float]:
+    """Parse the borders of an area in the scene's frame.
+
+    Args:
+        option: that has them, for the message.
+        text: `XMIN,YMIN,XMAX,YMAX` [m].
+
+    Returns:
+        x_min, x_max, y_min, y_max [m]
+
+    Raises:
+        BadInput: they are not four numbers, or a minimum is not below its maximum.
+    """
+    values = _numbers(text)
+    if len(values) != 4 or not (values[0] < values[2] and values[1] < values[3]):
+        raise BadInput(f"{option} {text!r} is not an area; give XMIN,YMIN,XMAX,YMAX in metres, "
+                       "the minimum below the maximum")
+    x_min, y_min, x_max, y_max = values
+    return x_min, x_max, y_min, y_max
+
+
 def _numbers(text: str) -> list[float]:
     """Return the finite numbers of a list; none of them where one is not."""
     try:

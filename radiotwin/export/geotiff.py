@@ -11,10 +11,11 @@ from radiotwin.geodesy import local_crs
 from radiotwin.map_file import MapBlock, MapStream
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
+from radiotwin.tables import Origin
 
 MAX_BANDS = 65_535  # of the format
 _WHOLE_VALUES = 2**24  # of a map whose bands are interleaved pixel by pixel
-_CACHE_BYTES = 2**26  # of GDAL
+GDAL_OPTIONS = {"GTIFF_WRITE_TOWGS84": "NO", "GDAL_CACHEMAX": 2**26}  # the cache in bytes
 
 
 def write_geotiff(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> None:
@@ -32,12 +33,7 @@ def write_geotiff(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> 
     Raises:
         BadInput: rasterio is not installed, or the lattice is not regular.
     """
-    try:
-        import rasterio
-    except ImportError:
-        raise BadInput(
-            f"{path}: GeoTIFF is written with the package rasterio, which is not installed; "
-            "install it with `pip install 'radiotwin[gis]'`, or write .nc or .csv") from None
+    rasterio = require_rasterio(path)
     lattice, step_m = radio_map.lattice, cell_size_m(radio_map, scene)
     names = [(device, altitude_m) for device in radio_map.devices for altitude_m in lattice.z_m]
     if len(names) > MAX_BANDS:
@@ -45,18 +41,14 @@ def write_geotiff(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> 
                        f"{len(names):,} devices and altitudes; choose some with --devices or "
                        "--altitudes, or write .nc or .csv")
     levels, height, width = lattice.shape
-    origin = scene.config.origin
-    crs = None if origin is None else rasterio.crs.CRS.from_string(local_crs(origin))
-    transform = rasterio.Affine(step_m, 0, lattice.x_m[0] - step_m / 2,
-                                0, -step_m, lattice.y_m[-1] + step_m / 2)
+    place = georeference(lattice.x_m, lattice.y_m, step_m, scene.config.origin)
     attributes = {name: str(value) for name, value in radio_map.header.attrs.items()}
     is_large = len(names) * height * width > _WHOLE_VALUES
     # GDAL hides errors of a full disk: it writes to memory, and we to the disk.
-    with rasterio.Env(GTIFF_WRITE_TOWGS84="NO", GDAL_CACHEMAX=_CACHE_BYTES), \
-            rasterio.MemoryFile(ext=".tif") as memory:
+    with rasterio.Env(**GDAL_OPTIONS), rasterio.MemoryFile(ext=".tif") as memory:
         with memory.open(
                 driver="GTiff", dtype="float32", count=len(names), nodata=np.nan,
-                height=height, width=width, compress="deflate", crs=crs, transform=transform,
+                height=height, width=width, compress="deflate", **place,
                 **({"interleave": "band", "bigtiff": "if_safer"} if is_large else {})) as file:
             bands = None if is_large else np.empty((len(names), height, width), np.float32)
             for block in radio_map.blocks():
@@ -70,6 +62,40 @@ def write_geotiff(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> 
                 file.update_tags(number, device=device, z_m=f"{altitude_m:g}")
         with atomic_file(path) as out:
             out.write(memory.getbuffer())
+
+
+def require_rasterio(path: Path) -> Any:
+    """Return the package rasterio.
+
+    Args:
+        path: of the GeoTIFF file, for the message.
+
+    Raises:
+        BadInput: it is not installed.
+    """
+    try:
+        import rasterio
+    except ImportError:
+        raise BadInput(
+            f"{path}: GeoTIFF is written with the package rasterio, which is not installed; "
+            "install it with `pip install 'radiotwin[gis]'`, or write .nc or .csv") from None
+    return rasterio
+
+
+def georeference(x_m: np.ndarray, y_m: np.ndarray, step_m: float,
+                 origin: Origin | None) -> dict[str, Any]:
+    """Return the reference system and the transform of a raster, north up, for rasterio.
+
+    Args:
+        x_m, y_m: middles of the cells, ascending [m].
+        step_m: side of a cell [m].
+        origin: of the local frame; None: coordinates are local, without a system.
+    """
+    import rasterio
+
+    crs = None if origin is None else rasterio.crs.CRS.from_string(local_crs(origin))
+    return {"crs": crs, "transform": rasterio.Affine(step_m, 0, x_m[0] - step_m / 2,
+                                                     0, -step_m, y_m[-1] + step_m / 2)}
 
 
 def _put(file: Any, bands: np.ndarray | None, block: MapBlock, levels: int) -> None:

@@ -1,12 +1,14 @@
-"""Write every page and figure: of a run, of a close-loop, of a comparison, of a radio map."""
+"""Write every page and figure: of a run, of a close-loop, of a comparison, of a radio map, of coverage."""
 
 from radiotwin.report.closeloop_figures import write_closeloop_figures
 from radiotwin.report.closeloop_page import write_closeloop_page
 from radiotwin.report.closeloop_words import closeloop_summary
 from radiotwin.report.comparison_figures import write_comparison_figures
+from radiotwin.report.coverage_figures import write_coverage_pictures
 from radiotwin.report.map_figures import write_picture
 from radiotwin.report.run_folder import Run, read_run
 from radiotwin.report.run_page import write_report
 
 __all__ = ["Run", "closeloop_summary", "read_run", "write_closeloop_figures",
-           "write_closeloop_page", "write_comparison_figures", "write_picture", "write_report"]
+           "write_closeloop_page", "write_comparison_figures", "write_coverage_pictures",
+           "write_picture", "write_report"]

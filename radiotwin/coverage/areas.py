@@ -1,0 +1,166 @@
+"""Shares of areas: of the whole extent and of polygons, above thresholds and by server."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+import xarray as xr
+from scipy.special import ndtri
+from shapely.geometry.base import BaseGeometry
+
+from radiotwin.coverage.grid import CoverageGrid
+from radiotwin.coverage.radio import location_probability
+from radiotwin.coverage.settings import CoverageSettings
+from radiotwin.coverage.transmitters import Transmitter
+from radiotwin.errors import BadInput
+from radiotwin.footprints.gis_files import read_geojson
+from radiotwin.geodesy import to_local
+from radiotwin.scene import Scene
+
+SINR_CLASSES_DB = (20.0, 13.0, 0.0, -5.0)  # excellent, good, fair, poor, as drive tests show it
+RATE_CLASSES = (0.9, 0.5, 0.25, 0.1)  # of the greatest rate
+PROBABILITY_CLASSES = (0.95, 0.9, 0.75, 0.5)
+
+
+@dataclass(frozen=True, eq=False)
+class Area:
+    """A polygon whose covered share is wanted.
+
+    Attributes:
+        name: for tables.
+        outline: polygon or multipolygon in the scene's frame [m].
+    """
+
+    name: str
+    outline: BaseGeometry
+
+
+def read_areas(path: Path | str, scene: Scene) -> list[Area]:
+    """Read the polygons of a GeoJSON file.
+
+    Args:
+        path: `.geojson`, longitude and latitude unless it declares another system.
+        scene: whose origin places them in the local frame.
+
+    Raises:
+        BadInput: no polygon, a scene without an origin, or a file that cannot be read.
+    """
+    path, origin = Path(path), scene.config.origin
+    if origin is None:
+        raise BadInput(f"{path}: its longitudes and latitudes need the scene's position, and "
+                       f"{scene.folder / 'scene.toml'} has no [origin]; add one with latitude_deg "
+                       "and longitude_deg of x = y = 0")
+    features = read_geojson(path).features
+    if not features:
+        raise BadInput(f"{path} holds no polygon; draw the area as a polygon and export it as "
+                       "GeoJSON")
+
+    def project(points: np.ndarray) -> np.ndarray:
+        return np.column_stack(to_local(origin, *points.T))
+
+    return [Area(each.tags.get("name", each.name),
+                 shapely.make_valid(shapely.transform(each.area, project))) for each in features]
+
+
+def class_lists(settings: CoverageSettings, bandwidth_hz: float) -> dict[str, tuple[float, ...]]:
+    """Return the lower ends of the classes of each raster, descending.
+
+    Args:
+        settings: with the classes of received power and the rate's model.
+        bandwidth_hz: of the channel [Hz].
+    """
+    top_bps = bandwidth_hz * settings.rate.max_bps_hz
+    return {"received_power_dbm": settings.classes_dbm, "snr_db": SINR_CLASSES_DB,
+            "sinr_db": SINR_CLASSES_DB, "rate_bps": tuple(top_bps * each for each in RATE_CLASSES),
+            "coverage_probability": PROBABILITY_CLASSES}
+
+
+def area_records(dataset: xr.Dataset, grid: CoverageGrid, transmitters: Sequence[Transmitter],
+                 settings: CoverageSettings, classes: dict[str, tuple[float, ...]],
+                 areas: Sequence[Area]) -> list[dict[str, Any]]:
+    """Return the shares of the whole extent, and of each polygon.
+
+    Shares are of the cells that are not left out; a cell counts where its middle is in the area.
+    Nothing detected is below every threshold.
+
+    Args:
+        dataset: as of `Coverage`.
+        grid: its cells.
+        transmitters: names of the servers.
+        settings: threshold, reliability, and whether cells inside buildings count.
+        classes: thresholds of each raster.
+        areas: polygons.
+
+    Raises:
+        BadInput: no cell of a polygon is predicted.
+    """
+    indoor = dataset["indoor"].values
+    counted = np.ones_like(indoor) if settings.indoor_loss_db is not None else ~indoor
+    if not counted.any():
+        raise BadInput("every cell is inside a building; give --indoor-loss-db to predict there")
+    records = [_record("extent", dataset, counted, grid, transmitters, settings, classes)]
+    for area in areas:
+        inside = cells_in(area.outline, grid)
+        if not (inside & counted).any():
+            reason = "all of its cells are inside buildings" if inside.any() else (
+                "no cell's middle lies in it: it is outside the extent, or smaller than a cell")
+            raise BadInput(f"area {area.name!r}: {reason}")
+        records.append(_record(area.name, dataset, inside & counted, grid, transmitters, settings,
+                               classes) | {"outline_m2": float(area.outline.area),
+                                           "cells_left_out_indoors": int((inside & ~counted).sum())}
+                       )
+    return records
+
+
+def cells_in(outline: BaseGeometry, grid: CoverageGrid) -> np.ndarray:
+    """Return whether the middle of each cell (ny, nx) lies in an outline."""
+    shapely.prepare(outline)
+    found = np.zeros(grid.shape, dtype=bool)
+    for rows in grid.blocks():
+        x, y = np.meshgrid(grid.x_m, grid.y_m[rows])
+        found[rows] = shapely.contains_xy(outline, x, y)
+    return found
+
+
+def _record(name: str, dataset: xr.Dataset, where: np.ndarray, grid: CoverageGrid,
+            transmitters: Sequence[Transmitter], settings: CoverageSettings,
+            classes: dict[str, tuple[float, ...]]) -> dict[str, Any]:
+    cell_m2, n = grid.step_m**2, int(where.sum())
+    power_dbm = dataset["received_power_dbm"].values[where]
+    sd_db = (dataset["received_power_sd_db"].values[where].astype(float)
+             if "received_power_sd_db" in dataset else None)
+    thresholds = sorted({*settings.classes_dbm, settings.threshold_dbm}, reverse=True)
+    record: dict[str, Any] = {
+        "area": name, "cells": n, "area_m2": n * cell_m2, "step_m": grid.step_m,
+        "received_power_dbm": [_covered(power_dbm, sd_db, level_dbm, settings.reliability)
+                               for level_dbm in thresholds]}
+    for key in ("snr_db", "sinr_db", "rate_bps"):
+        values = dataset[key].values[where]
+        record[key] = [{"threshold": level, "share": float((values >= level).mean())}
+                       for level in classes[key]]
+    record["mean_rate_bps"] = float(dataset["rate_bps"].values[where].mean(dtype=float))
+    servers = np.bincount(dataset["best_server"].values[where] + 1,
+                          minlength=len(transmitters) + 1)
+    record["best_server"] = {each.name: float(count / n)
+                             for each, count in zip(transmitters, servers[1:])}
+    record["not_detected"] = float(servers[0] / n)
+    return record
+
+
+def _covered(power_dbm: np.ndarray, sd_db: np.ndarray | None, threshold_dbm: float,
+             reliability: float) -> dict[str, float]:
+    """Return the share of cells that reach a threshold: by the median, and with certainty.
+
+    `share_reliable` counts cells whose location probability is at least the reliability,
+    `mean_probability` is the expected share of the area.
+    """
+    found = {"threshold": threshold_dbm, "share": float((power_dbm >= threshold_dbm).mean())}
+    if sd_db is not None:
+        margin_db = float(ndtri(reliability)) * sd_db
+        found["share_reliable"] = float((power_dbm - margin_db >= threshold_dbm).mean())
+        found["mean_probability"] = float(
+            location_probability(power_dbm, sd_db, threshold_dbm).mean())
+    return found

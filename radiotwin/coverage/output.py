@@ -1,0 +1,229 @@
+"""Files of a coverage prediction: tables, NetCDF, GeoTIFF, GeoPackage and KMZ."""
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgba_array
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+from radiotwin.cells import write_csv
+from radiotwin.coverage.legends import Legend, drawn_rasters, file_stem, legend_of
+from radiotwin.coverage.run import Coverage
+from radiotwin.coverage.vectors import require_vectors, write_geopackage
+from radiotwin.errors import BadInput
+from radiotwin.export.geotiff import GDAL_OPTIONS, georeference, require_rasterio
+from radiotwin.export.kmz import OPACITY, Overlay, enlarged_png, write_overlays
+from radiotwin.files import atomic_file
+from radiotwin.geodesy import local_crs
+from radiotwin.scene import Scene
+from radiotwin.tables import Origin
+
+LEGEND_ROWS = 24  # servers in a legend
+RASTERS = ("received_power_dbm", "received_power_sd_db", "best_server", "snr_db", "sinr_db",
+           "rate_bps", "coverage_probability")
+
+
+def write_tables(coverage: Coverage, folder: Path) -> None:
+    """Write `coverage.json`, with everything, and `coverage.csv`, a row for each share.
+
+    Args:
+        coverage: of the network.
+        folder: to write to.
+    """
+    with atomic_file(folder / "coverage.json") as file:
+        file.write(json.dumps(coverage.summary, indent=1, allow_nan=False,
+                              ensure_ascii=False).encode())
+    with atomic_file(folder / "coverage.csv") as file:
+        write_csv(share_table(coverage), file)
+
+
+def share_table(coverage: Coverage) -> pd.DataFrame:
+    """Return a row for each area, quantity and threshold: shares of the area, and square metres."""
+    rows = []
+    for area in coverage.summary["areas"]:
+        for quantity in ("received_power_dbm", "snr_db", "sinr_db", "rate_bps"):
+            rows += [{"area": area["area"], "quantity": quantity, **each,
+                      "area_m2": each["share"] * area["area_m2"]} for each in area[quantity]]
+        rows += [{"area": area["area"], "quantity": "best_server", "device": name, "share": share,
+                  "area_m2": share * area["area_m2"]}
+                 for name, share in area["best_server"].items()]
+    columns = ["area", "quantity", "device", "threshold", "share", "share_reliable",
+               "mean_probability", "area_m2"]
+    return pd.DataFrame(rows).reindex(columns=columns)
+
+
+def write_netcdf(coverage: Coverage, scene: Scene, path: Path) -> None:
+    """Write all rasters as NetCDF-4 after the CF conventions, for `xarray.open_dataset`.
+
+    Args:
+        coverage: of the network.
+        scene: whose origin places it on the globe.
+        path: of the .nc file.
+    """
+    dataset, origin = coverage.dataset.copy(), scene.config.origin
+    dataset["indoor"] = dataset["indoor"].astype(np.int8)
+    dataset.attrs["Conventions"] = "CF-1.11"
+    if origin is not None:
+        from pyproj import CRS
+
+        for name in dataset.data_vars:
+            dataset[name].attrs["grid_mapping"] = "crs"
+        dataset["crs"] = xr.Variable((), np.int32(0), CRS(local_crs(origin)).to_cf())
+    rasters = [name for name in (*RASTERS, "indoor") if name in dataset]
+    data = io.BytesIO()
+    dataset.to_netcdf(data, engine="h5netcdf", encoding={
+        **{name: {"compression": "gzip", "compression_opts": 4} for name in rasters},
+        **{axis: {"_FillValue": None} for axis in "xy"}})
+    with atomic_file(path) as file:
+        file.write(data.getbuffer())
+
+
+def write_geotiffs(coverage: Coverage, scene: Scene, folder: Path) -> None:
+    """Write a GeoTIFF for each raster, north up: a band in its unit, NaN or -1 for no data.
+
+    Args:
+        coverage: of the network.
+        scene: whose origin places it on the globe.
+        folder: to write to.
+
+    Raises:
+        BadInput: rasterio is not installed.
+    """
+    rasterio = require_rasterio(folder / "received_power.tif")
+    grid = coverage.grid
+    tags = {name: str(value) for name, value in coverage.dataset.attrs.items()}
+    tags |= {f"server_{row}": each.name for row, each in enumerate(coverage.transmitters)}
+    for name in RASTERS:
+        if name not in coverage.dataset:
+            continue
+        variable = coverage.dataset[name]
+        is_server = name == "best_server"
+        with rasterio.Env(**GDAL_OPTIONS), rasterio.MemoryFile(ext=".tif") as memory:
+            with memory.open(
+                    driver="GTiff", dtype=variable.dtype, count=1, height=grid.shape[0],
+                    width=grid.shape[1], nodata=-1 if is_server else np.nan, compress="deflate",
+                    **georeference(grid.x_m, grid.y_m, grid.step_m, scene.config.origin)) as file:
+                file.write(variable.values[::-1], 1)
+                file.update_tags(**tags)
+                file.units = [variable.attrs.get("units", "")]
+                file.set_band_description(1, variable.attrs["long_name"])
+            with atomic_file(folder / f"{file_stem(name)}.tif") as out:
+                out.write(memory.getbuffer())
+
+
+def write_kmz(coverage: Coverage, scene: Scene, path: Path) -> None:
+    """Write an overlay for each raster, with the colours of its classes, for Google Earth.
+
+    Args:
+        coverage: of the network.
+        scene: with an origin.
+        path: of the .kmz file.
+    """
+    names = drawn_rasters(coverage)
+    legends = {name: legend_of(name, coverage) for name in names}
+
+    def draw(name: str) -> bytes:
+        legend = legends[name]
+        classes = legend.classes(coverage.dataset[name].values)
+        colours = (to_rgba_array(legend.colours) * 255).astype(np.uint8)
+        pixels = colours[np.maximum(classes, 0)]
+        pixels[..., 3] = np.where(classes >= 0, OPACITY, 0)
+        return enlarged_png(pixels)
+
+    def drawer(name: str) -> Callable[[], bytes]:
+        return lambda: draw(name)
+
+    overlays = [Overlay("coverage", legends[name].title, not row, drawer(name))
+                for row, name in enumerate(names)]
+    marks = {each.name: (float(each.position_m[0]), float(each.position_m[1]))
+             for each in coverage.transmitters}
+    write_overlays(path, scene, coverage.grid.bounds_m, overlays, marks,
+                   _legend_png([legends[name] for name in names]))
+
+
+def _legend_png(legends: list[Legend]) -> bytes:
+    """Return the PNG of all legends, one below the other."""
+    rows = [min(len(each.labels), LEGEND_ROWS) + 1.6 for each in legends]
+    figure = Figure(figsize=(2.3, 0.2 * sum(rows) + 0.1), facecolor="white")
+    FigureCanvasAgg(figure)
+    top = 1.0
+    for each, height in zip(legends, rows):
+        patches = [Patch(color=colour, label=label.replace("$", r"\$"))
+                   for label, colour in zip(each.labels[:LEGEND_ROWS], each.colours)]
+        figure.legend(handles=patches, title=each.title.replace(", ", ",\n"), loc="upper left",
+                      bbox_to_anchor=(0.0, top), frameon=False, fontsize=8, title_fontsize=8,
+                      alignment="left")
+        top -= height / sum(rows)
+    data = io.BytesIO()
+    figure.savefig(data, dpi=90, format="png")
+    return data.getvalue()
+
+
+def available_formats(scene: Scene, wanted: list[str] | None) -> tuple[list[str], list[str]]:
+    """Return the formats to write, and a sentence on each that cannot be written.
+
+    Args:
+        scene: of the coverage.
+        wanted: formats that must be written; None: all that can be.
+
+    Raises:
+        BadInput: an unknown format, or one that is wanted and cannot be written.
+    """
+    for name in wanted or ():
+        if name not in FORMATS:
+            raise BadInput(f"unknown format {name!r}; allowed are {', '.join(FORMATS)}")
+    usable, notes = [], []
+    for name in wanted or FORMATS:
+        try:
+            FORMATS[name](scene)
+            usable.append(name)
+        except BadInput as error:
+            if wanted:
+                raise
+            notes.append(str(error))
+    return usable, notes
+
+
+def write_formats(coverage: Coverage, scene: Scene, folder: Path, formats: list[str]) -> None:
+    """Write the rasters and vectors in some formats.
+
+    Args:
+        coverage: of the network.
+        scene: of it.
+        folder: to write to.
+        formats: names of `FORMATS`; `png` is left to `radiotwin.report`.
+    """
+    if "nc" in formats:
+        write_netcdf(coverage, scene, folder / "coverage.nc")
+    if "tif" in formats:
+        write_geotiffs(coverage, scene, folder)
+    if "gpkg" in formats:
+        write_geopackage(coverage, scene, folder / "coverage.gpkg")
+    if "kmz" in formats:
+        write_kmz(coverage, scene, folder / "coverage.kmz")
+
+
+def _check_origin(scene: Scene) -> Origin:
+    if scene.config.origin is None:
+        raise BadInput(f"coverage.kmz: Google Earth needs the position of the scene, and "
+                       f"{scene.folder / 'scene.toml'} has no [origin]; add one with latitude_deg "
+                       "and longitude_deg of x = y = 0")
+    return scene.config.origin
+
+
+FORMATS: dict[str, Callable[[Scene], object]] = {
+    "nc": lambda scene: None, "tif": lambda scene: require_rasterio(Path("received_power.tif")),
+    "gpkg": lambda scene: require_vectors(Path("coverage.gpkg")), "kmz": _check_origin,
+    "png": lambda scene: None}
+"""Formats, and what raises BadInput where one cannot be written for a scene."""
+FILES = frozenset({
+    "coverage.json", "coverage.csv", "coverage.nc", "coverage.gpkg", "coverage.kmz",
+    *(f"{file_stem(name)}{suffix}" for name in RASTERS for suffix in (".tif", ".png"))})
+"""Names of all files that are written to a folder."""

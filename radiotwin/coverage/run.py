@@ -1,0 +1,271 @@
+"""Coverage of a network, block by block: best server, SINR, rate and location probability."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from scipy.special import ndtri
+
+import radiotwin
+from radiotwin.coverage.areas import Area, area_records, class_lists
+from radiotwin.coverage.grid import CoverageGrid, ground_of
+from radiotwin.coverage.radio import (
+    ServerTally,
+    location_probability,
+    rate_bps,
+    thermal_noise_dbm,
+)
+from radiotwin.coverage.settings import CoverageSettings
+from radiotwin.coverage.sources import (
+    GainSource,
+    LawSource,
+    MapSource,
+    TwinSource,
+    altitude_of,
+    map_grid,
+    twin_transmitters,
+)
+from radiotwin.coverage.transmitters import (
+    Transmitter,
+    scene_transmitters,
+    select,
+    with_defaults,
+)
+from radiotwin.errors import BadInput
+from radiotwin.progress import progress
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.twin import Twin
+
+SCHEMA = "radiotwin.coverage/1"
+DEFAULT_HEIGHT_M, DEFAULT_STEP_M = 1.5, 5.0
+_ATTRIBUTES = {
+    "received_power": ("dBm", "received power of the best server (NaN: not detected, or left out)"),
+    "received_power_sd": ("dB", "standard deviation of the received power"),
+    "best_server": ("", "row of the best server among the transmitters (-1: none)"),
+    "snr": ("dB", "signal-to-noise ratio"),
+    "sinr": ("dB", "signal-to-interference-and-noise ratio"),
+    "rate": ("bit/s", "rate of one user"),
+    "coverage_probability": ("1", "probability that the received power reaches the threshold"),
+    "indoor": ("", "the cell's receiver is inside a building"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """Coverage of a network.
+
+    Attributes:
+        dataset: variables `received_power_dbm`, `best_server`, `snr_db`, `sinr_db`, `rate_bps`,
+            `indoor` and, of a model with a standard deviation, `received_power_sd_db` and
+            `coverage_probability`, each (y, x); coordinates x, y: middles of the cells [m].
+        transmitters: with power, load and frequency; `best_server` counts them.
+        summary: what `coverage.json` holds.
+        grid: cells.
+        settings: as given.
+        areas: polygons whose shares are in the summary.
+    """
+
+    dataset: xr.Dataset
+    transmitters: list[Transmitter]
+    summary: dict[str, Any]
+    grid: CoverageGrid
+    settings: CoverageSettings
+    areas: tuple[Area, ...] = ()
+
+
+def predict_coverage(source: Twin | RadioMap | str, scene: Scene,
+                     transmitters: Sequence[Transmitter] | None = None,
+                     settings: CoverageSettings | None = None, areas: Sequence[Area] = (),
+                     devices: list[str] | None = None) -> Coverage:
+    """Predict the coverage of a network over a scene.
+
+    Args:
+        source: of the gains: a twin, a radio map of the scene, or the name of a published law.
+        scene: 3D map and radio.
+        transmitters: None: the twin's devices, or those that the scene declares.
+        settings: None: the defaults.
+        areas: polygons whose covered shares are wanted beside those of the extent.
+        devices: names of the transmitters to use; None: all.
+
+    Returns:
+        Rasters, shares of areas, and the transmitters with all that was assumed of them.
+
+    Raises:
+        BadInput: an impossible setting, a transmit power that is not known, or a source that does
+            not know a transmitter.
+    """
+    settings = settings or CoverageSettings()
+    settings.check()
+    chosen = _transmitters(source, scene, transmitters, devices, settings)
+    grid, gains = _prepare(source, scene, chosen, settings)
+    bandwidth_hz = settings.bandwidth_hz or scene.config.radio.bandwidth_hz
+    noise_figure_db = _noise_figure_db(scene, settings)
+    noise_dbm = thermal_noise_dbm(bandwidth_hz) + noise_figure_db
+    values = _rasters(gains, scene, chosen, grid, settings, noise_dbm, bandwidth_hz)
+    attributes: dict[str, Any] = {
+        "schema": SCHEMA, "model": gains.description, "scene": scene.config.name,
+        "height_m": grid.height_m, "step_m": grid.step_m, "bandwidth_hz": bandwidth_hz,
+        "noise_figure_db": noise_figure_db, "noise_dbm": noise_dbm,
+        "threshold_dbm": settings.threshold_dbm, "reliability": settings.reliability,
+        "radiotwin_version": radiotwin.__version__}
+    dataset = _dataset(values, chosen, grid, attributes, scene)
+    summary = _summary(dataset, chosen, grid, gains, settings, areas, bandwidth_hz)
+    return Coverage(dataset, chosen, summary, grid, settings, tuple(areas))
+
+
+def _transmitters(source: Twin | RadioMap | str, scene: Scene,
+                  given: Sequence[Transmitter] | None, devices: list[str] | None,
+                  settings: CoverageSettings) -> list[Transmitter]:
+    declared = scene_transmitters(scene)
+    if given is not None:
+        found = list(given)
+    elif isinstance(source, Twin):
+        found = twin_transmitters(source, declared)
+    else:
+        found = declared
+    if isinstance(source, RadioMap):
+        known = set(source.devices)
+        if given is None:
+            found = [each for each in found if each.name in known]
+        for each in select(found, devices):
+            if each.name not in known:
+                raise BadInput(f"device {each.name!r} is not in the radio map, which holds no "
+                               "other transmitters than it was made for; leave it out with "
+                               "--devices, or give a twin or a scene")
+    if not found:
+        raise BadInput(f"there is no transmitter: {scene.folder / 'scene.toml'} declares no "
+                       "[[devices]]; add some, or give a table with --transmitters")
+    found = select(found, devices)
+    if isinstance(source, Twin) and source.level == "rssi_dbm":
+        if settings.tx_power_dbm is not None:
+            raise BadInput("the twin's levels are received powers, with the transmit power in "
+                           "them; leave --tx-power-dbm out")
+        found = with_defaults(found, scene, scene.config.radio.tx_power_dbm, settings.load)
+    else:
+        found = with_defaults(found, scene, settings.tx_power_dbm, settings.load)
+    return found
+
+
+def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Transmitter],
+             settings: CoverageSettings) -> tuple[CoverageGrid, GainSource]:
+    """Return the cells, and the source of their gains."""
+    if isinstance(source, RadioMap):
+        for name, value in (("step", settings.step_m), ("extent", settings.extent_m)):
+            if value is not None:
+                raise BadInput(f"a radio map has a grid of its own, and its {name} cannot be "
+                               f"chosen: leave --{name} out, or make the map over a scene that "
+                               f"was built with build-scene --{name}")
+        altitude_m = altitude_of(source, settings.height_m)
+        return (CoverageGrid.of_map(map_grid(source, altitude_m)),
+                MapSource(source, altitude_m, transmitters))
+    grid = CoverageGrid.over(
+        settings.extent_m or scene.config.extent.bounds, settings.step_m or DEFAULT_STEP_M,
+        settings.height_m or DEFAULT_HEIGHT_M)
+    if isinstance(source, Twin):
+        return grid, TwinSource(source, scene, transmitters)
+    return grid, LawSource(source, scene, transmitters)
+
+
+def _noise_figure_db(scene: Scene, settings: CoverageSettings) -> float:
+    """Return the noise figure that is given, or that the scene's noise power implies [dB]."""
+    if settings.noise_figure_db is not None:
+        return settings.noise_figure_db
+    radio = scene.config.radio
+    figure_db = radio.noise_dbm - thermal_noise_dbm(radio.bandwidth_hz)
+    if figure_db < 0:
+        raise BadInput(f"{scene.folder / 'scene.toml'}: noise_dbm = {radio.noise_dbm:g} lies "
+                       f"{-figure_db:.1f} dB below the thermal noise of bandwidth_hz = "
+                       f"{radio.bandwidth_hz:g}, which no receiver reaches; correct it, or give "
+                       "--noise-figure-db")
+    return figure_db
+
+
+def _rasters(gains: GainSource, scene: Scene, transmitters: list[Transmitter], grid: CoverageGrid,
+             settings: CoverageSettings, noise_dbm: float,
+             bandwidth_hz: float) -> dict[str, np.ndarray]:
+    """Predict all cells, some rows at a time; return variables (ny, nx) by name."""
+    frequencies_hz = sorted({each.frequency_hz or 0.0 for each in transmitters})
+    shape, ground = grid.shape, ground_of(scene.city)
+    values = {name: np.full(shape, np.nan, np.float32) for name in (
+        "received_power_dbm", "received_power_sd_db", "snr_db", "sinr_db", "rate_bps",
+        "coverage_probability")}
+    values["best_server"] = np.full(shape, -1, np.int32)
+    values["indoor"] = np.zeros(shape, bool)
+    blocks = list(grid.blocks())
+    with progress("coverage", total=len(blocks) * len(transmitters)) as advance:
+        for rows in blocks:
+            receiver_m = grid.receivers_m(rows, ground)
+            indoor = scene.city.inside(receiver_m)
+            used = np.flatnonzero(~indoor if settings.indoor_loss_db is None else
+                                  np.ones(len(indoor), bool))
+            index = used + rows.start * shape[1]
+            tally = ServerTally(len(used), len(frequencies_hz))
+            entry_db = np.where(indoor[used], settings.indoor_loss_db or 0.0, 0.0)
+            for row, each in enumerate(transmitters):
+                mean_db, sd_db = gains.predict(row, receiver_m[used], index)
+                power_dbm = mean_db - entry_db
+                if not gains.has_power:
+                    power_dbm = power_dbm + each.tx_power_dbm
+                tally.add(row, power_dbm, np.nan if sd_db is None else sd_db, each.load or 0.0,
+                          frequencies_hz.index(each.frequency_hz or 0.0))
+                advance(1)
+            sinr_db = tally.sinr_db(noise_dbm)
+            found = {
+                "received_power_dbm": tally.power_dbm, "received_power_sd_db": tally.sd_db,
+                "best_server": tally.server, "snr_db": tally.power_dbm - noise_dbm,
+                "sinr_db": sinr_db, "rate_bps": rate_bps(sinr_db, bandwidth_hz, settings.rate),
+                "coverage_probability": location_probability(
+                    tally.power_dbm, tally.sd_db, settings.threshold_dbm)}
+            for name, value in found.items():
+                values[name].reshape(-1)[index] = value
+            values["indoor"][rows] = indoor.reshape(-1, shape[1])
+    if not np.isfinite(values["received_power_sd_db"]).any():
+        del values["received_power_sd_db"], values["coverage_probability"]
+    return values
+
+
+def _dataset(values: dict[str, np.ndarray], transmitters: list[Transmitter], grid: CoverageGrid,
+             attributes: dict[str, Any], scene: Scene) -> xr.Dataset:
+    dataset = xr.Dataset({name: (("y", "x"), value) for name, value in values.items()},
+                         coords={"y": grid.y_m, "x": grid.x_m,
+                                 "transmitter": np.array([each.name for each in transmitters],
+                                                         dtype=object)}, attrs=attributes)
+    if scene.config.origin is not None:
+        dataset.attrs |= {f"origin_{name}": value for name, value in
+                          scene.config.origin.model_dump().items()}
+    for name in dataset.data_vars:
+        key = str(name)
+        for ending in ("_dbm", "_db", "_bps"):
+            key = key.removesuffix(ending)
+        unit, long_name = _ATTRIBUTES[key]
+        dataset[name].attrs |= ({"units": unit} if unit else {}) | {"long_name": long_name}
+    for axis, long_name in (("x", "east"), ("y", "north")):
+        dataset[axis].attrs |= {"units": "m", "long_name": long_name}
+    return dataset
+
+
+def _summary(dataset: xr.Dataset, transmitters: list[Transmitter], grid: CoverageGrid,
+             gains: GainSource, settings: CoverageSettings, areas: Sequence[Area],
+             bandwidth_hz: float) -> dict[str, Any]:
+    left_out = int(dataset["indoor"].sum()) if settings.indoor_loss_db is None else 0
+    return {
+        **dataset.attrs, "notes": list(gains.notes),
+        "above_ground": grid.above_ground, "cells": int(np.prod(grid.shape)),
+        "cells_left_out_indoors": left_out, "indoor_loss_db": settings.indoor_loss_db,
+        "load": settings.load,
+        "rate_model": {"share": settings.rate.share, "min_sinr_db": settings.rate.min_sinr_db,
+                       "max_bps_hz": settings.rate.max_bps_hz,
+                       "source": "3GPP TR 36.942 Annex A.1"},
+        "reliability_quantile": float(ndtri(settings.reliability)),
+        "transmitters": [
+            {"device": each.name, **dict(zip(("x_m", "y_m", "z_m"), map(float, each.position_m))),
+             "tx_power_dbm": None if gains.has_power else each.tx_power_dbm, "load": each.load,
+             "frequency_hz": each.frequency_hz, "antenna": each.antenna is not None,
+             **({} if each.antenna is None else {"azimuth_deg": each.antenna.azimuth_deg,
+                                                 "tilt_deg": each.antenna.tilt_deg})}
+            for each in transmitters],
+        "areas": area_records(dataset, grid, transmitters, settings,
+                              class_lists(settings, bandwidth_hz), areas)}

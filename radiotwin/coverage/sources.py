@@ -1,0 +1,232 @@
+"""Sources of gains: a twin, a radio map, or a published law over the 3D map of a scene."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import numpy as np
+from typing_extensions import override
+
+from radiotwin.channel import channel_named
+from radiotwin.channel.published import PublishedLaw
+from radiotwin.coverage.transmitters import Transmitter
+from radiotwin.errors import BadInput
+from radiotwin.links import LinkData, LinkGeometry
+from radiotwin.radiomap import RadioMap
+from radiotwin.scene import Scene
+from radiotwin.scene.lattice import Lattice
+from radiotwin.twin import Twin
+
+
+class GainSource(ABC):
+    """Levels between transmitters and receivers.
+
+    Attributes:
+        description: of the model, for people.
+        notes: on how far it can be trusted, a sentence each; complete after the last prediction.
+        has_power: whether its levels are received powers, with the transmit power in them.
+    """
+
+    description: str
+    has_power: bool = False
+
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    @abstractmethod
+    def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
+                ) -> tuple[np.ndarray, np.ndarray | None]:
+        """Return gains with antennas, or received powers where `has_power`.
+
+        Args:
+            row: of the transmitter.
+            receiver_m: (n, 3) positions of the receivers [m].
+            index: (n,) flat (y, x) index of their cells.
+
+        Returns:
+            (n,) mean [dB], NaN where it is not detected; and (n,) standard deviation [dB], None
+            where it is not known.
+        """
+
+
+class LawSource(GainSource):
+    """A published law, and the pattern of each antenna along the straight line.
+
+    Args:
+        model: name of the law.
+        scene: whose 3D map decides line of sight.
+        transmitters: each with a frequency.
+    """
+
+    def __init__(self, model: str, scene: Scene, transmitters: Sequence[Transmitter]) -> None:
+        super().__init__()
+        kind = channel_named(model)
+        if not issubclass(kind, PublishedLaw):
+            raise BadInput(f"model {model!r} is learnt from measurements, and a scene has none: "
+                           "fit a twin with it and give that, or take a published law, such as "
+                           "p1411, tr36777_umi, al_hourani_urban or cost231_wi")
+        self._scene, self._transmitters = scene, transmitters
+        self._laws = {frequency_hz: kind().fit(self._links(np.empty((0, 3)), frequency_hz, 0),
+                                               np.empty(0), None)
+                      for frequency_hz in {each.frequency_hz for each in transmitters}}
+        self.description = f"{kind.name} ({kind.source})"
+
+    @override
+    def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
+                ) -> tuple[np.ndarray, np.ndarray | None]:
+        each = self._transmitters[row]
+        law = self._laws[each.frequency_hz]
+        links = self._links(receiver_m, each.frequency_hz, row)
+        for note in law.outside(links) if len(links) else ():
+            quantity = note.split(":")[1].split(" is ")[0].strip()
+            if not any(quantity in known for known in self.notes):
+                self.notes.append(note)
+        mean_db, sd_db = law.predict(links)
+        return mean_db + antenna_gain_db(each, receiver_m), sd_db
+
+    def _links(self, receiver_m: np.ndarray, frequency_hz: float | None, row: int) -> LinkGeometry:
+        city = self._scene.city
+        device_m = np.broadcast_to(self._transmitters[row].position_m, receiver_m.shape)
+        los = city.line_of_sight(device_m, receiver_m) if len(receiver_m) else np.empty(0, bool)
+        return LinkGeometry(device_m, receiver_m, los, np.full(len(receiver_m), row), city,
+                            float(frequency_hz or np.nan))
+
+
+class TwinSource(GainSource):
+    """A twin: of its own devices, or its law for transmitters elsewhere.
+
+    Measured levels hold the antennas of the twin's devices. Transmitters that were not measured
+    get the law of all devices, and the pattern of their antenna along the straight line.
+
+    Args:
+        twin: learnt in the scene.
+        scene: its 3D map.
+        transmitters: each is a device of the twin where it has the name and the place of one.
+    """
+
+    def __init__(self, twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]) -> None:
+        super().__init__()
+        twin.require_map(scene)
+        twin.warn_of_another_scene(scene, scene.content_hash())
+        self._twin, self._scene, self._transmitters = twin, scene, transmitters
+        self.has_power = twin.level == "rssi_dbm"
+        self.description = f"twin: {twin.description}"
+        own = {each.device: row for row, each in enumerate(twin.devices) if each.located}
+        self._row = [own.get(each.name) if is_device(twin, each) else None
+                     for each in transmitters]
+        new = [each.name for each, row in zip(transmitters, self._row) if row is None]
+        if new and self.has_power:
+            raise BadInput(f"{new[0]} is not a device of the twin, whose levels are received "
+                           "powers: what another transmitter would send is not known; import the "
+                           "measurements as gains, or leave it out with --devices")
+        if new:
+            self.notes.append(f"{len(new)} of {len(transmitters)} transmitters were not measured: "
+                              "the twin's law for any device is used")
+
+    @override
+    def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
+                ) -> tuple[np.ndarray, np.ndarray | None]:
+        known, each = self._row[row], self._transmitters[row]
+        if known is not None:
+            links = self._twin.links(receiver_m, np.full(len(receiver_m), known), self._scene)
+            found = self._twin.predict(links)
+            return found.mean_db, found.sd_db
+        twin = self._twin
+        device_m = np.vstack([np.nan_to_num(twin.device_m), each.position_m])
+        links = LinkData.synthetic(
+            device_m, np.full(len(receiver_m), len(twin.devices)), receiver_m,
+            device_names=[*(device.device for device in twin.devices), each.name],
+            limit_db=twin.limit_db, frequency_hz=self._scene.config.radio.frequency_hz,
+            city=self._scene.city, is_gain=True,
+            anchors=frozenset(range(len(device_m))))
+        if twin.fitted is None:
+            mean_db, sd_db = twin.channel.trend.predict(links.geometry)
+        else:
+            found = twin.predict(links)
+            mean_db, sd_db = found.mean_db, found.sd_db
+        return mean_db + antenna_gain_db(each, receiver_m), sd_db
+
+
+class MapSource(GainSource):
+    """A radio map at one of its altitudes, with the antennas that it was made with.
+
+    Args:
+        radio_map: of the scene.
+        altitude_m: of the map to use [m].
+        transmitters: which must be in the map.
+    """
+
+    def __init__(self, radio_map: RadioMap, altitude_m: float,
+                 transmitters: Sequence[Transmitter]) -> None:
+        super().__init__()
+        level = int(np.flatnonzero(radio_map.lattice.z_m == altitude_m)[0])
+        rows = [radio_map.devices.index(each.name) for each in transmitters]
+        self._gain_db = radio_map.gain_db[rows, level].reshape(len(rows), -1)
+        self._sd_db = None
+        if "sigma_db" in radio_map.dataset:
+            sd_db = radio_map.dataset["sigma_db"].values
+            self._sd_db = sd_db[rows, level].reshape(len(rows), -1)
+        self.description = f"radio map: {radio_map.attributes.get('source', 'unknown source')}"
+
+    @override
+    def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
+                ) -> tuple[np.ndarray, np.ndarray | None]:
+        sd_db = None if self._sd_db is None else self._sd_db[row, index].astype(float)
+        return self._gain_db[row, index].astype(float), sd_db
+
+
+def is_device(twin: Twin, transmitter: Transmitter) -> bool:
+    """Return whether a transmitter has the name and, to a metre, the place of a twin's device."""
+    return any(each.device == transmitter.name and each.located and np.allclose(
+        (each.x_m, each.y_m, each.z_m), transmitter.position_m, atol=1.0)
+        for each in twin.devices)
+
+
+def twin_transmitters(twin: Twin, declared: Sequence[Transmitter]) -> list[Transmitter]:
+    """Return the located devices of a twin, with power and load of those declared by that name."""
+    by_name = {each.name: each for each in declared}
+    found = []
+    for each in twin.devices:
+        if each.located:
+            other = by_name.get(each.device)
+            found.append(Transmitter(
+                each.device, np.array([each.x_m, each.y_m, each.z_m], dtype=float),
+                *((other.tx_power_dbm, other.antenna, other.load, other.frequency_hz)
+                  if other else ())))
+    return found
+
+
+def antenna_gain_db(transmitter: Transmitter, receiver_m: np.ndarray) -> np.ndarray | float:
+    """Return what an antenna adds along the straight line (n,) [dB]; 0 for an isotropic one."""
+    if transmitter.antenna is None:
+        return 0.0
+    return transmitter.antenna.gain_dbi(receiver_m - transmitter.position_m)
+
+
+def altitude_of(radio_map: RadioMap, height_m: float | None) -> float:
+    """Return the altitude of a map that a height names; its lowest for None.
+
+    Raises:
+        BadInput: the map has no such altitude.
+    """
+    altitudes_m = radio_map.lattice.z_m
+    if height_m is None:
+        return float(altitudes_m[0])
+    if not (altitudes_m == height_m).any():
+        known = ", ".join(f"{each:g}" for each in altitudes_m[:20])
+        raise BadInput(f"the radio map has no altitude of {height_m:g} m; it has {known} m")
+    return height_m
+
+
+def map_grid(radio_map: RadioMap, altitude_m: float) -> Lattice:
+    """Return the positions of a map at one altitude.
+
+    Raises:
+        BadInput: they are not equally far apart, so that they have no cells.
+    """
+    lattice = radio_map.lattice
+    step_m = lattice.step_m
+    if not step_m or any(not np.allclose(np.diff(axis), step_m, rtol=0, atol=1e-6 * step_m)
+                         for axis in (lattice.x_m, lattice.y_m)):
+        raise BadInput("the radio map's positions are not equally far apart, so that shares of "
+                       "an area cannot be told; make a map with one step")
+    return Lattice(lattice.x_m, lattice.y_m, np.array([altitude_m]))
