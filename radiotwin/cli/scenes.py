@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from radiotwin.cli.options import SceneFolder, parse_origin
+from radiotwin.cli.options import SceneFolder, parse_bounds, parse_numbers, parse_origin
 from radiotwin.console import console, result, say
 from radiotwin.errors import BadInput
 
@@ -57,6 +57,14 @@ def build_scene(
     uavs: Annotated[int | None, typer.Option(
         min=0, help="UAVs to place near the middle [3].")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the placement [0].")] = None,
+    altitudes: Annotated[str | None, typer.Option(
+        metavar="Z,…", help="Altitudes of the lattice [m], such as 1.5 for streets [three above "
+                            "the roofs].")] = None,
+    step: Annotated[float | None, typer.Option(
+        help="Step of the lattice [m] [20, or less where the extent is small].")] = None,
+    extent: Annotated[str | None, typer.Option(
+        metavar="A,B,C,D", help="Extent of the lattice: XMIN,YMIN,XMAX,YMAX [m], of a map from its "
+                                "origin [around the buildings].")] = None,
     origin: Annotated[str | None, typer.Option(
         metavar="LAT,LON[,ALT]", help="Where on the earth x = y = 0 is; ALT is the ground's "
                                       "altitude [m] [of a map its middle, of a city model "
@@ -70,7 +78,10 @@ def build_scene(
     from radiotwin.scene.report import print_report
 
     common = _given(frequency_hz=frequency_hz, devices=devices, uavs=uavs, seed=seed,
-                    origin=parse_origin(origin))
+                    origin=parse_origin(origin), step_m=step,
+                    altitudes_m=None if altitudes is None else
+                    tuple(parse_numbers("--altitudes", altitudes)),
+                    extent_m=None if extent is None else parse_bounds("--extent", extent))
     of_cities = _given(scale=scale, up=up)
     of_maps = _given(height_default=height_default, material_table=material_table,
                      overpass=overpass or None)

@@ -139,6 +139,8 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
         raise BadInput(f"there is no transmitter: {scene.folder / 'scene.toml'} declares no "
                        "[[devices]]; add some, or give a table with --transmitters")
     found = select(found, devices)
+    if given is not None:
+        _check_outdoors(found, scene)
     if isinstance(source, Twin) and source.level == "rssi_dbm":
         if settings.tx_power_dbm is not None:
             raise BadInput("the twin's levels are received powers, with the transmit power in "
@@ -147,6 +149,17 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
     else:
         found = with_defaults(found, scene, settings.tx_power_dbm, settings.load)
     return found
+
+
+def _check_outdoors(transmitters: list[Transmitter], scene: Scene) -> None:
+    """Raise BadInput about a transmitter inside a building; a scene's own are checked before."""
+    for each in transmitters:
+        x_m, y_m, z_m = each.position_m
+        if scene.city.inside(each.position_m[None])[0]:
+            top_m = float(scene.city.height_at(x_m, y_m))
+            raise BadInput(f"transmitter {each.name!r} at ({x_m:g}, {y_m:g}, {z_m:g}) m is inside "
+                           f"a building {top_m:.1f} m high; move it, or put it on the roof (z_m > "
+                           f"{top_m:.1f})")
 
 
 def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Transmitter],

@@ -35,7 +35,7 @@ from radiotwin.scene.build import BuildOptions, Declared, check_target, finish_s
 from radiotwin.scene.importer import ImportedCity
 from radiotwin.scene.materials import Material, itu_material
 from radiotwin.scene.names import RESERVED_NAMES, Names, safe_name, unique_name
-from radiotwin.scene.placement import choose_extent
+from radiotwin.scene.placement import choose_extent, make_extent
 from radiotwin.scene.problems import Problem
 from radiotwin.scene.report import BuildReport
 from radiotwin.scene.sources import scene_name, source_text
@@ -108,7 +108,7 @@ def build_scene_from_map(
         source: `.osm`, `.osm.pbf`, `.geojson` or `.gpkg` file.
         out_folder: scene folder to write; a scene in it is replaced.
         map_options: how to read the map; None: the defaults.
-        options: frequency, devices, UAVs, seed and origin; `bbox`, `scale`, `up`, `materials` are
+        options: frequency, devices, UAVs, seed, origin and lattice; `bbox`, `scale`, `up`, `materials` are
             for city models. None: the defaults.
         check_only: write nothing.
 
@@ -143,11 +143,14 @@ def build_scene_from_map(
                                   *(problem.message for problem in problems)]))
     contacts = find_contacts(prisms)
     problems += _overlaps(prisms, contacts)
-    extent = choose_extent(_bounds_m(prisms, origin, map_options.bbox_deg))
+    around = choose_extent(_bounds_m(prisms, origin, map_options.bbox_deg))
+    extent = around if options.extent_m is None else make_extent(options.extent_m)
+    _check_width(max(np.ptp(extent.bounds[:2]), np.ptp(extent.bounds[2:])), MAX_WIDTH_M)
     city, shape_of = _city(prisms, contacts, extent.bounds, map_options.materials, problems)
     table = building_table(prisms, shape_of)
     counts = height_counts(table)
-    vegetation, unusable = make_vegetation(found.vegetation, origin, extent.bounds)
+    vegetation, unusable = make_vegetation(found.vegetation, origin,
+                                           _both(around.bounds, extent.bounds))
     city.problems.extend(unusable)
     declared = Declared(str(source), map_name(source), extent, origin,
                         _provenance(str(source), counts, map_options, options),
@@ -238,6 +241,12 @@ def _bounds_m(prisms: list[Prism], origin: Origin, bbox_deg: Bounds | None) -> B
     box = float(np.min(x_m)), float(np.max(x_m)), float(np.min(y_m)), float(np.max(y_m))
     _check_width(max(box[1] - box[0], box[3] - box[2]), MAX_WIDTH_M)
     return box
+
+
+def _both(one_m: Bounds, other_m: Bounds) -> Bounds:
+    """Return (x_min, x_max, y_min, y_max) of what holds two areas [m]."""
+    return (min(one_m[0], other_m[0]), max(one_m[1], other_m[1]),
+            min(one_m[2], other_m[2]), max(one_m[3], other_m[3]))
 
 
 def _check_sizes(features: list[Feature], origin: Origin, path: Path) -> None:

@@ -54,7 +54,7 @@ def coverage_figure(coverage: Coverage, scene: Scene, name: str,
     x_min, x_max, y_min, y_max = bounds_m
     width, height = x_max - x_min, y_max - y_min
     scale = LONGER_SIDE_IN / max(width, height)
-    figure = new_figure(max(width, height / MAX_RATIO) * scale + LEGEND_IN,
+    figure = new_figure(max(width, height / MAX_RATIO) * scale + LEGEND_IN + 0.9,
                         max(height, width / MAX_RATIO) * scale + 1.1)
     ax = figure.add_subplot()
     classes = legend.classes(coverage.dataset[name].values)
@@ -65,6 +65,10 @@ def coverage_figure(coverage: Coverage, scene: Scene, name: str,
     building = height_m > BUILDING_M
     indoors = coverage.settings.indoor_loss_db is not None
     if not indoors:
+        # Cells whose middle is inside, and the outlines in full detail.
+        ax.imshow(np.where(coverage.dataset["indoor"].values, 1.0, np.nan), origin="lower",
+                  extent=bounds_m, cmap=ListedColormap([BUILDING_COLOUR]),
+                  interpolation="nearest")
         ax.imshow(np.where(building, 1.0, np.nan), origin="lower", extent=over,
                   cmap=ListedColormap([BUILDING_COLOUR]), interpolation="nearest")
     if building.any():

@@ -45,8 +45,9 @@ from radiotwin.scene.report import BuildReport, MaterialUse
 from radiotwin.scene.sources import find_source, scene_name, source_text
 from radiotwin.scene.vegetation import VegetationConfig
 from radiotwin.scene.writer import CityShape, write_city
-from radiotwin.tables import Origin
+from radiotwin.tables import MAX_COORDINATE_M, Origin
 
+MIN_STEP_M = 0.01  # of a lattice
 SCENE_FILES = frozenset({"scene.toml", "city.xml", "meshes", "preview.png", "buildings.csv"})
 
 
@@ -68,6 +69,10 @@ class BuildOptions:
         seed: Seed of the placement.
         origin: Where on the earth the scene's x = y = 0 lies: of a map, where to put it (None: its
             middle); of a city model, where its file has it (None: unknown).
+        extent_m: (x_min, x_max, y_min, y_max) of the lattice [m], in the file's frame as `bbox`; of
+            a map, from its origin. None: around the buildings, or `bbox`.
+        step_m: of the lattice [m]; None: chosen by the extent.
+        altitudes_m: of the lattice [m]; None: chosen by the roofs.
     """
 
     frequency_hz: float = 2.4e9
@@ -79,6 +84,9 @@ class BuildOptions:
     uavs: int = 3
     seed: int = 0
     origin: Origin | None = None
+    extent_m: tuple[float, float, float, float] | None = None
+    step_m: float | None = None
+    altitudes_m: tuple[float, ...] | None = None
 
     def check(self) -> None:
         """Raise BadInput for an impossible value."""
@@ -97,6 +105,27 @@ class BuildOptions:
             if not (np.isfinite(self.bbox).all() and x_min < x_max and y_min < y_max):
                 raise BadInput(f"bbox {self.bbox} is not possible; give x_min,y_min,x_max,y_max in "
                                "metres, the minimum below the maximum")
+        self._check_lattice()
+
+    def _check_lattice(self) -> None:
+        if self.extent_m is not None:
+            x_min, x_max, y_min, y_max = self.extent_m
+            if not (np.isfinite(self.extent_m).all() and x_min < x_max and y_min < y_max):
+                raise BadInput(f"an extent of x {x_min:g} to {x_max:g} m, y {y_min:g} to {y_max:g} "
+                               "m is not possible; the minimum must be below the maximum")
+        if self.step_m is not None and not MIN_STEP_M <= self.step_m <= MAX_COORDINATE_M:
+            raise BadInput(f"a step of {self.step_m:g} m is not possible; give {MIN_STEP_M:g} to "
+                           f"{MAX_COORDINATE_M:g} m")
+        altitudes_m = self.altitudes_m
+        if altitudes_m is not None:
+            if not altitudes_m or not all(0 < each <= MAX_COORDINATE_M for each in altitudes_m):
+                raise BadInput(f"altitudes of {', '.join(f'{each:g}' for each in altitudes_m)} m "
+                               f"are not possible; give some above 0 and at most "
+                               f"{MAX_COORDINATE_M:g} m")
+            if len(set(altitudes_m)) < len(altitudes_m):
+                raise BadInput(f"an altitude is given twice in "
+                               f"{', '.join(f'{each:g}' for each in altitudes_m)} m; every one "
+                               "must be unique")
 
 
 def build_scene(source: Path | str, out_folder: Path | str, options: BuildOptions = BuildOptions(),
@@ -134,13 +163,21 @@ def build_scene(source: Path | str, out_folder: Path | str, options: BuildOption
                        "is: it was moved to the middle; move it nearer, or write [origin] into "
                        "scene.toml")
     extent = None
-    if options.bbox is not None:
+    moved_m = np.repeat(city.moved_m[:2], 2)  # of x_min, x_max, y_min, y_max
+    if options.extent_m is not None:
+        extent = make_extent(_four(np.array(options.extent_m) + moved_m))
+    elif options.bbox is not None:
         corners = np.array(options.bbox) + np.tile(city.moved_m[:2], 2)
         x_min, y_min, x_max, y_max = corners.tolist()
         extent = make_extent((x_min, x_max, y_min, y_max))
     declared = Declared(str(source), scene_name(source), extent, options.origin,
                         _provenance(city, str(source), options))
     return finish_scene(city, declared, out_folder, options, check_only)
+
+
+def _four(bounds_m: np.ndarray) -> tuple[float, float, float, float]:
+    x_min, x_max, y_min, y_max = bounds_m.tolist()
+    return x_min, x_max, y_min, y_max
 
 
 @dataclass(frozen=True)
@@ -191,7 +228,7 @@ def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, optio
             if buildings is not None:
                 write_csv(buildings, folder / "buildings.csv")
             draw_preview(Scene.load(folder), folder / "preview.png")
-    return _report(city, shapes, plan, declared, None if check_only else out_folder)
+    return _report(city, shapes, plan, declared, options, None if check_only else out_folder)
 
 
 def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | None = None) -> None:
@@ -249,8 +286,9 @@ def _plan(city: ImportedCity, declared: Declared, options: BuildOptions) -> _Pla
                          for faces in (solid, city.ground))
     tops_m, heights_m = building_tops(surfaces, solid, ground)
     highest = int(heights_m.argmax())
-    lattice = LatticeConfig(step_m=choose_step(bounds),
-                            altitudes_m=choose_altitudes(tops_m[heights_m > 0]))
+    lattice = LatticeConfig(step_m=options.step_m or choose_step(bounds),
+                            altitudes_m=list(options.altitudes_m or choose_altitudes(
+                                tops_m[heights_m > 0])))
     grid = BuiltGrid.over(extent, buildings)
     config = {
         "name": declared.name,
@@ -281,7 +319,7 @@ def _provenance(city: ImportedCity, source: str, options: BuildOptions) -> dict[
 
 
 def _report(city: ImportedCity, shapes: list[CityShape], plan: _Plan, declared: Declared,
-            folder: Path | None) -> BuildReport:
+            options: BuildOptions, folder: Path | None) -> BuildReport:
     config, uses = plan.config, []
     as_declared = dict(zip((shape.material for shape in shapes), city.materials))
     for material, count in Counter(shape.material for shape in shapes).most_common():
@@ -296,7 +334,7 @@ def _report(city: ImportedCity, shapes: list[CityShape], plan: _Plan, declared: 
         sum(len(shape.mesh.faces) for shape in shapes), config.extent.bounds,
         plan.tallest_m, plan.tallest, plan.built_fraction, tuple(config.lattice.altitudes_m),
         len(config.devices), len(config.uavs), tuple(uses), _by_severity(city.problems),
-        declared.facts)
+        declared.facts, config.lattice.step_m, options.altitudes_m is not None)
 
 
 def _by_severity(problems: list[Problem]) -> tuple[Problem, ...]:

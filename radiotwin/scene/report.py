@@ -54,6 +54,8 @@ class BuildReport:
         materials: Materials in use.
         problems: Errors first.
         facts: More lines, as (subject, finding).
+        step_m: Step of the lattice [m].
+        altitudes_given: Whether the altitudes were asked for.
     """
 
     source: str
@@ -71,6 +73,8 @@ class BuildReport:
     materials: tuple[MaterialUse, ...] = ()
     problems: tuple[Problem, ...] = ()
     facts: tuple[tuple[str, str], ...] = ()
+    step_m: float = 0.0
+    altitudes_given: bool = False
 
     @property
     def tracing_would_fail(self) -> bool:
@@ -95,7 +99,10 @@ def print_report(report: BuildReport, console: Console) -> None:
         facts.add_row("tallest building", tallest)
         facts.add_row("built fraction", f"{report.built_fraction:.1%}")
         altitudes = ", ".join(f"{altitude:g}" for altitude in report.altitudes_m)
-        facts.add_row("lattice altitudes", altitudes + " m   (from 10 m above 95 % of the roofs)")
+        how = "" if report.altitudes_given else "   (from 10 m above 95 % of the roofs)"
+        facts.add_row("lattice altitudes", f"{altitudes} m{how}")
+        if report.step_m:
+            facts.add_row("lattice step", f"{report.step_m:g} m")
         facts.add_row("devices, UAVs", f"{report.devices}, {report.uavs}")
     for subject, finding in report.facts:
         facts.add_row(subject, escape(finding))
