@@ -16,7 +16,7 @@ LAYERS = (
     {"report"},
     {"comparison_output"},
     {"compare"},
-    {"closeloop"},
+    {"closeloop", "coverage"},
     {"twin"},
     {"localize"},
     {"effects"},

@@ -79,8 +79,10 @@ class CoverageSettings:
             ("greatest spectral efficiency", self.rate.max_bps_hz, 1e-3, 100.0, "bit/s/Hz"))
         for name, value, low, high, unit in limits:
             if value is not None and not low <= value <= high:
-                raise BadInput(f"a {name} of {value:g} {unit} is not possible; allowed are {low:g} "
-                               f"to {high:g} {unit}".replace(" ;", ";").rstrip())
+                given, least, greatest = (f"{each:g} {unit}".rstrip() for each in
+                                          (value, low, high))
+                raise BadInput(f"a {name} of {given} is not possible; allowed are {least} to "
+                               f"{greatest}")
         classes = np.asarray(self.classes_dbm, dtype=float)
         if not (1 <= len(classes) <= 20 and (np.abs(classes) <= 250).all()
                 and (np.diff(classes) < 0).all()):
