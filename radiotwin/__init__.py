@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from radiotwin.closeloop.result_file import make_report
     from radiotwin.closeloop.run import Loop, close_loop
     from radiotwin.compare import Comparison, compare_models, score_map, split_flights
+    from radiotwin.coverage import CoverageSettings, predict_coverage
     from radiotwin.errors import BadInput, RunFailed
     from radiotwin.measurements import Measurements, read_measurements
     from radiotwin.paths.listing import list_paths
@@ -33,6 +34,7 @@ _MODULES = {
     "closeloop.result_file": ["make_report"],
     "closeloop.run": ["Loop", "close_loop"],
     "compare": ["Comparison", "compare_models", "score_map", "split_flights"],
+    "coverage": ["CoverageSettings", "predict_coverage"],
     "errors": ["BadInput", "RunFailed"],
     "measurements": ["Measurements", "read_measurements"],
     "paths.listing": ["list_paths"],
@@ -48,11 +50,11 @@ _MODULES = {
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [  # noqa: F822 - names that __getattr__ finds
-    "BadInput", "BuildOptions", "Comparison", "Loop", "Measurements", "RadioMap", "RunFailed",
-    "Scene", "SelectionCriteria", "SolverSettings", "Twin", "__version__", "build_preset",
-    "build_scene", "close_loop", "compare_models", "corrected_twin", "fit_twin", "fly_survey",
-    "list_paths", "make_report", "read_measurements", "read_run", "score_map", "segmented_truth",
-    "split_flights", "trace_map", "write_report"]
+    "BadInput", "BuildOptions", "Comparison", "CoverageSettings", "Loop", "Measurements",
+    "RadioMap", "RunFailed", "Scene", "SelectionCriteria", "SolverSettings", "Twin", "__version__",
+    "build_preset", "build_scene", "close_loop", "compare_models", "corrected_twin", "fit_twin",
+    "fly_survey", "list_paths", "make_report", "predict_coverage", "read_measurements", "read_run",
+    "score_map", "segmented_truth", "split_flights", "trace_map", "write_report"]
 
 
 def __getattr__(name: str) -> Any:

@@ -31,14 +31,16 @@ def add_commands(app: typer.Typer) -> None:
 def coverage(
     source: Annotated[Path, typer.Argument(
         metavar="SOURCE", help="Where gains are from: a twin's folder, a radio map (.nc), or a "
-                               "scene's folder for a published law over its map.")],
+                               "scene's folder for a published law, or paths, "
+                               "over its map.")],
     scene: OptionalScene = None,
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="Folder for tables, rasters, vectors and pictures.")
         ] = Path("coverage"),
     model: Annotated[str | None, typer.Option(
-        help="Published law, where SOURCE is a scene: p1411, tr36777_uma, tr36777_umi, "
-             "al_hourani_urban (…), cost231_wi (…) [p1411].")] = None,
+        help="Where SOURCE is a scene: a published law (p1411, tr36777_uma, tr36777_umi, "
+             "al_hourani_urban (…), cost231_wi (…)), or raytrace: paths over the 3D map, which "
+             "takes far longer [p1411].")] = None,
     transmitters: Annotated[Path | None, typer.Option(
         metavar="TABLE", help="Transmitters in place of the twin's or the scene's devices: device, "
                               "x_m, y_m (or latitude_deg, longitude_deg), z_m, tx_power_dbm, load, "
@@ -168,6 +170,7 @@ def _print(found: "Coverage") -> None:
     shares = facts["areas"][0]["best_server"]
     print_rows("Transmitters", {"device": "left"} | dict.fromkeys(
         ("x [m]", "y [m]", "z [m]", "power [dBm]", "load", "best server [%]"), "right"),
-        [[each["device"], each["x_m"], each["y_m"], each["z_m"],
+        [[each["device"], *(float("nan") if each[axis] is None else each[axis]
+                            for axis in ("x_m", "y_m", "z_m")),
           "measured" if each["tx_power_dbm"] is None else each["tx_power_dbm"], each["load"],
           100 * shares[each["device"]]] for each in facts["transmitters"]])

@@ -143,7 +143,7 @@ def write_kmz(coverage: Coverage, scene: Scene, path: Path) -> None:
     overlays = [Overlay("coverage", legends[name].title, not row, drawer(name))
                 for row, name in enumerate(names)]
     marks = {each.name: (float(each.position_m[0]), float(each.position_m[1]))
-             for each in coverage.transmitters}
+             for each in coverage.transmitters if np.isfinite(each.position_m).all()}
     write_overlays(path, scene, coverage.grid.bounds_m, overlays, marks,
                    _legend_png([legends[name] for name in names]))
 

@@ -20,11 +20,11 @@ from radiotwin.coverage.radio import (
 from radiotwin.coverage.settings import CoverageSettings
 from radiotwin.coverage.sources import (
     GainSource,
-    LawSource,
     MapSource,
     TwinSource,
     altitude_of,
     map_grid,
+    over_scene,
     twin_transmitters,
 )
 from radiotwin.coverage.transmitters import (
@@ -83,7 +83,8 @@ def predict_coverage(source: Twin | RadioMap | str, scene: Scene,
     """Predict the coverage of a network over a scene.
 
     Args:
-        source: of the gains: a twin, a radio map of the scene, or the name of a published law.
+        source: of the gains: a twin, a radio map of the scene, or the name of a published law,
+            or `raytrace` for paths over the 3D map.
         scene: 3D map and radio.
         transmitters: None: the twin's devices, or those that the scene declares.
         settings: None: the defaults.
@@ -128,8 +129,10 @@ def _transmitters(source: Twin | RadioMap | str, scene: Scene,
         found = declared
     if isinstance(source, RadioMap):
         known = set(source.devices)
-        if given is None:
-            found = [each for each in found if each.name in known]
+        if given is None:  # where a device of the map is does not matter, and may not be declared
+            by_name = {each.name: each for each in declared}
+            found = [by_name.get(name, Transmitter(name, np.full(3, np.nan)))
+                     for name in source.devices]
         for each in select(found, devices):
             if each.name not in known:
                 raise BadInput(f"device {each.name!r} is not in the radio map, which holds no "
@@ -179,7 +182,7 @@ def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Tra
         settings.height_m or DEFAULT_HEIGHT_M)
     if isinstance(source, Twin):
         return grid, TwinSource(source, scene, transmitters)
-    return grid, LawSource(source, scene, transmitters)
+    return grid, over_scene(source, scene, transmitters)
 
 
 def _noise_figure_db(scene: Scene, settings: CoverageSettings) -> float:
@@ -260,6 +263,10 @@ def _dataset(values: dict[str, np.ndarray], transmitters: list[Transmitter], gri
     return dataset
 
 
+def _known(position_m: np.ndarray) -> list[float | None]:
+    return [float(each) if np.isfinite(each) else None for each in position_m]
+
+
 def _summary(dataset: xr.Dataset, transmitters: list[Transmitter], grid: CoverageGrid,
              gains: GainSource, settings: CoverageSettings, areas: Sequence[Area],
              bandwidth_hz: float) -> dict[str, Any]:
@@ -274,7 +281,7 @@ def _summary(dataset: xr.Dataset, transmitters: list[Transmitter], grid: Coverag
                        "source": "3GPP TR 36.942 Annex A.1"},
         "reliability_quantile": float(ndtri(settings.reliability)),
         "transmitters": [
-            {"device": each.name, **dict(zip(("x_m", "y_m", "z_m"), map(float, each.position_m))),
+            {"device": each.name, **dict(zip(("x_m", "y_m", "z_m"), _known(each.position_m))),
              "tx_power_dbm": None if gains.has_power else each.tx_power_dbm, "load": each.load,
              "frequency_hz": each.frequency_hz, "antenna": each.antenna is not None,
              **({} if each.antenna is None else {"azimuth_deg": each.antenna.azimuth_deg,

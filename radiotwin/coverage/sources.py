@@ -1,4 +1,4 @@
-"""Sources of gains: a twin, a radio map, or a published law over the 3D map of a scene."""
+"""Sources of gains: a twin, a radio map, or a published law or paths over a scene's 3D map."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -6,7 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 from typing_extensions import override
 
+from radiotwin.antennas import Antenna
 from radiotwin.channel import channel_named
+from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.channel.published import PublishedLaw
 from radiotwin.coverage.transmitters import Transmitter
 from radiotwin.errors import BadInput
@@ -15,6 +17,8 @@ from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
 from radiotwin.twin import Twin
+
+PATH_RECEIVERS = 5_000  # whose paths are followed at a time: bounds the memory
 
 
 class GainSource(ABC):
@@ -62,8 +66,8 @@ class LawSource(GainSource):
         kind = channel_named(model)
         if not issubclass(kind, PublishedLaw):
             raise BadInput(f"model {model!r} is learnt from measurements, and a scene has none: "
-                           "fit a twin with it and give that, or take a published law, such as "
-                           "p1411, tr36777_umi, al_hourani_urban or cost231_wi")
+                           "fit a twin with it and give that, or take raytrace, or a published "
+                           "law, such as p1411, tr36777_umi, al_hourani_urban or cost231_wi")
         self._scene, self._transmitters = scene, transmitters
         self._laws = {frequency_hz: kind().fit(self._links(np.empty((0, 3)), frequency_hz, 0),
                                                np.empty(0), None)
@@ -89,6 +93,51 @@ class LawSource(GainSource):
         los = city.line_of_sight(device_m, receiver_m) if len(receiver_m) else np.empty(0, bool)
         return LinkGeometry(device_m, receiver_m, los, np.full(len(receiver_m), row), city,
                             float(frequency_hz or np.nan))
+
+
+class PathSource(GainSource):
+    """The sum of the powers of all paths over the 3D map, through the antennas; nothing is fitted.
+
+    Args:
+        scene: 3D map.
+        transmitters: each with a frequency.
+    """
+
+    def __init__(self, scene: Scene, transmitters: Sequence[Transmitter]) -> None:
+        super().__init__()
+        self._city, self._transmitters = scene.city, transmitters
+        self.description = "raytrace: paths over the 3D map, powers added"
+
+    @override
+    def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
+                ) -> tuple[np.ndarray, np.ndarray | None]:
+        from radiotwin.paths.powers import path_powers  # numba is large
+
+        each = self._transmitters[row]
+        parts = [np.empty(0)]
+        for start in range(0, len(receiver_m), PATH_RECEIVERS):
+            ends_m = receiver_m[start:start + PATH_RECEIVERS]
+            found = path_powers(self._city, each.position_m[None], ends_m,
+                                np.zeros(len(ends_m), int), float(each.frequency_hz or np.nan),
+                                "vertical")
+            parts.append(found.total if each.antenna is None else
+                         _through_antenna(found.departures, found.total, each.antenna))
+        with np.errstate(divide="ignore"):
+            gain_db = 10 * np.log10(np.concatenate(parts))
+        return np.where(np.isfinite(gain_db), gain_db, np.nan), None
+
+
+def _through_antenna(departures: np.ndarray, power: np.ndarray, antenna: Antenna) -> np.ndarray:
+    """Return the power (n,) of paths through an antenna, by their mean direction in each sector.
+
+    Args:
+        departures: (n, sectors, 3) power times direction, see `PathPowers`.
+        power: (n,) of all paths, from an isotropic antenna.
+        antenna: of the transmitter.
+    """
+    in_sector = np.linalg.norm(departures, axis=2)
+    weighted = in_sector * 10 ** (antenna.gain_dbi(departures) / 10)
+    return power * weighted.sum(axis=1) / np.maximum(in_sector.sum(axis=1), 1e-300)
 
 
 class TwinSource(GainSource):
@@ -172,6 +221,22 @@ class MapSource(GainSource):
                 ) -> tuple[np.ndarray, np.ndarray | None]:
         sd_db = None if self._sd_db is None else self._sd_db[row, index].astype(float)
         return self._gain_db[row, index].astype(float), sd_db
+
+
+def over_scene(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:
+    """Return the source for a scene without measurements.
+
+    Args:
+        model: name of a published law, or `raytrace` for paths over the map.
+        scene: 3D map.
+        transmitters: each with a frequency.
+
+    Raises:
+        BadInput: no such model, or one that is learnt.
+    """
+    if channel_named(model) is ImagePaths:
+        return PathSource(scene, transmitters)
+    return LawSource(model, scene, transmitters)
 
 
 def is_device(twin: Twin, transmitter: Transmitter) -> bool:

@@ -31,7 +31,8 @@ class Transmitter:
 
     Attributes:
         name: as in a scene or a table.
-        position_m: (3,) x, y, and z above the ground datum [m].
+        position_m: (3,) x, y, and z above the ground datum [m]; NaN where it is not known, as of a
+            radio map's devices.
         tx_power_dbm: None: not declared [dBm].
         antenna: None: isotropic.
         load: share of the time that it is active, 0 to 1; None: not declared.

@@ -1,5 +1,6 @@
 """Coverage as vectors: a GeoPackage with the areas of each class, and the transmitters."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -74,12 +75,13 @@ def write_geopackage(coverage: Coverage, scene: Scene, path: Path) -> None:
                        "minimum": lower, "area_m2": shapely.area(areas)}
             _write(pyogrio, temporary, file_stem(name), shapely.transform(areas, project),
                    "MultiPolygon", columns, origin is not None)
-        position_m = np.array([each.position_m for each in coverage.transmitters])
-        columns = {"device": np.array([each.name for each in coverage.transmitters], object),
+        placed = [each for each in coverage.transmitters if np.isfinite(each.position_m).all()]
+        power_dbm = {each["device"]: each["tx_power_dbm"]
+                     for each in coverage.summary["transmitters"]}
+        position_m = np.array([each.position_m for each in placed]).reshape(-1, 3)
+        columns = {"device": np.array([each.name for each in placed], object),
                    "z_m": position_m[:, 2],
-                   "tx_power_dbm": np.array([each["tx_power_dbm"] if each["tx_power_dbm"] is not
-                                             None else np.nan for each in
-                                             coverage.summary["transmitters"]], float)}
+                   "tx_power_dbm": np.array([power_dbm[each.name] for each in placed], float)}
         _write(pyogrio, temporary, "transmitters", shapely.points(project(position_m[:, :2])),
                "Point", columns, origin is not None)
 
@@ -87,6 +89,8 @@ def write_geopackage(coverage: Coverage, scene: Scene, path: Path) -> None:
 def _write(pyogrio: Any, path: Path, layer: str, shapes: np.ndarray, kind: str,
            columns: dict[str, np.ndarray], is_placed: bool) -> None:
     """Add a layer to a GeoPackage."""
-    pyogrio.raw.write(path, shapely.to_wkb(shapes), list(columns.values()), list(columns),
-                      layer=layer, driver="GPKG", geometry_type=kind, append=path.exists(),
-                      crs=DEGREES if is_placed else None)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "'crs' was not provided", UserWarning)
+        pyogrio.raw.write(path, shapely.to_wkb(shapes), list(columns.values()), list(columns),
+                          layer=layer, driver="GPKG", geometry_type=kind, append=path.exists(),
+                          crs=DEGREES if is_placed else None)

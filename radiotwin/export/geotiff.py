@@ -87,7 +87,8 @@ def georeference(x_m: np.ndarray, y_m: np.ndarray, step_m: float,
     """Return the reference system and the transform of a raster, north up, for rasterio.
 
     Args:
-        x_m, y_m: middles of the cells, ascending [m].
+        x_m: middles of the cells to the east, ascending [m].
+        y_m: likewise to the north [m].
         step_m: side of a cell [m].
         origin: of the local frame; None: coordinates are local, without a system.
     """

@@ -108,8 +108,8 @@ def build_scene_from_map(
         source: `.osm`, `.osm.pbf`, `.geojson` or `.gpkg` file.
         out_folder: scene folder to write; a scene in it is replaced.
         map_options: how to read the map; None: the defaults.
-        options: frequency, devices, UAVs, seed, origin and lattice; `bbox`, `scale`, `up`, `materials` are
-            for city models. None: the defaults.
+        options: frequency, devices, UAVs, seed, origin and lattice; `bbox`, `scale`, `up`,
+            `materials` are for city models. None: the defaults.
         check_only: write nothing.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Write every page and figure: of a run, of a close-loop, of a comparison, of a radio map, of coverage."""
+"""Write every page and figure: of a run, a close-loop, a comparison, a radio map, coverage."""
 
 from radiotwin.report.closeloop_figures import write_closeloop_figures
 from radiotwin.report.closeloop_page import write_closeloop_page

@@ -54,7 +54,7 @@ def coverage_figure(coverage: Coverage, scene: Scene, name: str,
     x_min, x_max, y_min, y_max = bounds_m
     width, height = x_max - x_min, y_max - y_min
     scale = LONGER_SIDE_IN / max(width, height)
-    figure = new_figure(max(width, height / MAX_RATIO) * scale + LEGEND_IN + 0.9,
+    figure = new_figure(max(width, height / MAX_RATIO) * scale + LEGEND_IN + 0.6,
                         max(height, width / MAX_RATIO) * scale + 1.1)
     ax = figure.add_subplot()
     classes = legend.classes(coverage.dataset[name].values)
@@ -114,6 +114,8 @@ def _draw_transmitters(ax: Axes, coverage: Coverage) -> None:
     length_m = 0.03 * max(x_max - x_min, y_max - y_min)
     for each in coverage.transmitters:
         x_m, y_m = map(float, each.position_m[:2])
+        if np.isnan(x_m):
+            continue
         if each.antenna is not None and np.ptp(each.antenna.pattern.gain_dbi, axis=1).max() > 0.5:
             azimuth = np.radians(each.antenna.azimuth_deg)
             ax.plot([x_m, x_m + length_m * np.sin(azimuth)],

@@ -86,6 +86,8 @@ def test_transmitters_of_other_frequencies_do_not_interfere(build, twin_of):
     coverage = predict_coverage("al_hourani_urban", scene, pair, CoverageSettings(step_m=20.0))
     np.testing.assert_allclose(coverage.dataset["sinr_db"], coverage.dataset["snr_db"], atol=1e-5)
     assert coverage.summary["model"].startswith("al_hourani_urban (Al-Hourani")
+    with pytest.raises(BadInput, match="the radio's frequency is 28 GHz"):
+        predict_coverage("cost231_wi", scene, [Transmitter("a", np.array([0, 0, 9.0]), 1.0, frequency_hz=28e9)])
 
 
 def test_noise_follows_bandwidth_and_noise_figure(build, twin_of):
@@ -152,6 +154,22 @@ def test_an_antenna_points_where_it_is_turned_to(build):
         assert float(gain_db.sel(x=x_m, y=y_m)) == pytest.approx(expected_db, abs=0.2)
 
 
+def test_paths_over_the_map_go_through_the_antenna(build, house):
+    """Direct path and ground reflection over open ground, nearly nothing behind a building; the pattern in dB."""
+    pattern = Pattern(np.array([0.0, 90.0, 180.0, 270.0]), np.array([-90.0, 90.0]),
+                      np.array([[15.0, 0.0, -10.0, 0.0]] * 2))
+    scene = build(house(-120, -100, -100, 100, 40), devices=[("a", 0.0, 0.0, 10.0)])
+    settings, place = CoverageSettings(step_m=50.0, extent_m=(-200, 300, -25, 25)), np.array([0, 0, 10.0])
+    plain, turned = (predict_coverage("raytrace", scene, [Transmitter("a", place, 30.0, antenna)], settings)
+                     for antenna in (None, Antenna(pattern, azimuth_deg=90.0)))
+    distance_m = math.hypot(275.0, 8.5)
+    direct_dbm = 30.0 + FREE_SPACE_AT_1_M_DB - 20 * math.log10(distance_m)
+    assert direct_dbm < power_at(plain, 275.0, 0.0) < direct_dbm + 3.1
+    assert power_at(plain, -175.0, 0.0) < 30.0 + FREE_SPACE_AT_1_M_DB - 20 * math.log10(175.0) - 10.0
+    assert power_at(turned, 275.0, 0.0) - power_at(plain, 275.0, 0.0) == pytest.approx(15.0, abs=0.3)
+    assert "coverage_probability" not in plain.dataset and plain.summary["model"].startswith("raytrace")
+
+
 def test_receivers_stand_on_uneven_ground(build, twin_of):
     scene = build(devices=[("a", 0.0, 0.0, 200.0)], ground_z_m=lambda x, y: 0.1 * (x + 600.0))
     ground = ground_of(scene.city)
@@ -195,6 +213,13 @@ def test_a_radio_map_is_taken_at_one_altitude(build):
         predict_coverage(radio_map, scene, settings=CoverageSettings(step_m=7.0))
     with pytest.raises(BadInput, match="'c' is not in the radio map"):
         predict_coverage(radio_map, scene, [Transmitter("c", np.zeros(3) + 5.0)])
+
+
+def test_a_radio_map_of_devices_that_the_scene_does_not_declare(build):
+    scene = build()
+    radio_map = RadioMap.build(["x"], Lattice.over(-50, 50, -50, 50, 50, [3]), np.full((1, 9), -80.0), np.ones((1, 9)))
+    coverage = predict_coverage(radio_map, scene)
+    assert power_at(coverage, 0, 0) == -50.0 and coverage.summary["transmitters"][0]["x_m"] is None
 
 
 def test_sites_that_were_not_measured_get_the_twins_law(build, twin_of):

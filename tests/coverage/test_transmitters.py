@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+
+from radiotwin.coverage.transmitters import (
+    read_transmitters,
+    scene_transmitters,
+    select,
+    with_defaults,
+)
+from radiotwin.errors import BadInput
+from radiotwin.frames import write_frame
+from radiotwin.geodesy import to_geographic, to_local
+from radiotwin.tables import Origin
+
+PATTERN = "azimuth_deg,elevation_deg,gain_dbi\n" + "".join(
+    f"{azimuth},{elevation},{10 - azimuth / 20}\n" for azimuth in (0, 90, 180, 270) for elevation in (-90, 0, 90))
+
+
+@pytest.fixture
+def scene(build):
+    return build(devices=[("a", 0.0, 0.0, 10.0)])
+
+
+def written(tmp_path, text):
+    path = tmp_path / "sites.csv"
+    path.write_text(text)
+    return path
+
+
+def test_every_column_is_read(scene, tmp_path):
+    (tmp_path / "antennas").mkdir()
+    (tmp_path / "antennas" / "sector.csv").write_text(PATTERN)
+    path = written(tmp_path, "device,x_m,y_m,z_m,tx_power_dbm,load,frequency_hz,antenna,azimuth_deg,tilt_deg\n"
+                             "s1,10,-20,30,43,0.5,2.1e9,antennas/sector.csv,120,-6\ns2,1,2,3,,,,,,\n")
+    first, second = read_transmitters(path, scene)
+    assert (first.name, first.tx_power_dbm, first.load, first.frequency_hz) == ("s1", 43.0, 0.5, 2.1e9)
+    assert first.position_m.tolist() == [10, -20, 30]
+    assert first.antenna.azimuth_deg == 120 and first.antenna.tilt_deg == -6
+    assert first.antenna.pattern.peak_dbi == pytest.approx(10.0)
+    assert second.antenna is second.tx_power_dbm is second.load is second.frequency_hz is None
+    whole = with_defaults([first, second], scene, 20.0, 0.7)
+    assert [(each.tx_power_dbm, each.load, each.frequency_hz) for each in whole] == [(43, 0.5, 2.1e9), (20, 0.7, 2e9)]
+    assert with_defaults([second], scene, None, 1.0)[0].tx_power_dbm == 30.0  # the scene's
+
+
+def test_positions_on_the_globe(scene, tmp_path):
+    longitude, latitude = to_geographic(scene.config.origin, [100.0], [-50.0])
+    path = written(tmp_path, f"device,latitude_deg,longitude_deg,z_m\ns1,{latitude[0]:.9f},{longitude[0]:.9f},5\n")
+    np.testing.assert_allclose(read_transmitters(path, scene)[0].position_m, [100, -50, 5], atol=1e-3)
+
+
+def test_positions_of_another_frame(scene, tmp_path):
+    other = Origin(latitude_deg=47.501, longitude_deg=8.7)
+    write_frame(other, tmp_path / "frame.toml")
+    x_m, y_m = to_local(scene.config.origin, [other.longitude_deg], [other.latitude_deg])
+    path = written(tmp_path, "device,x_m,y_m,z_m\ns1,0,0,5\n")
+    np.testing.assert_allclose(read_transmitters(path, scene)[0].position_m, [x_m[0], y_m[0], 5], atol=1e-6)
+
+
+def test_a_table_of_devices_is_one(scene, tmp_path):
+    path = written(tmp_path, "device,x_m,y_m,z_m,role,azimuth_deg\nd0,1,2,3,anchor,90\n")
+    with pytest.warns(UserWarning, match="no column antenna names the file"):
+        (found,) = read_transmitters(path, scene)
+    assert found.position_m.tolist() == [1, 2, 3] and found.antenna is None
+
+
+def test_those_of_the_scene(scene):
+    (found,) = scene_transmitters(scene)
+    assert found.name == "a" and found.tx_power_dbm is None and found.position_m.tolist() == [0, 0, 10]
+    assert select([found], ["a"]) == [found] == select([found], None)
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("device,x_m,y_m,z_m\n", "has no rows"),
+    ("device,x_m,y_m\ns,1,2\n", "column 'z_m' is missing"),
+    ("device,x_m,z_m\ns,1,2\n", "needs the columns x_m, y_m or latitude_deg, longitude_deg"),
+    ("device,x_m,y_m,z_m\ns,1,2,3\ns,1,2,3\n", "row 3, column device: 's' occurs twice"),
+    ("device,x_m,y_m,z_m\ns,1,,3\n", "row 2, column y_m: '' is not a finite number"),
+    ("device,x_m,y_m,z_m\ns,1,inf,3\n", "row 2, column y_m: 'inf' is not a finite number"),
+    ("device,x_m,y_m,z_m,load\ns,1,2,3,1.2\n", "row 2, column load: '1.2' is no load; allowed are 0 to 1"),
+    ("device,x_m,y_m,z_m,tx_power_dbm\ns,1,2,3,loud\n", "row 2, column tx_power_dbm: 'loud' is not a finite number"),
+    ("device,x_m,y_m,z_m,frequency_hz\ns,1,2,3,2.4\n", "row 2, column frequency_hz: '2.4' is no frequency"),
+    ("device,x_m,y_m,z_m,antenna,tilt_deg\ns,1,2,3,,95\n", "row 2, column tilt_deg: '95' is no tilt"),
+    ("device,x_m,y_m,z_m,antenna\ns,1,2,3,../secret.msi\n", "row 2: .* leads out of"),
+    ("device,x_m,y_m,z_m,antenna\ns,1,2,3,none.msi\n", "none.msi does not exist"),
+    ("device,latitude_deg,longitude_deg,z_m\ns,95,2,3\n", "column latitude_deg: '95' is not within 90 degrees")])
+def test_a_bad_cell_is_named(scene, tmp_path, text, message):
+    with pytest.raises(BadInput, match=message):
+        read_transmitters(written(tmp_path, text), scene)
