@@ -15,9 +15,9 @@ from radiotwin.scene import Scene
 from radiotwin.scene.preview import height_grid
 
 BUILDING_M = 2.0  # lowest height that is drawn
-OUTLINE_CELLS = 1200  # along the longer side
+OUTLINE_CELLS = 800  # along the longer side
 LONGER_SIDE_IN = 7.5
-LEGEND_IN = 2.6
+LEGEND_IN = 3.6
 MAX_RATIO = 3.0  # of the sides of a picture
 MAX_LABELS = 30  # transmitters with a name beside them
 MAX_LEGEND_ROWS = 24
@@ -54,7 +54,7 @@ def coverage_figure(coverage: Coverage, scene: Scene, name: str,
     x_min, x_max, y_min, y_max = bounds_m
     width, height = x_max - x_min, y_max - y_min
     scale = LONGER_SIDE_IN / max(width, height)
-    figure = new_figure(max(width, height / MAX_RATIO) * scale + LEGEND_IN + 0.6,
+    figure = new_figure(max(width, height / MAX_RATIO) * scale + LEGEND_IN,
                         max(height, width / MAX_RATIO) * scale + 1.1)
     ax = figure.add_subplot()
     classes = legend.classes(coverage.dataset[name].values)
