@@ -66,7 +66,7 @@ def test_netcdf_opens_anywhere(coverage, scene, tmp_path):
         for name in coverage.dataset.data_vars:
             np.testing.assert_array_equal(opened[name].values, coverage.dataset[name].values)
         assert opened["sinr_db"].attrs["units"] == "dB"
-        assert CRS.from_cf(opened["crs"].attrs).to_dict()["proj"] == "aeqd"
+        assert CRS.from_cf(opened["crs"].attrs).coordinate_operation.method_name == "Azimuthal Equidistant"
         assert opened["transmitter"].values.tolist() == ["west", "east"]
 
 

@@ -165,7 +165,8 @@ def test_paths_over_the_map_go_through_the_antenna(build, house):
     distance_m = math.hypot(275.0, 8.5)
     direct_dbm = 30.0 + FREE_SPACE_AT_1_M_DB - 20 * math.log10(distance_m)
     assert direct_dbm < power_at(plain, 275.0, 0.0) < direct_dbm + 3.1
-    assert power_at(plain, -175.0, 0.0) < 30.0 + FREE_SPACE_AT_1_M_DB - 20 * math.log10(175.0) - 10.0
+    behind_dbm = power_at(plain, -175.0, 0.0)  # over two edges, or not at all
+    assert math.isnan(behind_dbm) or behind_dbm < 30.0 + FREE_SPACE_AT_1_M_DB - 20 * math.log10(175.0) - 10.0
     assert power_at(turned, 275.0, 0.0) - power_at(plain, 275.0, 0.0) == pytest.approx(15.0, abs=0.3)
     assert "coverage_probability" not in plain.dataset and plain.summary["model"].startswith("raytrace")
 
