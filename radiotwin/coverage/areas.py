@@ -161,6 +161,6 @@ def _covered(power_dbm: np.ndarray, sd_db: np.ndarray | None, threshold_dbm: flo
     if sd_db is not None:
         margin_db = float(ndtri(reliability)) * sd_db
         found["share_reliable"] = float((power_dbm - margin_db >= threshold_dbm).mean())
-        found["mean_probability"] = float(
-            location_probability(power_dbm, sd_db, threshold_dbm).mean())
+        found["mean_probability"] = float(np.nanmean(
+            location_probability(power_dbm, sd_db, threshold_dbm)))
     return found

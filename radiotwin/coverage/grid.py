@@ -95,8 +95,18 @@ class CoverageGrid:
             ground: 3D map of the ground that they stand on; None: the datum.
         """
         x, y = (each.ravel() for each in np.meshgrid(self.x_m, self.y_m[rows]))
-        bottom_m = ground.height_at(x, y) if ground is not None and self.above_ground else 0.0
-        return np.column_stack([x, y, np.broadcast_to(bottom_m + self.height_m, x.shape)])
+        return self.at_height(x, y, ground)
+
+    def at_height(self, x_m: np.ndarray, y_m: np.ndarray, ground: CityMap | None) -> np.ndarray:
+        """Return positions (n, 3) at the receivers' height [m].
+
+        Args:
+            x_m: (n,) to the east [m].
+            y_m: (n,) to the north [m].
+            ground: as of `receivers_m`.
+        """
+        bottom_m = ground.height_at(x_m, y_m) if ground is not None and self.above_ground else 0.0
+        return np.column_stack([x_m, y_m, np.broadcast_to(bottom_m + self.height_m, x_m.shape)])
 
 
 def ground_of(city: CityMap) -> CityMap | None:

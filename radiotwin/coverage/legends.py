@@ -44,10 +44,10 @@ class Legend:
             values: any shape; numbers of servers where there are no lower ends.
         """
         if not self.lower:
-            return values.astype(np.int16)
+            return values.astype(np.int32)
         ends = np.asarray(self.lower[::-1], dtype=float)
         found = len(ends) - np.searchsorted(ends, np.nan_to_num(values), side="right")
-        return np.where(np.isnan(values), -1, found).astype(np.int16)
+        return np.where(np.isnan(values), -1, found).astype(np.int32)
 
 
 def legend_of(name: str, coverage: Coverage) -> Legend:

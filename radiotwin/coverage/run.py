@@ -41,6 +41,7 @@ from radiotwin.twin import Twin
 
 SCHEMA = "radiotwin.coverage/1"
 DEFAULT_HEIGHT_M, DEFAULT_STEP_M = 1.5, 5.0
+NOTED_RECEIVERS = 1_000  # whose links are compared with the range of a published law
 _ATTRIBUTES = {
     "received_power": ("dBm", "received power of the best server (NaN: not detected, or left out)"),
     "received_power_sd": ("dB", "standard deviation of the received power"),
@@ -113,7 +114,8 @@ def predict_coverage(source: Twin | RadioMap | str, scene: Scene,
         "threshold_dbm": settings.threshold_dbm, "reliability": settings.reliability,
         "radiotwin_version": radiotwin.__version__}
     dataset = _dataset(values, chosen, grid, attributes, scene)
-    summary = _summary(dataset, chosen, grid, gains, settings, areas, bandwidth_hz)
+    summary = _summary(dataset, chosen, grid, gains, settings, areas, bandwidth_hz,
+                       scene)
     return Coverage(dataset, chosen, summary, grid, settings, tuple(areas))
 
 
@@ -263,16 +265,25 @@ def _dataset(values: dict[str, np.ndarray], transmitters: list[Transmitter], gri
     return dataset
 
 
+def _some_receivers(dataset: xr.Dataset, grid: CoverageGrid, scene: Scene) -> np.ndarray:
+    """Return the positions (n, 3) of at most `NOTED_RECEIVERS` receivers that are not inside."""
+    outside = np.flatnonzero(~dataset["indoor"].values)
+    chosen = outside[::max(1, -(-len(outside) // NOTED_RECEIVERS))]
+    y_m, x_m = (axis[rows] for axis, rows in zip((grid.y_m, grid.x_m),
+                                                 np.unravel_index(chosen, grid.shape)))
+    return grid.at_height(x_m, y_m, ground_of(scene.city))
+
+
 def _known(position_m: np.ndarray) -> list[float | None]:
     return [float(each) if np.isfinite(each) else None for each in position_m]
 
 
 def _summary(dataset: xr.Dataset, transmitters: list[Transmitter], grid: CoverageGrid,
              gains: GainSource, settings: CoverageSettings, areas: Sequence[Area],
-             bandwidth_hz: float) -> dict[str, Any]:
+             bandwidth_hz: float, scene: Scene) -> dict[str, Any]:
     left_out = int(dataset["indoor"].sum()) if settings.indoor_loss_db is None else 0
     return {
-        **dataset.attrs, "notes": list(gains.notes),
+        **dataset.attrs, "notes": gains.notes(_some_receivers(dataset, grid, scene)),
         "above_ground": grid.above_ground, "cells": int(np.prod(grid.shape)),
         "cells_left_out_indoors": left_out, "indoor_loss_db": settings.indoor_loss_db,
         "load": settings.load,

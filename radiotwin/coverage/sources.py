@@ -18,6 +18,7 @@ from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
 from radiotwin.twin import Twin
 
+NOTED_TRANSMITTERS = 100  # of a frequency, whose links are compared with a law's validity
 PATH_RECEIVERS = 5_000  # whose paths are followed at a time: bounds the memory
 
 
@@ -26,15 +27,11 @@ class GainSource(ABC):
 
     Attributes:
         description: of the model, for people.
-        notes: on how far it can be trusted, a sentence each; complete after the last prediction.
         has_power: whether its levels are received powers, with the transmit power in them.
     """
 
     description: str
     has_power: bool = False
-
-    def __init__(self) -> None:
-        self.notes: list[str] = []
 
     @abstractmethod
     def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
@@ -51,6 +48,14 @@ class GainSource(ABC):
             where it is not known.
         """
 
+    def notes(self, receiver_m: np.ndarray) -> list[str]:
+        """Return how far the levels can be trusted, a sentence each.
+
+        Args:
+            receiver_m: (n, 3) some of the receivers [m].
+        """
+        return []
+
 
 class LawSource(GainSource):
     """A published law, and the pattern of each antenna along the straight line.
@@ -62,7 +67,6 @@ class LawSource(GainSource):
     """
 
     def __init__(self, model: str, scene: Scene, transmitters: Sequence[Transmitter]) -> None:
-        super().__init__()
         kind = channel_named(model)
         if not issubclass(kind, PublishedLaw):
             raise BadInput(f"model {model!r} is learnt from measurements, and a scene has none: "
@@ -80,12 +84,22 @@ class LawSource(GainSource):
         each = self._transmitters[row]
         law = self._laws[each.frequency_hz]
         links = self._links(receiver_m, each.frequency_hz, row)
-        for note in law.outside(links) if len(links) else ():
-            quantity = note.split(":")[1].split(" is ")[0].strip()
-            if not any(quantity in known for known in self.notes):
-                self.notes.append(note)
         mean_db, sd_db = law.predict(links)
         return mean_db + antenna_gain_db(each, receiver_m), sd_db
+
+    @override
+    def notes(self, receiver_m: np.ndarray) -> list[str]:
+        """Return where links lie outside what the law was published for."""
+        found = []
+        for frequency_hz, law in self._laws.items():
+            rows = [row for row, each in enumerate(self._transmitters)
+                    if each.frequency_hz == frequency_hz][:NOTED_TRANSMITTERS]
+            device = np.repeat(rows, len(receiver_m))
+            device_m = np.array([self._transmitters[row].position_m for row in device])
+            links = LinkGeometry(device_m.reshape(-1, 3), np.tile(receiver_m, (len(rows), 1)),
+                                 np.ones(len(device), bool), device)
+            found += law.outside(links) if len(links) else []
+        return list(dict.fromkeys(found))
 
     def _links(self, receiver_m: np.ndarray, frequency_hz: float | None, row: int) -> LinkGeometry:
         city = self._scene.city
@@ -104,7 +118,6 @@ class PathSource(GainSource):
     """
 
     def __init__(self, scene: Scene, transmitters: Sequence[Transmitter]) -> None:
-        super().__init__()
         self._city, self._transmitters = scene.city, transmitters
         self.description = "raytrace: paths over the 3D map, powers added"
 
@@ -153,7 +166,6 @@ class TwinSource(GainSource):
     """
 
     def __init__(self, twin: Twin, scene: Scene, transmitters: Sequence[Transmitter]) -> None:
-        super().__init__()
         twin.require_map(scene)
         twin.warn_of_another_scene(scene, scene.content_hash())
         self._twin, self._scene, self._transmitters = twin, scene, transmitters
@@ -167,9 +179,19 @@ class TwinSource(GainSource):
             raise BadInput(f"{new[0]} is not a device of the twin, whose levels are received "
                            "powers: what another transmitter would send is not known; import the "
                            "measurements as gains, or leave it out with --devices")
+        self._notes = []
         if new:
-            self.notes.append(f"{len(new)} of {len(transmitters)} transmitters were not measured: "
+            self._notes.append(f"{len(new)} of {len(transmitters)} transmitters were not measured: "
                               "the twin's law for any device is used")
+        if any(each.frequency_hz not in (None, scene.config.radio.frequency_hz)
+               for each in transmitters):
+            self._notes.append("transmitters of other frequencies get the twin's law, which was "
+                               f"learnt at {scene.config.radio.frequency_hz / 1e9:g} GHz")
+
+    @override
+    def notes(self, receiver_m: np.ndarray) -> list[str]:
+        """Return which transmitters get the law of other devices, or of another frequency."""
+        return self._notes
 
     @override
     def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
@@ -206,7 +228,6 @@ class MapSource(GainSource):
 
     def __init__(self, radio_map: RadioMap, altitude_m: float,
                  transmitters: Sequence[Transmitter]) -> None:
-        super().__init__()
         level = int(np.flatnonzero(radio_map.lattice.z_m == altitude_m)[0])
         rows = [radio_map.devices.index(each.name) for each in transmitters]
         self._gain_db = radio_map.gain_db[rows, level].reshape(len(rows), -1)

@@ -84,17 +84,19 @@ def coverage_figure(coverage: Coverage, scene: Scene, name: str,
            ylabel="y, north [m]")
     ax.set_title(legend.title, loc="left", fontweight="bold")
     _draw_scale_bar(ax, bounds_m)
-    figure.legend(handles=_handles(legend, classes, building.any() and not indoors),
+    figure.legend(handles=_handles(legend, classes, coverage, building.any() and not indoors),
                   loc="outside right upper", frameon=False, alignment="left",
                   title="share of the area", title_fontsize="small")
     figure.supxlabel(_caption(coverage, scene), fontsize=7, color="#444444")
     return figure
 
 
-def _handles(legend: Legend, classes: np.ndarray, with_buildings: bool) -> list[Patch]:
+def _handles(legend: Legend, classes: np.ndarray, coverage: Coverage,
+             with_buildings: bool) -> list[Patch]:
     """Return a patch for each class with its share of the cells that are not left out."""
     counts = np.bincount(classes[classes >= 0].astype(int), minlength=len(legend.labels))
-    shares = counts / max(counts.sum(), 1)
+    cells = classes.size - coverage.summary["cells_left_out_indoors"]
+    shares = counts / max(cells, 1)
     rows = list(range(len(legend.labels)))
     if len(rows) > MAX_LEGEND_ROWS:
         rows = sorted(np.argsort(-shares, kind="stable")[:MAX_LEGEND_ROWS].tolist())
@@ -102,6 +104,9 @@ def _handles(legend: Legend, classes: np.ndarray, with_buildings: bool) -> list[
                      label=f"{plain(legend.labels[row], 30)}   {shares[row]:.1%}") for row in rows]
     if len(rows) < len(legend.labels):
         handles.append(Patch(alpha=0, label=f"… {len(legend.labels) - len(rows)} more"))
+    if counts.sum() < cells:
+        handles.append(Patch(facecolor="white", edgecolor="#666666", linewidth=0.4,
+                             label=f"not detected   {1 - counts.sum() / cells:.1%}"))
     if with_buildings:
         handles.append(Patch(facecolor=BUILDING_COLOUR, edgecolor=OUTLINE_COLOUR, linewidth=0.4,
                              label="building, left out"))
