@@ -59,7 +59,11 @@ def read_areas(path: Path | str, scene: Scene) -> list[Area]:
                        "GeoJSON")
 
     def project(points: np.ndarray) -> np.ndarray:
-        return np.column_stack(to_local(origin, *points.T))
+        placed_m = np.column_stack(to_local(origin, *points.T))
+        if not (np.abs(points) <= (180, 90)).all() or not np.isfinite(placed_m).all():
+            raise BadInput(f"{path}: an area has corners that are no longitude and latitude in "
+                           "degrees; export it in EPSG:4326")
+        return placed_m
 
     return [Area(each.tags.get("name", each.name),
                  shapely.make_valid(shapely.transform(each.area, project))) for each in features]

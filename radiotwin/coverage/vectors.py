@@ -82,8 +82,9 @@ def write_geopackage(coverage: Coverage, scene: Scene, path: Path) -> None:
         columns = {"device": np.array([each.name for each in placed], object),
                    "z_m": position_m[:, 2],
                    "tx_power_dbm": np.array([power_dbm[each.name] for each in placed], float)}
-        _write(pyogrio, temporary, "transmitters", shapely.points(project(position_m[:, :2])),
-               "Point", columns, origin is not None)
+        _write(pyogrio, temporary, "transmitters",
+               np.asarray(shapely.points(project(position_m[:, :2]))), "Point", columns,
+               origin is not None)
 
 
 def _write(pyogrio: Any, path: Path, layer: str, shapes: np.ndarray, kind: str,

@@ -84,9 +84,9 @@ def coverage_figure(coverage: Coverage, scene: Scene, name: str,
            ylabel="y, north [m]")
     ax.set_title(legend.title, loc="left", fontweight="bold")
     _draw_scale_bar(ax, bounds_m)
-    figure.legend(handles=_handles(legend, classes, coverage, building.any() and not indoors),
-                  loc="outside right upper", frameon=False, alignment="left",
-                  title="share of the area", title_fontsize="small")
+    handles = _handles(legend, classes, coverage, bool(building.any()) and not indoors)
+    figure.legend(handles=handles, loc="outside right upper", frameon=False,
+                  alignment="left", title="share of the area", title_fontsize="small")
     figure.supxlabel(_caption(coverage, scene), fontsize=7, color="#444444")
     return figure
 

@@ -102,6 +102,7 @@ BAD = {
     "polygon": ("scene --transmitters sites.csv --polygon none.geojson", ["none.geojson does not exist"]),
     "points": ("scene --transmitters sites.csv --polygon points.geojson", ["points.geojson holds no polygon"]),
     "far away": ("scene --transmitters sites.csv --polygon far.geojson", ["'far': no cell's middle lies in it"]),
+    "not degrees": ("scene --transmitters sites.csv --polygon metres.geojson", ["no longitude and latitude in degrees"]),
     "foreign files": ("scene --transmitters sites.csv -o .", ["which the new content would erase"]),
 }
 
@@ -117,6 +118,7 @@ def test_a_mistake_is_one_message_and_nothing_is_written(run, town, tmp_path, wh
                    np.ones((1, lattice.positions_m.shape[0]))).write(tmp_path / "map.nc")
     feature = {"type": "Feature", "properties": {"name": "far"}}
     for name, geometry in (("points", {"type": "Point", "coordinates": [8, 47]}),
+                           ("metres", {"type": "Polygon", "coordinates": [[[5e5, 6e6], [6e5, 6e6], [6e5, 7e6], [5e5, 6e6]]]}),
                            ("far", {"type": "Polygon", "coordinates": [[[9, 47], [9.1, 47], [9, 47.1], [9, 47]]]})):
         (tmp_path / f"{name}.geojson").write_text(json.dumps(
             {"type": "FeatureCollection", "features": [feature | {"geometry": geometry}]}))

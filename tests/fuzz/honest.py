@@ -46,6 +46,9 @@ LINES = {
     "loop": "radiotwin close-loop survey/measurements.csv -o out --base log-distance --hold-out block --seed 1 --scene scene",
     "locate": "radiotwin locate open/measurements.csv -o out.csv --twin loop/twin --truth located.csv --devices open/devices.csv",
     "compare": "radiotwin compare survey/measurements.csv -o out --scene scene --truth map.nc --held-out 1 --seed 1 --also twin",
+    "coverage": "radiotwin coverage town -o out --transmitters sites/sites.csv --model p1411 --tx-power-dbm 20 --load 0.5 --height 2 "
+                "--step 20 --bandwidth-hz 1e6 --noise-figure-db 9 --threshold-dbm -90 --classes=-80,-90 --reliability 0.95 "
+                "--polygon town.geojson --indoor-loss-db 9 --rate 0.6,-10,4.4 --formats nc",
     "report": "radiotwin report twin -o out.html --scene scene --truth segmented --measurements survey/measurements.csv",
     "import": "radiotwin import log.csv -o out --columns import.toml --level-unit dBm --length-unit m --time-zone UTC "
               "--not-detected -150,no --not-measured x --not-detected-at-or-below -140 --min-level -160 --max-level 0 "
@@ -69,6 +72,11 @@ def make_honest(folder: Path) -> None:
     (folder / "pattern.csv").write_text("azimuth_deg,elevation_deg,gain_dbi\n" + "".join(
         f"{azimuth},{elevation},{-abs(elevation) / 10}\n" for azimuth in range(0, 360, 30)
         for elevation in range(-90, 91, 30)))
+    (folder / "sites").mkdir()
+    (folder / "sites" / "pattern.csv").write_bytes((folder / "pattern.csv").read_bytes())
+    (folder / "sites" / "sites.csv").write_text(
+        "device,x_m,y_m,z_m,tx_power_dbm,load,frequency_hz,antenna,azimuth_deg,tilt_deg\n"
+        "roof,5,5,40,30,0.5,2.4e9,pattern.csv,120,-6\nmast,-20,30,40,20,,,,,\n")
     (folder / "pattern.msi").write_text("NAME test\nFREQUENCY 2400\nGAIN 2 dBi\n" + "".join(
         f"{cut} 360\n" + "".join(f"{angle} {angle % 90 / 10}\n" for angle in range(360))
         for cut in ("HORIZONTAL", "VERTICAL")))

@@ -68,6 +68,13 @@ TARGETS = (
         "radiotwin map map.nc --scene scene -o out.npz", "radiotwin map map.nc --scene scene --altitudes 55 -o out.tif",
         "radiotwin map map.nc --scene scene --devices d1 -o out.png",
         "radiotwin report scene --truth map.nc -o out.html")),
+    *(Target("transmitters", file, "radiotwin coverage town --transmitters sites/sites.csv --step 20 --formats nc -o out")
+      for file in ("sites/sites.csv", "sites/pattern.csv")),
+    Target("GeoJSON map", "town.geojson",
+           "radiotwin coverage town --transmitters sites/sites.csv --step 20 --polygon town.geojson --indoor-loss-db 9 "
+           "--formats gpkg -o out"),
+    Target("radio map", "map.nc", "radiotwin coverage map.nc --scene scene --tx-power-dbm 20 --formats tif,png -o out"),
+    Target("twin", "twin/twin.json", "radiotwin coverage twin --scene scene --tx-power-dbm 20 --step 30 --formats nc -o out"),
     *(Target("run folder", file, "radiotwin report loop -o out.html")
       for file in ("loop/closeloop.json", "loop/residuals.csv.gz", "loop/drivers.png")),
     *(Target("run folder", f"comparison/{name}", "radiotwin report comparison --scene scene -o out.html")
