@@ -68,7 +68,8 @@ TARGETS = (
         "radiotwin map map.nc --scene scene -o out.npz", "radiotwin map map.nc --scene scene --altitudes 55 -o out.tif",
         "radiotwin map map.nc --scene scene --devices d1 -o out.png",
         "radiotwin report scene --truth map.nc -o out.html")),
-    *(Target("transmitters", file, "radiotwin coverage town --transmitters sites/sites.csv --step 20 --formats nc -o out")
+    *(Target("transmitters", file, "radiotwin coverage town --transmitters sites/sites.csv --step 20 --indoor-loss-db 9 --formats nc "
+             "-o out")
       for file in ("sites/sites.csv", "sites/pattern.csv")),
     Target("GeoJSON map", "town.geojson",
            "radiotwin coverage town --transmitters sites/sites.csv --step 20 --polygon town.geojson --indoor-loss-db 9 "
