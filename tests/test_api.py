@@ -1,6 +1,7 @@
 """`import radiotwin as rt`: quick, complete, and the documented lines run as they are."""
 
 import ast
+import inspect
 import re
 import subprocess
 import sys
@@ -9,8 +10,21 @@ from pathlib import Path
 import pytest
 
 import radiotwin as rt
+from radiotwin.cli.commands import app
 
 ROOT = Path(__file__).parents[1]
+# Command -> functions of `rt` that do its work; a command calls them, or (after the arrow) what they call, too.
+COMMANDS = {
+    "build-scene": ["build_scene"], "export-scene": ["export_scene"], "trace": ["trace_map", "choose_quality"],
+    "gains": ["trace_points", "read_points"], "paths": ["list_paths", "read_points"],
+    "survey": ["fly_survey", "read_truth"], "import": ["import_measurements → import_file"], "fit": ["fit_twin"],
+    "map": ["export_map"], "compare": ["compare_held_out", "write_comparison_folder"],
+    "close-loop": ["close_loop", "write_closeloop_folder", "write_corrected_scene"],
+    "locate": ["locate_devices", "position_errors"], "report": ["read_run", "write_report"], "demo": ["run_demo"],
+    "doctor": ["diagnose"], "cache": ["cache_content", "clear_cache"],
+}
+# Options of the command line -> parameters of functions that are called otherwise than they.
+RENAMED = {"out": {"folder", "path", "out", "out_path"}, "check": {"check_only"}}
 HEAVY = ("torch", "numpy", "pandas", "matplotlib", "mitsuba", "scipy")
 
 
@@ -46,3 +60,51 @@ def test_the_documented_lines_run(tmp_path, monkeypatch, capsys):
     assert names["prediction"].mean_db.shape == (2,) and (names["prediction"].sd_db > 0).all()
     described = (ROOT / "docs" / "close-the-loop.md").read_text(encoding="utf-8")
     assert all(f"`{key}`" in described for key in rt.make_report(names["loop"]))
+
+
+def called_by(module_path, function):
+    """Return the names that a function of a module imports or calls, and those of the module's own that it calls."""
+    tree = ast.parse(Path(module_path).read_text(encoding="utf-8"))
+    bodies = {node.name: node for node in tree.body if isinstance(node, ast.FunctionDef)}
+    names, waiting, seen = set(), [function], set()
+    while waiting:
+        name = waiting.pop()
+        seen.add(name)
+        for node in ast.walk(bodies[name]):
+            if isinstance(node, ast.ImportFrom):
+                names.update(alias.name for alias in node.names)
+            elif isinstance(node, ast.Name):
+                names.add(node.id)
+        waiting += [each for each in names & bodies.keys() if each not in seen]
+    return names
+
+
+def test_every_command_is_declared():
+    assert {command.name for command in app.registered_commands} == COMMANDS.keys()
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_calls_a_function_that_python_has(command):
+    callback = inspect.unwrap(next(each.callback for each in app.registered_commands if each.name == command))
+    called = called_by(inspect.getsourcefile(callback), callback.__name__)
+    for entry in COMMANDS[command]:
+        name, _, inner = entry.partition(" → ")
+        function = getattr(rt, name)
+        assert name in rt.__all__ and callable(function)
+        assert (inner or name) in called
+        assert not inner or inner in called_by(inspect.getsourcefile(function), name)
+
+
+@pytest.mark.parametrize("name", sorted({each.partition(" → ")[0] for names in COMMANDS.values() for each in names}))
+def test_functions_have_defaults_where_commands_have(name):
+    """What a command leaves open, a function leaves open, too: seed, flights, pattern, model and the like."""
+    parameters = inspect.signature(getattr(rt, name)).parameters
+    command = next(key for key, names in COMMANDS.items() if any(each.split(" ")[0] == name for each in names))
+    callback = next(each.callback for each in app.registered_commands if each.name == command)
+    for option, declared in inspect.signature(callback).parameters.items():
+        for same in RENAMED.get(option, {option}) & parameters.keys():
+            if declared.default not in (inspect.Parameter.empty, None):  # None: not wanted, or chosen
+                assert parameters[same].default is not inspect.Parameter.empty, same
+    for option in ("seed", "flights", "pattern", "model", "settings"):
+        if option in parameters and parameters[option].kind is not inspect.Parameter.VAR_KEYWORD:
+            assert parameters[option].default is not inspect.Parameter.empty, option

@@ -23,6 +23,7 @@ LAYERS = (
     {"channel"},
     {"paths"},
     {"links", "inference"},
+    {"build"},
     {"trace", "survey", "importing", "export", "footprints", "alignment"},
     {"radiomap"},
     {"map_file"},

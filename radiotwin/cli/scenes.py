@@ -2,16 +2,13 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from radiotwin.cli.options import SceneFolder, parse_origin
 from radiotwin.console import console, result, say
 from radiotwin.errors import BadInput
-
-if TYPE_CHECKING:
-    from radiotwin.scene.report import BuildReport
 
 Bounds = tuple[float, float, float, float]
 
@@ -66,22 +63,16 @@ def build_scene(
 
     A report lists its contents and all problems that were found.
     """
-    from radiotwin.footprints import map_suffix
+    from radiotwin.build import build_scene as build
     from radiotwin.scene.report import print_report
 
-    common = _given(frequency_hz=frequency_hz, devices=devices, uavs=uavs, seed=seed,
-                    origin=parse_origin(origin))
-    of_cities = _given(scale=scale, up=up)
-    of_maps = _given(height_default=height_default, material_table=material_table,
-                     overpass=overpass or None)
-    pairs, bounds = _pairs(material or []), _bounds(bbox)
-    if map_suffix(source):
-        _refuse(of_cities, f"{source} is a map")
-        report = _build_from_map(source, out, common, pairs, bounds, of_maps, check)
-    else:
-        _refuse(of_maps, f"{source} is not a map (.osm, .osm.pbf, .geojson, .gpkg)")
-        options = common | of_cities | _given(materials=pairs or None, bbox=bounds)
-        report = _build_from_city(source, out, options, check)
+    report = build(source, out, frequency_hz=frequency_hz, materials=_pairs(material or []),
+                   bbox=_bounds(bbox), devices=devices, uavs=uavs, seed=seed,
+                   origin=parse_origin(origin), scale=scale, up=up,
+                   default_height_m=height_default, material_table=material_table,
+                   overpass=overpass, check_only=check)
+    if overpass:
+        say(f"wrote {source} (© OpenStreetMap contributors, ODbL)")
     print_report(report, console)
     result("scene", asdict(report))
     if report.folder:
@@ -103,63 +94,6 @@ def export_scene(
     scene = Scene.load(folder)
     export(scene, out)
     say(f"wrote {out}" + (f": {', '.join(_content(out))}" if out.is_dir() else ""))
-
-
-def _build_from_city(source: str, out: Path | None, options: dict[str, Any],
-                     check: bool) -> "BuildReport":
-    from radiotwin.scene.build import BuildOptions
-    from radiotwin.scene.build import build_scene as build
-    from radiotwin.scene.presets import build_preset_scene
-    from radiotwin.scene.sources import scene_name
-
-    if source.startswith("preset:"):
-        if options:
-            raise BadInput(f"{source} is built as it is published; the option for "
-                           f"{', '.join(options)} cannot be used with it. Build it without, then "
-                           "change scene.toml")
-        name = source.removeprefix("preset:")
-        return build_preset_scene(name, out or Path("scenes") / name, check_only=check)
-    out = out or Path("scenes") / scene_name(source)
-    return build(source, out, BuildOptions(**options), check_only=check)
-
-
-def _build_from_map(source: str, out: Path | None, common: dict[str, Any], pairs: dict[str, str],
-                    bbox_deg: Bounds | None, of_maps: dict[str, Any], check: bool) -> "BuildReport":
-    from radiotwin.footprints import (
-        MapOptions,
-        build_scene_from_map,
-        map_name,
-        read_material_table,
-        with_pairs,
-    )
-    from radiotwin.footprints.material_table import STANDARD
-    from radiotwin.footprints.overpass import download_osm
-    from radiotwin.scene.build import BuildOptions
-
-    table = STANDARD
-    if "material_table" in of_maps:
-        table = read_material_table(of_maps["material_table"])
-    height_m = of_maps.get("height_default", 10.0)
-    options = MapOptions(bbox_deg, height_m, with_pairs(table, pairs))
-    options.check()
-    if "overpass" in of_maps:
-        if bbox_deg is None:
-            raise BadInput("--overpass downloads an area; give it with --bbox "
-                           "SOUTH,WEST,NORTH,EAST")
-        download_osm(Path(source), bbox_deg)
-        say(f"wrote {source} (© OpenStreetMap contributors, ODbL)")
-    out = out or Path("scenes") / map_name(source)
-    return build_scene_from_map(source, out, options, BuildOptions(**common), check)
-
-
-def _given(**options: Any) -> dict[str, Any]:
-    return {name: value for name, value in options.items() if value is not None}
-
-
-def _refuse(options: dict[str, Any], reason: str) -> None:
-    if options:
-        names = ", ".join("--" + name.replace("_", "-") for name in options)
-        raise BadInput(f"{reason}: {names} cannot be used with it; leave it out")
 
 
 def _content(folder: Path) -> list[str]:

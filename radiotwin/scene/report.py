@@ -9,7 +9,9 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from radiotwin.errors import BadInput
 from radiotwin.scene.problems import Problem
+from radiotwin.scene.scene import Scene
 
 _COLOURS = {"error": "bold red", "warning": "yellow", "fixed": "green"}
 _TITLE: dict[str, Any] = {"title_justify": "left", "title_style": "bold"}
@@ -76,6 +78,17 @@ class BuildReport:
     def tracing_would_fail(self) -> bool:
         """Whether there is an error among the problems."""
         return any(problem.severity == "error" for problem in self.problems)
+
+    def load_scene(self) -> Scene:
+        """Load the scene that was written.
+
+        Raises:
+            BadInput: it was only checked.
+        """
+        if self.folder is None:
+            raise BadInput(f"{self.source} was only checked, no scene was written; build it "
+                           "without check_only")
+        return Scene.load(self.folder)
 
 
 def print_report(report: BuildReport, console: Console) -> None:

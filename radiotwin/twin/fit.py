@@ -25,8 +25,8 @@ from radiotwin.twin.twin import Twin
 MAX_LINKS, THINNED_LINKS = 1_000_000, 300_000
 
 
-def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmented_nn", seed: int,
-             start: Twin | None = None, allow_indoor: bool = False) -> Twin:
+def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmented_nn",
+             seed: int = 0, start: Twin | None = None, allow_indoor: bool = False) -> Twin:
     """Learn the channel from the anchors' links, then locate the unknown devices with it.
 
     A published law (`radiotwin.channel.published`) is taken as it stands and needs no anchor.
