@@ -23,8 +23,6 @@ COMMANDS = {
     "locate": ["locate_devices", "position_errors"], "report": ["read_run", "write_report"], "demo": ["run_demo"],
     "doctor": ["diagnose"], "cache": ["cache_content", "clear_cache"],
 }
-# Options of the command line -> parameters of functions that are called otherwise than they.
-RENAMED = {"out": {"folder", "path", "out", "out_path"}, "check": {"check_only"}}
 HEAVY = ("torch", "numpy", "pandas", "matplotlib", "mitsuba", "scipy")
 
 
@@ -102,9 +100,8 @@ def test_functions_have_defaults_where_commands_have(name):
     command = next(key for key, names in COMMANDS.items() if any(each.split(" ")[0] == name for each in names))
     callback = next(each.callback for each in app.registered_commands if each.name == command)
     for option, declared in inspect.signature(callback).parameters.items():
-        for same in RENAMED.get(option, {option}) & parameters.keys():
-            if declared.default not in (inspect.Parameter.empty, None):  # None: not wanted, or chosen
-                assert parameters[same].default is not inspect.Parameter.empty, same
+        if option in parameters and declared.default not in (inspect.Parameter.empty, None):  # None: not wanted
+            assert parameters[option].default is not inspect.Parameter.empty, option
     for option in ("seed", "flights", "pattern", "model", "settings"):
         if option in parameters and parameters[option].kind is not inspect.Parameter.VAR_KEYWORD:
             assert parameters[option].default is not inspect.Parameter.empty, option

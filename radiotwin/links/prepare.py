@@ -152,7 +152,8 @@ def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | N
         level_db, np.full(len(level_db), -np.inf), receiver_m, device_m, device, receiver,
         flight, _column(table, "time_s"), heading_deg % 360,
         list(measurements.devices["device"].iloc[kept_devices]), list(receiver_names),
-        list(flight_names), _frequency_hz(measurements, scene), scene.city if scene else None,
+        list(flight_names), _frequency_hz(measurements, scene),
+        scene.city if scene is not None else None,
         is_gain, anchors, notes, _column(table, "pitch_deg"), _column(table, "roll_deg"),
         _column(table, "quality"))
     declared_db = None

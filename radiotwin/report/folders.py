@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from radiotwin.closeloop.corrected_twin import corrected_twin
-from radiotwin.closeloop.residual_table import write_residuals
+from radiotwin.closeloop.residual_table import residuals
 from radiotwin.closeloop.result_file import make_report, write_report
 from radiotwin.closeloop.run import Loop
 from radiotwin.compare import Comparison
@@ -57,7 +57,7 @@ def write_closeloop_folder(loop: Loop, scene: Scene | None, folder: Path | str, 
     report = make_report(loop) | ({} if inputs is None else {"inputs": inputs})
     write_closeloop_figures(loop, scene, report, folder)
     write_report(report, folder / "closeloop.json")
-    write_residuals(loop, folder / "residuals.csv.gz")
+    residuals(loop).save(folder / "residuals.csv.gz")
     corrected_twin(loop, scene).save(folder / "twin")
     write_closeloop_page(report, folder, title)
     return report
