@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from radiotwin.closeloop.corrected_scene import write_corrected_scene
     from radiotwin.closeloop.corrected_twin import corrected_twin
     from radiotwin.closeloop.criteria import SelectionCriteria
+    from radiotwin.closeloop.residual_table import residuals
+    from radiotwin.closeloop.residuals import Residuals
     from radiotwin.closeloop.result_file import make_report
     from radiotwin.closeloop.run import Loop, close_loop
     from radiotwin.compare import Comparison, compare_models, score_map, split_flights
@@ -21,6 +23,7 @@ if TYPE_CHECKING:
     from radiotwin.doctor import diagnose
     from radiotwin.errors import BadInput, RunFailed
     from radiotwin.importing import import_measurements
+    from radiotwin.map_difference import MapDifference
     from radiotwin.measurements import Measurements, read_measurements
     from radiotwin.paths.listing import list_paths
     from radiotwin.pieces import cache_content, clear_cache, keep_pieces
@@ -49,6 +52,8 @@ _MODULES = {
     "closeloop.corrected_scene": ["write_corrected_scene"],
     "closeloop.corrected_twin": ["corrected_twin"],
     "closeloop.criteria": ["SelectionCriteria"],
+    "closeloop.residual_table": ["residuals"],
+    "closeloop.residuals": ["Residuals"],
     "closeloop.result_file": ["make_report"],
     "closeloop.run": ["Loop", "close_loop"],
     "compare": ["Comparison", "compare_models", "score_map", "split_flights"],
@@ -57,6 +62,7 @@ _MODULES = {
     "doctor": ["diagnose"],
     "errors": ["BadInput", "RunFailed"],
     "importing": ["import_measurements"],
+    "map_difference": ["MapDifference"],
     "measurements": ["Measurements", "read_measurements"],
     "paths.listing": ["list_paths"],
     "pieces": ["cache_content", "clear_cache", "keep_pieces"],
@@ -75,15 +81,15 @@ _MODULES = {
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [  # noqa: F822 - names that __getattr__ finds
-    "BadInput", "BuildOptions", "Comparison", "Loop", "Measurements", "RadioMap", "RunFailed",
-    "Scene", "SelectionCriteria", "SolverSettings", "Twin", "__version__", "build_preset",
-    "build_scene", "cache_content", "choose_quality", "clear_cache", "close_loop",
+    "BadInput", "BuildOptions", "Comparison", "Loop", "MapDifference", "Measurements", "RadioMap",
+    "Residuals", "RunFailed", "Scene", "SelectionCriteria", "SolverSettings", "Twin", "__version__",
+    "build_preset", "build_scene", "cache_content", "choose_quality", "clear_cache", "close_loop",
     "compare_held_out", "compare_models", "corrected_twin", "diagnose", "export_map",
     "export_scene", "fit_twin", "fly_survey", "import_measurements", "in_scene_frame",
     "keep_pieces", "list_paths", "locate_devices", "make_report", "position_errors",
-    "read_measurements", "read_points", "read_run", "read_truth", "run_demo", "score_map",
-    "segmented_truth", "split_flights", "trace_map", "trace_points", "write_closeloop_folder",
-    "write_comparison_folder", "write_corrected_scene", "write_report"]
+    "read_measurements", "read_points", "read_run", "read_truth", "residuals", "run_demo",
+    "score_map", "segmented_truth", "split_flights", "trace_map", "trace_points",
+    "write_closeloop_folder", "write_comparison_folder", "write_corrected_scene", "write_report"]
 
 
 def __getattr__(name: str) -> Any:

@@ -57,6 +57,7 @@ def close_loop(
         write_closeloop_folder,
     )
     from radiotwin.scene import Scene
+    from radiotwin.twin.locate import NOT_BY_PATHS
 
     data = read_measurements(measurements, devices)
     world = Scene.load(scene) if scene else None
@@ -64,6 +65,8 @@ def close_loop(
     check_closeloop_folder(out)
     if write_scene is not None:
         check_corrected_target(write_scene, world, out)
+    if base == "raytrace":
+        notice(f"the twin will follow paths, {NOT_BY_PATHS}")
     inputs = {"measurements": str(measurements), "scene": scene and str(scene)}
     with keep_pieces() as pieces, progress("closing the loop", total=None) as advance:
         loop = run(data, world, base, seed,
@@ -74,6 +77,8 @@ def close_loop(
                                         title=f"Close-loop report of {measurements.name}")
     notice(pieces.progress)
     _print(report)
+    if base == "auto" and loop.base == "raytrace":
+        say(f"note: the twin's base is 'raytrace', {NOT_BY_PATHS}")
     say(closeloop_summary(report))
     say(f"wrote {out / 'closeloop.html'}")
     if write_scene is not None and world is not None:
@@ -131,10 +136,9 @@ def locate(
     from radiotwin.twin import Twin
     from radiotwin.twin.locate import check_can_locate, locate_devices, position_errors
 
-    data, known = read_measurements(measurements, devices), Twin.load(twin)
-    world = Scene.load(scene) if scene else None
-    check_can_locate(known, world)
-    data = in_frame_of(world, data, shift)
+    known, world = Twin.load(twin), Scene.load(scene) if scene else None
+    check_can_locate(known, world)  # before a file is read that may be large
+    data = in_frame_of(world, read_measurements(measurements, devices), shift)
     true = read_devices(truth) if truth else None
     require_writable(out)
     unknown = int((data.devices["role"] == "unknown").sum())

@@ -16,6 +16,9 @@ from radiotwin.progress import progress
 from radiotwin.scene import Scene
 from radiotwin.twin.twin import Twin
 
+NOT_BY_PATHS = ("and following paths from every position where a device may be takes too long: "
+                "locate cannot use such a twin. close-loop --base twin makes one for it, and "
+                "fit --model raytrace locates devices along with the twin")
 MAX_NAMED = 5  # receivers in a note
 MIN_WIDENING = 1.2  # of residuals, from which a file's links are unlike those learnt from
 
@@ -32,10 +35,7 @@ def check_can_locate(twin: Twin, scene: Scene | None) -> None:
             the other way round.
     """
     if twin.channel.follows_paths:
-        raise BadInput("the twin's base is 'raytrace', and following paths from every position "
-                       "where a device may be takes too long; `radiotwin fit --model raytrace` "
-                       "locates devices along with the twin, and close-loop --base twin makes one "
-                       "for locate")
+        raise BadInput(f"the twin's base is 'raytrace', {NOT_BY_PATHS}")
     if twin.fitted is None:
         raise BadInput("the twin was not made by `radiotwin close-loop`, or by an earlier version "
                        "of it; run that on measurements of devices whose positions are known")
