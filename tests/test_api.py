@@ -1,12 +1,15 @@
 """`import radiotwin as rt`: quick, complete, and the documented lines run as they are."""
 
 import ast
+import contextlib
 import inspect
+import io
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib
 import pytest
 
 import radiotwin as rt
@@ -43,21 +46,47 @@ def test_every_name_is_there_for_people_and_for_type_checkers():
         _ = rt.nothing
 
 
-def test_the_documented_lines_run(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
-    first, second = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    assert len([line for line in first.splitlines() if line]) <= 12
-    names = {}
-    exec(compile(first, "docs/python.md", "exec"), names)
-    assert {type(names[name]).__name__ for name in ("scene", "truth", "measurements", "twin", "loop")} == {
-        "Scene", "RadioMap", "Measurements", "Twin", "Loop"}
-    assert 0 < float(capsys.readouterr().out.split()[0]) < 5
-    assert (tmp_path / "quick" / "twin" / "twin.json").is_file() and (tmp_path / "quick" / "report.html").is_file()
-    exec(compile(second, "docs/python.md", "exec"), names)
+@pytest.fixture(scope="module")
+def documented(tmp_path_factory):
+    """The names that all snippets of docs/python.md leave, run one after another in an empty folder, and the folder."""
+    folder, text = tmp_path_factory.mktemp("documented"), (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    snippets = re.findall(r"```py.*?\n(.*?)```", text, re.DOTALL)
+    assert len(snippets) == text.count("```") / 2 == 7
+    matplotlib.use("Agg")
+    names, printed = {}, io.StringIO()
+    with contextlib.chdir(folder), contextlib.redirect_stdout(printed):
+        for snippet in snippets:
+            exec(compile(snippet, "docs/python.md", "exec"), names)
+    return names, folder / "quick", printed.getvalue()
+
+
+def test_the_documented_lines_run(documented):
+    names, folder, printed = documented
+    kinds = ("Scene", "RadioMap", "Measurements", "Twin", "Loop", "MapDifference", "Residuals")
+    assert [type(names[name]).__name__ for name in ("scene", "truth", "measurements", "twin", "loop", "difference",
+                                                    "residuals")] == list(kinds)
+    assert 0 < float(printed.split()[0]) < 5
+    made = ("twin/twin.json", "report.html", "plots.png", "d3.csv", "city.glb",
+            "imported/measurements.csv", "block/scene.toml")
+    assert [name for name in made if not (folder / name).is_file()] == []
     assert names["prediction"].mean_db.shape == (2,) and (names["prediction"].sd_db > 0).all()
+    assert names["block"].config.origin == names["imported"].origin and len(names["imported"]) == 2
+    assert set(names["positions"]["device"]) == {device.device for device in names["scene"].config.devices
+                                                 if device.role == "unknown"}
+    assert len((folder / "d3.csv").read_text().splitlines()) == 1 + 16 * 16
+    assert (names["first"]["path_gain_db"].values < 0).all() and names["listed"].sizes["link"] == 2 * 7
+
+
+def test_what_closeloop_json_holds_is_documented(documented):
     described = (ROOT / "docs" / "close-the-loop.md").read_text(encoding="utf-8")
-    assert all(f"`{key}`" in described for key in rt.make_report(names["loop"]))
+    assert all(f"`{key}`" in described for key in rt.make_report(documented[0]["loop"]))
+
+
+def test_every_function_and_object_is_documented():
+    text = (ROOT / "docs" / "python.md").read_text(encoding="utf-8")
+    table = text.partition("## Functions")[2].partition("## Predictions")[0]
+    functions = {each.partition(" → ")[0] for names in COMMANDS.values() for each in names}
+    assert all(f"`{name}`" in table or f"`{name}(" in table for name in functions)
 
 
 def called_by(module_path, function):
