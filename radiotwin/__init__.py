@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from radiotwin.measurements import Measurements, read_measurements
     from radiotwin.paths.listing import list_paths
     from radiotwin.pieces import cache_content, clear_cache, keep_pieces
+    from radiotwin.point_gains import export_ns3
     from radiotwin.radiomap import RadioMap
     from radiotwin.report import (
         export_map,
@@ -66,6 +67,7 @@ _MODULES = {
     "measurements": ["Measurements", "read_measurements"],
     "paths.listing": ["list_paths"],
     "pieces": ["cache_content", "clear_cache", "keep_pieces"],
+    "point_gains": ["export_ns3"],
     "radiomap": ["RadioMap"],
     "report": ["export_map", "read_run", "write_closeloop_folder", "write_comparison_folder",
                "write_report"],
@@ -84,7 +86,7 @@ __all__ = [  # noqa: F822 - names that __getattr__ finds
     "BadInput", "BuildOptions", "Comparison", "Loop", "MapDifference", "Measurements", "RadioMap",
     "Residuals", "RunFailed", "Scene", "SelectionCriteria", "SolverSettings", "Twin", "__version__",
     "build_preset", "build_scene", "cache_content", "choose_quality", "clear_cache", "close_loop",
-    "compare_held_out", "compare_models", "corrected_twin", "diagnose", "export_map",
+    "compare_held_out", "compare_models", "corrected_twin", "diagnose", "export_map", "export_ns3",
     "export_scene", "fit_twin", "fly_survey", "import_measurements", "in_scene_frame",
     "keep_pieces", "list_paths", "locate_devices", "make_report", "position_errors",
     "read_measurements", "read_points", "read_run", "read_truth", "residuals", "run_demo",

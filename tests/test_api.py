@@ -18,7 +18,8 @@ from radiotwin.cli.commands import app
 ROOT = Path(__file__).parents[1]
 # Command -> functions of `rt` that do its work; a command calls them, or (after the arrow) what they call, too.
 COMMANDS = {
-    "build-scene": ["build_scene"], "export-scene": ["export_scene"], "trace": ["trace_map", "choose_quality"],
+    "build-scene": ["build_scene"], "export-scene": ["export_scene"], "export": ["export_ns3", "read_points"],
+    "trace": ["trace_map", "choose_quality"],
     "gains": ["trace_points", "read_points"], "paths": ["list_paths", "read_points"],
     "survey": ["fly_survey", "read_truth"], "import": ["import_measurements → import_file"], "fit": ["fit_twin"],
     "map": ["export_map"], "compare": ["compare_held_out", "write_comparison_folder"],

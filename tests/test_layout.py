@@ -15,7 +15,7 @@ LAYERS = (
     {"demo"},
     {"report"},
     {"comparison_output"},
-    {"compare"},
+    {"compare", "point_gains"},
     {"closeloop"},
     {"twin"},
     {"localize"},

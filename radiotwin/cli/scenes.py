@@ -1,4 +1,4 @@
-"""The commands that build scenes and export them: build-scene, export-scene."""
+"""The commands that build scenes and export: build-scene, export-scene, export."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -6,7 +6,14 @@ from typing import Annotated
 
 import typer
 
-from radiotwin.cli.options import SceneFolder, parse_origin
+from radiotwin.cli.options import (
+    OnlyDevices,
+    PointsFile,
+    SceneFolder,
+    SceneOption,
+    parse_origin,
+    split_names,
+)
 from radiotwin.console import console, result, say
 from radiotwin.errors import BadInput
 
@@ -17,6 +24,7 @@ def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module to the app."""
     app.command("build-scene")(build_scene)
     app.command("export-scene")(export_scene)
+    app.command("export")(export)
 
 
 def build_scene(
@@ -94,6 +102,35 @@ def export_scene(
     scene = Scene.load(folder)
     export(scene, out)
     say(f"wrote {out}" + (f": {', '.join(_content(out))}" if out.is_dir() else ""))
+
+
+def export(
+    source: Annotated[Path, typer.Argument(
+        metavar="TWIN", help="Folder of a twin, or a radio map (.nc) whose lattice has the "
+                             "points.")],
+    scene: SceneOption,
+    points: PointsFile,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for nodes.csv and losses.csv.")],
+    to: Annotated[str, typer.Option("--to", help="Program to write for: ns3.")] = "ns3",
+    devices: OnlyDevices = None,
+) -> None:
+    """Write the losses between devices and points for a network simulator.
+
+    One loss for each pair: nothing moves.
+    """
+    from radiotwin.point_gains import export_ns3
+    from radiotwin.radiomap import RadioMap
+    from radiotwin.scene import Scene
+    from radiotwin.trace import read_points
+    from radiotwin.twin import Twin
+
+    if to != "ns3":
+        raise BadInput(f"--to {to!r} is unknown; allowed is ns3")
+    world = Scene.load(scene)
+    model = RadioMap.load(source) if source.suffix == ".nc" else Twin.load(source)
+    pairs = export_ns3(model, world, read_points(points, world.config.origin), out,
+                       devices=split_names(devices))
+    say(f"wrote {out / 'nodes.csv'}, {out / 'losses.csv'}: {pairs:,} pairs of a device and a point")
 
 
 def _content(folder: Path) -> list[str]:

@@ -27,8 +27,8 @@ VEGETATION_COLOUR = "#7fb069"
 BUILDING_M = 2.0  # lowest height that is outlined
 MIN_HEIGHT_M = 0.5  # of what is drawn as a building
 PLOT_CELLS = 400  # along the longer side of a plot
-MARKS = (("anchor", "^", 80, "#d1495b", "anchor"),
-         ("unknown", "*", 130, "#f08a00", "device to be found"))
+MARKS = (("anchor", "^", 110, "#d1495b", "anchor"),
+         ("unknown", "*", 170, "#f08a00", "device to be found"))
 """Role, marker, size, colour and label of devices."""
 LAYERS = ("buildings", "devices")
 
