@@ -37,7 +37,6 @@ if TYPE_CHECKING:
         write_report,
     )
     from radiotwin.scene import Scene
-    from radiotwin.scene.build import BuildOptions
     from radiotwin.scene.export import export_scene
     from radiotwin.scene.presets import build_preset
     from radiotwin.survey import fly_survey, read_truth, segmented_truth
@@ -72,7 +71,6 @@ _MODULES = {
     "report": ["export_map", "read_run", "write_closeloop_folder", "write_comparison_folder",
                "write_report"],
     "scene": ["Scene"],
-    "scene.build": ["BuildOptions"],
     "scene.export": ["export_scene"],
     "scene.presets": ["build_preset"],
     "survey": ["fly_survey", "read_truth", "segmented_truth"],
@@ -83,7 +81,7 @@ _MODULES = {
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
 __all__ = [  # noqa: F822 - names that __getattr__ finds
-    "BadInput", "BuildOptions", "Comparison", "Loop", "MapDifference", "Measurements", "RadioMap",
+    "BadInput", "Comparison", "Loop", "MapDifference", "Measurements", "RadioMap",
     "Residuals", "RunFailed", "Scene", "SelectionCriteria", "SolverSettings", "Twin", "__version__",
     "build_preset", "build_scene", "cache_content", "choose_quality", "clear_cache", "close_loop",
     "compare_held_out", "compare_models", "corrected_twin", "diagnose", "export_map", "export_ns3",
