@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder
 from radiotwin.inputs import is_within, read_bytes, require_within
-from radiotwin.scene.config import write_config
+from radiotwin.scene.config import DeviceConfig, UavConfig, write_config
 from radiotwin.scene.reader import read_city
 from radiotwin.scene.writer import write_city
 
@@ -57,7 +57,7 @@ def copy_scene(scene: Scene, folder: Path) -> None:
     if is_within(scene.folder, folder):
         raise BadInput(f"{folder} holds the scene itself, which the copy would replace; choose "
                        "another folder")
-    ends = [*scene.config.devices, *scene.config.uavs]
+    ends: list[DeviceConfig | UavConfig] = [*scene.config.devices, *scene.config.uavs]
     antennas = {Path(end.antenna).parts[0] for end in ends if end.antenna is not None}
     check_target(folder, SCENE_FILES | antennas)
     with atomic_folder(folder) as temporary:

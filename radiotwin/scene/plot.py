@@ -157,15 +157,15 @@ def scene_table(scene: Scene, layer: str) -> GeoDataFrame:
         return geo_data_frame(table, origin, position_m=scene.device_m)
     import shapely
 
-    rows, outlines = [], []
+    found, outlines = [], []
     for shape in read_city(scene.xml_path):
         corners_m = shape.mesh.vertices[shape.mesh.faces]
         if corners_m[..., 2].max() < GROUND_M:
             continue
-        flat = shapely.polygons(corners_m[..., :2])
+        flat = np.asarray(shapely.polygons(corners_m[..., :2]))
         outlines.append(shapely.union_all(flat[shapely.area(flat) > 0], grid_size=1e-3))
-        rows.append((shape.name, shape.material.name, float(corners_m[..., 2].max())))
-    table = pd.DataFrame(rows, columns=["building", "material", "height_m"])
+        found.append((shape.name, shape.material.name, float(corners_m[..., 2].max())))
+    table = pd.DataFrame(found, columns=["building", "material", "height_m"])
     return geo_data_frame(table, origin, geometry=np.array(outlines, dtype=object))
 
 
