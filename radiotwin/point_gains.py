@@ -64,7 +64,7 @@ def gains_at(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray,
     if isinstance(source, RadioMap):
         rows = [source.devices.index(name) for name in devices]
         flat = source.gain_db.reshape(len(source.devices), -1).astype(float)
-        gain_db = flat[np.ix_(rows, source.lattice.index_of(points_m))]
+        gain_db = flat[rows][:, source.lattice.index_of(points_m)]
     else:
         source.require_map(scene)
         row_of = {each.device: row for row, each in enumerate(source.devices)}

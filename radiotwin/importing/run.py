@@ -108,7 +108,7 @@ def import_measurements(path: Path | str, out: Path | str,
     """
     path, out = Path(path), Path(out)
     mapping = None if isinstance(columns, Mapping) else columns
-    given = {"columns": columns} if isinstance(columns, Mapping) else {}
+    given: dict[str, Any] = {"columns": columns} if isinstance(columns, Mapping) else {}
     given |= {name: str(value) if isinstance(value, Path) else value
               for name, value in settings.items()}
     import_file(path, read_settings(mapping, given, path.parent), out, compress, on_progress)

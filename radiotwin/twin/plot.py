@@ -45,8 +45,9 @@ def plot_positions(devices: list[TwinDevice], ax: Axes | None, origin: Origin | 
         ax.plot(*ring, color="#f08a00", linewidth=1.2, zorder=3,
                 label="" if number else "90 % radius")
     for each in placed[:MAX_NAMES]:
-        ax.annotate(plain(each.device, 24), [float(part) for part in frame.at(each.x_m, each.y_m)],
-                    xytext=(5, 5), textcoords="offset points", fontsize=8, zorder=5)
+        x, y = frame.at(each.x_m, each.y_m)
+        ax.annotate(plain(each.device, 24), (float(x), float(y)), xytext=(5, 5),
+                    textcoords="offset points", fontsize=8, zorder=5)
     frame.prepare(ax)
     add_legend(ax)
     missing = len(devices) - len(placed)
