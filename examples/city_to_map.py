@@ -28,7 +28,7 @@ if llvm.available():
     radio_map = rt.trace_map(scene, rt.SolverSettings.of_quality("fast"), out / "map.nc", ["d3"])
 else:
     radio_map = rt.segmented_truth(scene)
-    radio_map.write(out / "map.nc")
+    radio_map.save(out / "map.nc")
 gain_db = radio_map.dataset["gain_db"]
 print(f"{float(gain_db.isnull().mean()):.1%} of all links are not detected")
 print(gain_db.sel(device="d3", z=55.0).sel(x=100.0, y=100.0, method="nearest").item(), "dB")

@@ -11,7 +11,7 @@ from marl.checkpoint import NAME, OLD_NAME, Damaged, load_checkpoint, refuse_dam
 from marl.learner import Learner
 from marl.settings import RunSettings
 from marl.stored import require_count, require_fields
-from radiotwin.measurements import MAX_LEVEL_DB
+from radiotwin.measurement_columns import MAX_LEVEL_DB
 from radiotwin.scene import Scene
 from radiotwin.survey.grid import HOVER_COST
 from radiotwin.twin import Twin

@@ -104,7 +104,8 @@ def published_models(frequency_hz: float) -> tuple[str, ...]:
     return tuple(filter(holds, PUBLISHED_MODELS))
 
 
-def split_flights(measurements: Measurements, held_out: int) -> tuple[Measurements, Measurements]:
+def split_flights(measurements: Measurements, held_out: int = 1
+                  ) -> tuple[Measurements, Measurements]:
     """Split the last flights from those before.
 
     Args:
@@ -131,7 +132,7 @@ def split_flights(measurements: Measurements, held_out: int) -> tuple[Measuremen
 
 
 def compare_models(train: Measurements, test: Measurements, scene: Scene,
-                   truth: RadioMap | None, *, seed: int,
+                   truth: RadioMap | None = None, *, seed: int = 0,
                    models: tuple[str, ...] = DEFAULT_MODELS,
                    twins: dict[str, Twin] | None = None,
                    maps: dict[str, RadioMap] | None = None) -> Comparison:

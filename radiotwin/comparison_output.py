@@ -3,6 +3,7 @@
 import json
 import warnings
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -11,9 +12,17 @@ import pandas as pd
 from pydantic import field_validator
 
 from radiotwin.cells import write_csv
-from radiotwin.compare import CLASSES, Comparison
+from radiotwin.compare import (
+    CLASSES,
+    DEFAULT_MODELS,
+    Comparison,
+    compare_models,
+    published_models,
+    split_flights,
+)
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
+from radiotwin.measurements import Measurements
 from radiotwin.radiomap import RadioMap
 from radiotwin.records import Number, Record, Whole, read_record, validated
 from radiotwin.scene import Scene
@@ -61,6 +70,33 @@ class ComparisonRecord(Record):
         if len(rows) < len(scores) or any(count != len(CLASSES) for count in classes.values()):
             raise ValueError(f"not one row for each of {', '.join(CLASSES)} of a model")
         return scores
+
+
+def compare_held_out(measurements: Measurements, scene: Scene, truth: RadioMap | None = None, *,
+                     held_out: int = 1, raytrace: bool = False, also: Sequence[Path | str] = (),
+                     seed: int = 0) -> Comparison:
+    """Compare all channel models on the last flights, which none of them is fitted to.
+
+    Published laws that hold at the scene's frequency are among them, fitted to nothing.
+
+    Args:
+        measurements: of several flights.
+        scene: where they were flown.
+        truth: the whole map to judge on, too; None: there is none.
+        held_out: number of the last flights.
+        raytrace: compare the model `raytrace`, too; takes minutes.
+        also: folders of twins and, with a truth, files of radio maps, to compare with the models.
+        seed: of all fits.
+
+    Raises:
+        BadInput: too few flights, or what `judge_also` and `compare_models` refuse.
+    """
+    train, test = split_flights(measurements, held_out)
+    twins, maps = judge_also([Path(path) for path in also], truth, test.flights)
+    models = (*DEFAULT_MODELS, *published_models(scene.config.radio.frequency_hz),
+              *["raytrace"] * raytrace)
+    return compare_models(train, test, scene, truth, seed=seed, models=models, twins=twins,
+                          maps=maps)
 
 
 def judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],

@@ -13,6 +13,7 @@ from typing import Any, TextIO
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.segment import Segment
 from rich.table import Table
 
@@ -20,6 +21,8 @@ from rich.table import Table
 # and paragraph separators; halves of characters, as Python reads names that are not UTF-8.
 _OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069"
                      "\ud800-\udfff]")
+
+MAX_LINE = 10_000  # characters of a table that is not on a terminal
 
 
 def printable(text: str) -> str:
@@ -110,10 +113,32 @@ def print_rows(title: str, columns: dict[str, str], rows: list[list]) -> None:
     table = Table(title=escape(_text(title)), title_justify="left", title_style="bold",
                   box=SIMPLE_HEAD, pad_edge=False)
     for heading, justify in columns.items():
-        table.add_column(escape(_text(heading)), justify=justify)  # type: ignore[arg-type]  # a Literal
+        table.add_column(escape(_text(heading)), justify=justify,  # type: ignore[arg-type]  # a Literal
+                         overflow="fold")
     for row in rows:
         table.add_row(*(escape(_text(cell)) for cell in row))
-    console.print(table)
+    print_table(table, console)
+
+
+def print_table(table: Table, to: Console) -> None:
+    """Print a table with all of its text.
+
+    A file or a pipe has no width: there lines are as long as they need to be. On a terminal, what
+    is wider than it goes on in the next line of its cell.
+
+    Args:
+        table: whose columns overflow by `fold`.
+        to: where to print it.
+    """
+    if to.is_terminal:
+        to.print(table)
+        return
+    wanted = Measurement.get(to, to.options.update(max_width=MAX_LINE), table).maximum
+    width, to.width = to.width, max(to.width, wanted)
+    try:
+        to.print(table)
+    finally:
+        to.width = width
 
 
 def _text(cell: Any) -> str:

@@ -21,8 +21,8 @@ FLIGHTS, HELD_OUT = 6, 1
 ROOF_MATERIALS = {"sionna:munich": {"metal": "itu_marble", "wood": "itu_brick"}}
 
 
-def run_demo(source: str, folder: Path | str, *, seed: int,
-             on_progress: Callable[[str], None]) -> Comparison:
+def run_demo(source: str = "preset:small", folder: Path | str = "demo", *, seed: int = 0,
+             on_progress: Callable[[str], None] = lambda step: None) -> Comparison:
     """Run the chain and write everything into a folder.
 
     Args:

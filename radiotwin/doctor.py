@@ -81,15 +81,13 @@ def diagnose() -> Diagnosis:
     return diagnosis
 
 
-def print_diagnosis(console: Console) -> Diagnosis:
-    """Check this machine, and print findings and remedies.
+def print_diagnosis(diagnosis: Diagnosis, console: Console) -> None:
+    """Print findings about this machine, and remedies.
 
     Args:
+        diagnosis: to print.
         console: to print on.
     """
-    with console.status("checking this machine"):
-        diagnosis = diagnose()
-
     def say(text: str, style: str | None = None) -> None:  # neither wraps paths nor reads markup
         console.print(text, style=style, markup=False, highlight=False, soft_wrap=True)
 
@@ -104,7 +102,6 @@ def print_diagnosis(console: Console) -> Diagnosis:
             say(f"  - {line}".replace("\n", "\n    "), style)
     if diagnosis.healthy:
         say("  Everything works.", "green")
-    return diagnosis
 
 
 def _check_machine(diagnosis: Diagnosis) -> Rows:

@@ -4,22 +4,19 @@ import os
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 
 from radiotwin.budgets import DEVICES
-from radiotwin.cells import (
-    as_numbers,
-    check_suffix,
-    read_cells,
-    refuse,
-    require_pyarrow,
-    shown,
-    write_csv,
-)
+from radiotwin.cells import check_suffix, require_pyarrow, shown, write_csv
+from radiotwin.display import PlotFrame, Summary, new_axes
+from radiotwin.display.style import GAIN_COLOURS, level_range_db, plain
+from radiotwin.display.summary import count, some, span
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 from radiotwin.frames import (
@@ -31,30 +28,27 @@ from radiotwin.frames import (
     write_frame,
 )
 from radiotwin.inputs import is_within
-from radiotwin.tables import Origin, name_fault
+from radiotwin.link_view import links_dataset, links_table, of_device, plot_links
+from radiotwin.measurement_columns import LEVELS, read_columns
+from radiotwin.tables import Origin
+
+if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
+    from matplotlib.axes import Axes
+
+    from radiotwin.scene import Scene
 
 # Columns of the two files, as in docs/conventions.md.
 REQUIRED = ["flight", "receiver", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device"]
-LEVELS = ["gain_db", "rssi_dbm"]
 OPTIONAL = ["time_s", "heading_deg", "pitch_deg", "roll_deg", "quality"]
 DEVICE_REQUIRED = ["device", "x_m", "y_m", "z_m", "role"]
 DEVICE_OPTIONAL = ["frequency_hz", "tx_power_dbm", "azimuth_deg", "tilt_deg"]
 ROLES = ("anchor", "unknown")
 _RECEIVER_POSITION = ["receiver_x_m", "receiver_y_m", "receiver_z_m"]
 _DEVICE_POSITION = ["x_m", "y_m", "z_m"]
-_TEXT = {"flight", "receiver", "device", "role"}
+MAX_APART_M = 1e6  # between an anchor and the receivers' middle: no radio link is so long
 _MAY_BE_EMPTY = {"receiver_z_m", *LEVELS, *OPTIONAL}
 _DEVICE_MAY_BE_EMPTY = {"x_m", "y_m", "z_m", *DEVICE_OPTIONAL}
-# Limits that no measurement exceeds: what lies beyond them is another unit or a placeholder.
-MAX_LEVEL_DB = 300.0
-MAX_COORDINATE_M = 1e7  # a quarter of a meridian
-MAX_APART_M = 1e6  # between an anchor and the receivers' middle: no radio link is so long
-FREQUENCIES_HZ = (1e6, 450e9)  # as of a scene; materials of ITU-R P.2040 end at 450 GHz
-MAX_TIME_S = 1e11  # the year 5138; milliseconds since 1970 lie beyond
-MAX_SPAN_S = 3.2e9  # a century, the longest campaign
-MAX_ANGLE_DEG = 1e6  # thousands of turns in one direction, which some compasses count
-MAX_POWER_DBM = 300.0  # as of a level
-MAX_QUALITY = 1e15  # whole numbers are exact up to there
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +135,17 @@ class Measurements:
                            "Measurements, or move them")
         return self.moved(lambda position_m: between_frames(position_m, here, origin), origin)
 
-    def write(self, path: Path | str) -> None:
+    @classmethod
+    def load(cls, path: Path | str, devices_path: Path | str | None = None) -> "Measurements":
+        """Read links and devices, see `read_measurements`.
+
+        Args:
+            path: `.csv`, `.csv.gz` or `.parquet`.
+            devices_path: table of the devices; None: `devices.csv` in the same folder.
+        """
+        return read_measurements(path, devices_path)
+
+    def save(self, path: Path | str) -> None:
         """Write the links, and the devices to `devices.csv` in the same folder.
 
         A known origin goes to `frame.toml` there.
@@ -172,6 +176,89 @@ class Measurements:
                 self.table.to_parquet(links, index=False)
             else:
                 write_csv(self.table, links)
+
+    write = save  # the name of version 0.1
+
+    def plot(self, device: str | None = None, ax: "Axes | None" = None, *,
+             scene: "Scene | None" = None, geographic: bool | None = None) -> "Axes":
+        """Draw the levels of a device's links at the end that moves.
+
+        Args:
+            device: name; None: the one with the most detected links.
+            ax: axes of matplotlib to draw into; None: a new figure.
+            scene: whose buildings are outlined; None: none are.
+            geographic: whether axes are longitude and latitude; None: where the origin is known.
+
+        Returns:
+            The axes.
+
+        Raises:
+            BadInput: no such device, no link at all, or longitude and latitude without an origin.
+        """
+        if self.table.empty:
+            raise BadInput("there are no links to draw")
+        if device is None:
+            heard = self.table["device"][np.isfinite(self.level_db)]
+            device = str((heard if len(heard) else self.table["device"]).mode()[0])
+        origin = self.origin or (scene.config.origin if scene is not None else None)
+        frame = PlotFrame.choose(origin, geographic)
+        links = of_device(self._links_with_devices(), device)
+        level = links[self.level_column].to_numpy(dtype=float)
+        ax, (low, high) = new_axes(ax), level_range_db(level)
+        label = "channel gain [dB]" if self.level_column == "gain_db" else "received power [dBm]"
+        plot_links(links, level, ax, frame, scene, label, True, cmap=GAIN_COLOURS, vmin=low,
+                   vmax=high)
+        ax.set_title(f"device {plain(device)}: {count(len(links), 'link')}, "
+                     f"{np.isfinite(level).sum():,} detected")
+        return ax
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return links with the positions of both ends as variables over the dimension `link`."""
+        return links_dataset(self._links_with_devices(), self.origin)
+
+    def to_geodataframe(self) -> "GeoDataFrame":
+        """Return the links with a point at the end that moves, in metres of the local frame.
+
+        Raises:
+            BadInput: GeoPandas is not installed.
+        """
+        return links_table(self._links_with_devices(), self.origin)
+
+    def _links_with_devices(self) -> pd.DataFrame:
+        device = self.devices.iloc[self.device_index].reset_index(drop=True)
+        columns = {f"device_{name}": device[name] for name in _DEVICE_POSITION}
+        return self.table.reset_index(drop=True).assign(role=device["role"], **columns)
+
+    def __len__(self) -> int:
+        """Return the number of links."""
+        return len(self.table)
+
+    def __bool__(self) -> bool:
+        return True
+
+    def __repr__(self) -> str:
+        return self._summary.text()
+
+    def _repr_html_(self) -> str:
+        return self._summary.html()
+
+    @property
+    def _summary(self) -> Summary:
+        seen = np.isfinite(self.level_db)
+        known = self.level_db[seen]
+        unit = "dB" if self.level_column == "gain_db" else "dBm"
+        levels = span(float(known.min()), float(known.max()), unit) if len(known) else "–"
+        anchors, receivers = int(self.is_anchor.sum()), self.table["receiver"].unique()
+        missed = f"{1 - seen.mean():.1%}" if len(seen) else "–"
+        return Summary(
+            "Measurements", f"{count(len(self), 'link')}, {count(len(receivers), 'receiver')}, "
+            f"{count(len(self.devices), 'device')}, {count(len(self.flights), 'flight')}, "
+            f"{self.level_column} {levels}, {missed} not detected", (
+                ("links", f"{len(self):,}"), ("flights", some(self.flights)),
+                ("receivers", some(receivers)), ("devices", some(self.devices["device"])),
+                ("of these", count(anchors, "anchor")), (self.level_column, levels),
+                ("not detected", missed),
+                ("origin", "not known" if self.origin is None else place(self.origin))))
 
     def _check_frame(self, folder: Path) -> None:
         """Refuse a folder whose tables are in another frame."""
@@ -211,7 +298,7 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
         BadInput: names file, row and column of the first value that cannot be used.
     """
     path = Path(path)
-    table = _read_table(path, REQUIRED, OPTIONAL + LEVELS, _MAY_BE_EMPTY)
+    table = read_columns(path, REQUIRED, OPTIONAL + LEVELS, _MAY_BE_EMPTY)
     levels = [name for name in LEVELS if name in table]
     if len(levels) != 1:
         raise BadInput(f"{path}: needs exactly one of the columns {LEVELS}, it has "
@@ -255,7 +342,7 @@ def read_devices(path: Path | str) -> pd.DataFrame:
         BadInput: names file, row and column of the first value that cannot be used.
     """
     path = Path(path)
-    devices = _read_table(path, DEVICE_REQUIRED, DEVICE_OPTIONAL, _DEVICE_MAY_BE_EMPTY)
+    devices = read_columns(path, DEVICE_REQUIRED, DEVICE_OPTIONAL, _DEVICE_MAY_BE_EMPTY)
     if devices.empty:
         raise BadInput(f"{path}: has no rows; it needs one for each device")
     DEVICES.check(len(devices), path)
@@ -281,88 +368,6 @@ def _moved(table: pd.DataFrame, columns: list[str],
            position_m: Callable[[np.ndarray], np.ndarray]) -> pd.DataFrame:
     moved_m = position_m(table[columns].to_numpy(dtype=float))
     return table.assign(**dict(zip(columns, moved_m.T)))
-
-
-def _read_table(path: Path, required: list[str], optional: list[str],
-                may_be_empty: set[str]) -> pd.DataFrame:
-    table = read_cells(path, required, optional)
-    for name in table.columns:
-        if name in _TEXT:
-            table[name] = _names(path, name, table[name])
-        else:
-            cells = table[name]
-            table[name] = _numbers(path, name, cells, name in may_be_empty)
-            refuse_limits(partial(refuse, path, name, cells), name, table[name].to_numpy())
-    return table
-
-
-def _names(path: Path, name: str, column: pd.Series) -> pd.Series:
-    """Return the names in a column without spaces around them."""
-    names = column.astype(str).str.strip()
-    faults = {text: fault for text in names.unique() if (fault := name_fault(text))}
-    for text, fault in faults.items():
-        refuse(path, name, names, names == text, fault)
-    return names
-
-
-def _numbers(path: Path, name: str, column: pd.Series, may_be_empty: bool) -> pd.Series:
-    """Convert the cells of a column, NaN where empty."""
-    needed = "every row needs one: fill it in, or leave the row out"
-    if column.dtype.kind in "fiu":
-        numbers, empty = column.astype(float), column.isna()
-    else:
-        text = column.fillna("").astype(str).str.strip()
-        empty = text == ""
-        numbers = pd.Series(as_numbers(text), index=column.index)
-        named_nan = numbers.isna() & ~empty
-        named_nan[named_nan] = text[named_nan].str.lower().isin(["nan", "na", "none"])
-        refuse(path, name, column, numbers.isna() & ~empty & ~named_nan, "is not a number")
-        remedy = "leave the cell empty where there is no value" if may_be_empty else needed
-        refuse(path, name, column, named_nan, f"is not a number; {remedy}")
-    remedy = "; leave the cell empty where nothing was detected" if name in LEVELS else ""
-    refuse(path, name, column, np.isinf(numbers), f"is not finite{remedy}")
-    if not may_be_empty:
-        refuse(path, name, column, empty, f"is empty; {needed}")
-    return numbers
-
-
-def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
-                  numbers: np.ndarray) -> None:
-    """Refuse numbers of a column that can only be mistakes, such as a wrong unit.
-
-    Args:
-        refuse: called with (n,) bool and the reason; raises where one is true.
-        name: of the column, as in `measurements.csv` or `devices.csv`.
-        numbers: (n,) in its unit; NaN where empty.
-    """
-    if name in LEVELS:
-        refuse(np.abs(numbers) > MAX_LEVEL_DB,
-               f"is no level; allowed are -{MAX_LEVEL_DB:g} to {MAX_LEVEL_DB:g}")
-    if name == "gain_db":
-        refuse(numbers > 0,
-               "is above 0 dB, which no channel gain is; received power [dBm] goes into a column "
-               "rssi_dbm, and a path loss needs a minus sign")
-    if name == "frequency_hz":
-        low, high = FREQUENCIES_HZ
-        refuse((numbers < low) | (numbers > high),
-               f"is no frequency; allowed are {low:g} to {high:g} Hz; the unit is Hz")
-    if name.endswith("_m"):
-        refuse(np.abs(numbers) > MAX_COORDINATE_M,
-               f"is too far away; allowed are -{MAX_COORDINATE_M:g} to {MAX_COORDINATE_M:g} m in "
-               "the scene's frame")
-    if name == "time_s":
-        refuse(np.abs(numbers) > MAX_TIME_S,
-               f"is no time; allowed are -{MAX_TIME_S:g} to {MAX_TIME_S:g} s; the unit is s, not "
-               "ms")
-        if np.isfinite(numbers).any():
-            refuse(numbers - np.nanmin(numbers) > MAX_SPAN_S,
-                   f"is more than a century ({MAX_SPAN_S:g} s) after the first time, "
-                   f"{np.nanmin(numbers):g} s; is one of them wrong, or in another unit?")
-    for ending, limit in (("_deg", MAX_ANGLE_DEG), ("tx_power_dbm", MAX_POWER_DBM),
-                          ("quality", MAX_QUALITY)):
-        if name.endswith(ending):
-            refuse(np.abs(numbers) > limit,
-                   f"is out of range; allowed are -{limit:g} to {limit:g}")
 
 
 def _check_spread(path: Path, table: pd.DataFrame, devices_path: Path,

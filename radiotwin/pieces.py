@@ -156,6 +156,27 @@ class PieceStore:
             self._bytes -= size
 
 
+def cache_content() -> dict[str, Any]:
+    """Return what is kept of finished and of killed runs.
+
+    Returns:
+        `folder`, `bytes`, `limit_bytes`, and `parts`: kind -> `parts` (their number) and `bytes`.
+    """
+    store = PieceStore(pieces_folder())
+    by_kind: dict[str, dict[str, int]] = {}
+    for _, size, path in sorted(store.files(), key=lambda file: file[2].name):
+        kind = by_kind.setdefault(path.stem.rpartition("-")[0], {"parts": 0, "bytes": 0})
+        kind["parts"] += 1
+        kind["bytes"] += size
+    return {"folder": str(store.folder), "bytes": sum(each["bytes"] for each in by_kind.values()),
+            "limit_bytes": CACHE_BYTES.limit, "parts": by_kind}
+
+
+def clear_cache() -> int:
+    """Remove all that is kept of finished and of killed runs; return the number of parts."""
+    return PieceStore(pieces_folder()).clear()
+
+
 _stores: list[PieceStore] = []  # the last one is in use
 
 

@@ -4,15 +4,18 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import xarray as xr
 
 from radiotwin.budgets import DEVICES, MAP_AXIS
+from radiotwin.display.style import GAIN_COLOURS, level_range_db, plain
+from radiotwin.display.summary import Summary, count, some, span
 from radiotwin.errors import BadInput
 from radiotwin.hdf5 import check_hdf5
 from radiotwin.inputs import open_input
+from radiotwin.map_difference import MapDifference
 from radiotwin.map_file import (
     ATTRIBUTES,
     DIMS,
@@ -26,9 +29,15 @@ from radiotwin.map_file import (
     without_cf,
     write_blocks,
 )
-from radiotwin.measurements import MAX_COORDINATE_M
+from radiotwin.map_view import map_table, origin_of, pick, plot_values
+from radiotwin.measurement_columns import MAX_COORDINATE_M
+from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
 from radiotwin.tables import MAX_NAME, Origin
+
+if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
+    from matplotlib.axes import Axes
 
 _VARIABLES = ("gain_db", "los", "sigma_db")
 MIN_STEP_M = 1e-3
@@ -84,11 +93,11 @@ class RadioMap:
                                          for name, array in arrays.items()}))
 
     @classmethod
-    def read(cls, path: Path | str) -> "RadioMap":
+    def load(cls, path: Path | str) -> "RadioMap":
         """Read a NetCDF-4 file.
 
         Args:
-            path: of the file, as `write` makes it.
+            path: of the file, as `save` makes it.
 
         Raises:
             BadInput: no such file, not NetCDF-4, or not a radio map.
@@ -116,7 +125,9 @@ class RadioMap:
         dataset["los"] = dataset["los"].astype(bool)
         return cls(without_cf(dataset.drop_encoding()))
 
-    def write(self, path: Path | str) -> None:
+    read = load  # the name of version 0.1
+
+    def save(self, path: Path | str) -> None:
         """Write compressed NetCDF-4 by the CF conventions, atomically.
 
         Args:
@@ -128,6 +139,88 @@ class RadioMap:
         """
         dtypes = {name: self.dataset[name].dtype for name in self.variables}
         write_blocks(self.header, dtypes, self.blocks(), path)
+
+    write = save  # the name of version 0.1
+
+    def plot(self, device: str | None = None, altitude_m: float | None = None,
+             ax: "Axes | None" = None, *, scene: Scene | None = None,
+             geographic: bool | None = None) -> "Axes":
+        """Draw the gain of one device at one altitude; white where it is not detected.
+
+        Args:
+            device: name; None: the first one.
+            altitude_m: one of the map's [m]; None: the lowest.
+            ax: axes of matplotlib to draw into; None: a new figure.
+            scene: whose buildings are outlined; None: none are.
+            geographic: whether axes are longitude and latitude; None: where the origin is known.
+
+        Returns:
+            The axes.
+
+        Raises:
+            BadInput: no such device or altitude, or longitude and latitude without an origin.
+        """
+        device, altitude_m, part = pick(self.dataset, device, altitude_m)
+        low_db, high_db = level_range_db(part["gain_db"].values)
+        ax = plot_values(part["gain_db"], self.origin, ax, geographic, scene, device,
+                         "channel gain [dB]", "both", cmap=GAIN_COLOURS, vmin=low_db,
+                         vmax=high_db)
+        source = plain(str(self.attributes.get("source", ""))) or "radio map"
+        ax.set_title(f"{source}: device {plain(device)} at {altitude_m:g} m")
+        return ax
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return a copy of the dataset."""
+        return self.dataset.copy(deep=True)
+
+    def to_geodataframe(self) -> "GeoDataFrame":
+        """Return a row with a point for each device and position, in metres of the local frame.
+
+        Raises:
+            BadInput: GeoPandas is not installed.
+        """
+        return map_table(self.dataset, self.variables, self.origin)
+
+    def __sub__(self, other: "RadioMap") -> MapDifference:
+        """Return the difference of the gains, see `MapDifference`.
+
+        Raises:
+            BadInput: other devices, other positions, or another frame.
+        """
+        if not isinstance(other, RadioMap):
+            return NotImplemented
+        return MapDifference.of(self.dataset, other.dataset)
+
+    def __len__(self) -> int:
+        """Return the number of devices."""
+        return self.dataset.sizes["device"]
+
+    def __repr__(self) -> str:
+        return self._summary.text()
+
+    def _repr_html_(self) -> str:
+        return self._summary.html()
+
+    @property
+    def _summary(self) -> Summary:
+        levels, rows, columns = self.lattice.shape
+        source = str(self.attributes.get("source", "")) or "unknown source"
+        size = f"{columns} × {rows} × {levels} positions (x, y, z)"
+        seen = np.isfinite(self.gain_db)
+        values_db = self.gain_db[seen]
+        gains = span(float(values_db.min()), float(values_db.max()), "dB") if seen.any() else "–"
+        origin = self.origin
+        frequency_hz = self.attributes.get("frequency_hz")
+        return Summary("RadioMap", f"{source}, {count(len(self), 'device')}, {size}, "
+                       f"{self.lattice.step_m:g} m apart, gain {gains}", (
+            ("source", source), ("devices", some(self.devices)), ("lattice", size),
+            ("step", f"{self.lattice.step_m:g} m"),
+            ("altitudes", some(f"{z:g}" for z in self.lattice.z_m) + " m"),
+            ("frequency", "–" if frequency_hz is None else f"{frequency_hz / 1e9:g} GHz"),
+            ("gain", gains), ("without a gain", f"{1 - seen.mean():.1%}"),
+            ("standard deviation", "sigma_db" if "sigma_db" in self.variables else "none"),
+            ("origin", "not known" if origin is None else
+             f"latitude {origin.latitude_deg:g}°, longitude {origin.longitude_deg:g}°")))
 
     def blocks(self) -> Iterator[MapBlock]:
         """Return the map in parts, as `MapStream.blocks` makes them."""
@@ -160,6 +253,11 @@ class RadioMap:
     def attributes(self) -> dict[str, Any]:
         """Provenance."""
         return {str(name): value for name, value in self.dataset.attrs.items()}
+
+    @property
+    def origin(self) -> Origin | None:
+        """Of the local frame; None where it is not known."""
+        return origin_of(self.attributes)
 
     @property
     def variables(self) -> tuple[str, ...]:

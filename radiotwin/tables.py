@@ -1,9 +1,12 @@
 """Base classes of the tables in TOML files, which are validated when they are read."""
 
 import re
+from collections.abc import Sequence
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, Strict
+from pydantic import BaseModel, ConfigDict, Field, Strict, ValidationError
+
+from radiotwin.errors import BadInput
 
 MAX_COORDINATE_M = 1e6
 """Of the local frame [m]: beyond, single precision is coarser than a decimetre."""
@@ -52,3 +55,25 @@ class Origin(Table):
     latitude_deg: Number = Field(ge=-90, le=90)
     longitude_deg: Number = Field(ge=-180, le=180)
     altitude_m: Number = Field(0.0, ge=-12_000, le=100_000)
+
+
+def as_origin(value: Origin | Sequence[float] | None) -> Origin | None:
+    """Return the origin of a frame from numbers.
+
+    Args:
+        value: (latitude, longitude) [degrees] and optionally the altitude of the ground [m]; an
+            origin and None are returned as they are.
+
+    Raises:
+        BadInput: not two or three numbers, or a place that is not on the earth.
+    """
+    if value is None or isinstance(value, Origin):
+        return value
+    if len(value) not in (2, 3):
+        raise BadInput(f"origin {value!r} is not two or three numbers; give LATITUDE,LONGITUDE or "
+                       "LATITUDE,LONGITUDE,ALTITUDE in degrees and metres")
+    try:
+        return Origin.model_validate(dict(zip(Origin.model_fields, map(float, value))))
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise BadInput(f"origin {value!r}: {first['loc'][0]}: {first['msg']}") from None

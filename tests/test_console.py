@@ -53,6 +53,21 @@ def test_messages_warnings_logs_and_tables(out, capsys, monkeypatch):
         assert SHOWN in text and not set(text) & set("\x1b\x07\x9b\x7f\r\u202e\u2066\u2028\udcff")
 
 
+def test_a_table_is_cut_nowhere(monkeypatch):
+    """In a pipe a line is as long as it needs to be; on a narrow terminal a cell goes on in its next line."""
+    words = ["a" * 70, "b" * 60]
+    for is_terminal in (False, True):
+        text = io.StringIO()
+        monkeypatch.setattr(console, "console", PrintableConsole(file=text, width=80, color_system=None,
+                                                                force_terminal=is_terminal))
+        print_rows("title", {"first": "left", "second": "left"}, [words])
+        assert "…" not in text.getvalue()
+        lines = text.getvalue().splitlines()
+        assert any(all(word in line for word in words) for line in lines) is not is_terminal
+        assert text.getvalue().count("a") == 70 and text.getvalue().count("b") == 60
+        assert max(map(len, lines)) <= 80 or not is_terminal
+
+
 def test_whatever_rich_prints(out):
     console.console.print(Panel(Text(HOSTILE)), Text(HOSTILE, style="bold"))
     assert "\x1b" not in out.getvalue() and out.getvalue().count("x9b31m") == 2

@@ -29,8 +29,9 @@ def untraced(monkeypatch):
 def printed():
     """Whether all is well, and the lines that `doctor.print_diagnosis` prints."""
     output = io.StringIO()
-    healthy = doctor.print_diagnosis(Console(file=output, width=40)).healthy
-    return healthy, output.getvalue().splitlines()
+    diagnosis = doctor.diagnose()
+    doctor.print_diagnosis(diagnosis, Console(file=output, width=40))
+    return diagnosis.healthy, output.getvalue().splitlines()
 
 
 def test_healthy_machine(untraced):

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from radiotwin.cli.model import check_scene
 from radiotwin.cli.options import (
     OnlyDevices,
     OptionalScene,
@@ -118,6 +117,7 @@ def _source(source: Path, scene: Path | None, model: str | None,
             ) -> "tuple[Twin | RadioMap | str, Scene]":
     """Return the twin, the radio map, or the name of the law; and the scene."""
     from radiotwin.radiomap import RadioMap
+    from radiotwin.report import check_map_place
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin
 
@@ -138,7 +138,7 @@ def _source(source: Path, scene: Path | None, model: str | None,
     if not is_map:
         return Twin.load(source), world
     radio_map = RadioMap.read(source)
-    check_scene(source, radio_map.attributes, world)
+    check_map_place(str(source), radio_map.attributes, world)
     return radio_map, world
 
 

@@ -47,40 +47,38 @@ def close_loop(
     They are added to the model, and the error before and after is reported.
     """
     from radiotwin.closeloop.corrected_scene import check_corrected_target, write_corrected_scene
-    from radiotwin.closeloop.corrected_twin import corrected_twin
-    from radiotwin.closeloop.residual_table import write_residuals
-    from radiotwin.closeloop.result_file import make_report, write_report
     from radiotwin.closeloop.run import close_loop as run
-    from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
     from radiotwin.pieces import keep_pieces
     from radiotwin.progress import progress
-    from radiotwin.report import closeloop_summary, write_closeloop_figures, write_closeloop_page
+    from radiotwin.report import (
+        check_closeloop_folder,
+        closeloop_summary,
+        write_closeloop_folder,
+    )
     from radiotwin.scene import Scene
-    from radiotwin.twin import check_twin_target
+    from radiotwin.twin.locate import NOT_BY_PATHS
 
     data = read_measurements(measurements, devices)
     world = Scene.load(scene) if scene else None
     data = in_frame_of(world, data, shift)
-    require_writable(out / "closeloop.json")
-    check_twin_target(out / "twin")
+    check_closeloop_folder(out)
     if write_scene is not None:
         check_corrected_target(write_scene, world, out)
-    inputs = {"inputs": {"measurements": str(measurements), "scene": scene and str(scene)}}
-    with keep_pieces() as pieces:
-        with progress("closing the loop", total=None) as advance:
-            loop = run(data, world, base, seed,
-                       lambda text: advance(1, "; ".join(filter(None, [text, pieces.progress]))),
-                       hold_out)
-            advance(1, "other models, and the combination of all")
-            report = make_report(loop) | inputs
-        write_closeloop_figures(loop, world, report, out)
+    if base == "raytrace":
+        notice(f"the twin will follow paths, {NOT_BY_PATHS}")
+    inputs = {"measurements": str(measurements), "scene": scene and str(scene)}
+    with keep_pieces() as pieces, progress("closing the loop", total=None) as advance:
+        loop = run(data, world, base, seed,
+                   lambda text: advance(1, "; ".join(filter(None, [text, pieces.progress]))),
+                   hold_out)
+        advance(1, "other models, and the combination of all")
+        report = write_closeloop_folder(loop, world, out, inputs=inputs,
+                                        title=f"Close-loop report of {measurements.name}")
     notice(pieces.progress)
-    write_report(report, out / "closeloop.json")
-    write_residuals(loop, out / "residuals.csv.gz")
-    corrected_twin(loop, world).save(out / "twin")
-    write_closeloop_page(report, out, f"Close-loop report of {measurements.name}")
     _print(report)
+    if base == "auto" and loop.base == "raytrace":
+        say(f"note: the twin's base is 'raytrace', {NOT_BY_PATHS}")
     say(closeloop_summary(report))
     say(f"wrote {out / 'closeloop.html'}")
     if write_scene is not None and world is not None:
@@ -131,23 +129,20 @@ def locate(
 
     It works with or without a 3D map.
     """
-    from radiotwin.alignment import in_known_frame
     from radiotwin.cells import write_csv
     from radiotwin.files import atomic_path, require_writable
     from radiotwin.measurements import read_devices, read_measurements
-    from radiotwin.progress import progress
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin
-    from radiotwin.twin.locate import locate_file, position_errors
+    from radiotwin.twin.locate import check_can_locate, locate_devices, position_errors
 
-    data, known = read_measurements(measurements, devices), Twin.load(twin)
-    world = Scene.load(scene) if scene else None
-    data = in_frame_of(world, in_known_frame(data, known.origin, "the twin"), shift)
+    known, world = Twin.load(twin), Scene.load(scene) if scene else None
+    check_can_locate(known, world)  # before a file is read that may be large
+    data = in_frame_of(world, read_measurements(measurements, devices), shift)
     true = read_devices(truth) if truth else None
     require_writable(out)
     unknown = int((data.devices["role"] == "unknown").sum())
-    with progress("locating", total=unknown) as advance:
-        positions, notes = locate_file(data, known, world, lambda: advance(1))
+    positions, notes = locate_devices(data, known, world)
     for note in notes:
         say(f"note: {note}")
     with atomic_path(out) as temporary:

@@ -1,9 +1,8 @@
 """The commands that learn from measurements and judge the result: fit, map, compare."""
 
 import os
-import warnings
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -22,10 +21,7 @@ from radiotwin.errors import BadInput
 
 if TYPE_CHECKING:
     from radiotwin.compare import Comparison
-    from radiotwin.scene import Scene
     from radiotwin.twin import TwinDevice
-
-MAX_ORIGIN_DIFFERENCE = 1e-6  # [degrees, or metres of altitude] of one place, after rounding
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -105,10 +101,8 @@ def map_(
 
     It holds the gain of every device over the scene's lattice.
     """
-    from radiotwin.export import EXPORTERS, check_format, select, write_map
-    from radiotwin.files import require_writable
     from radiotwin.radiomap import RadioMap
-    from radiotwin.report import write_picture
+    from radiotwin.report import check_map_target, export_map
     from radiotwin.scene import Scene
     from radiotwin.twin import Twin
 
@@ -117,41 +111,13 @@ def map_(
         raise BadInput(f"{twin} is a radio map already; give the file to write with --out")
     place = Path(os.path.realpath(twin))  # unlike resolve, it takes links in a circle
     out = out or place.with_name(f"{place.name}.nc")
-    exporters = EXPORTERS | {".png": write_picture}
     world = Scene.load(scene)
-    check_format(out, world, exporters)
-    require_writable(out)
-    radio_map = RadioMap.read(twin) if is_map else Twin.load(twin).map_stream(world)
-    if is_map:
-        check_scene(twin, radio_map.attributes, world)
-    radio_map = select(radio_map, split_names(devices), _altitudes(altitudes))
-    write_map(radio_map, world, out, exporters)
-    say(f"wrote {out}: {len(radio_map.devices)} devices on {radio_map.lattice.shape} positions "
+    check_map_target(out, world)
+    source = RadioMap.read(twin) if is_map else Twin.load(twin)
+    written = export_map(source, world, out, devices=split_names(devices),
+                         altitudes_m=_altitudes(altitudes), name=str(twin))
+    say(f"wrote {out}: {len(written.devices)} devices on {written.lattice.shape} positions "
         "(z, y, x)")
-
-
-def check_scene(path: Path, attributes: dict[Any, Any], scene: "Scene") -> None:
-    """Refuse a map of another city, which would get the outlines and the origin of this one.
-
-    Args:
-        path: of the map.
-        attributes: of the map.
-        scene: that is given with it.
-
-    Raises:
-        BadInput: their origins differ.
-    """
-    origin = scene.config.origin
-    for name, value in ({} if origin is None else origin.model_dump()).items():
-        of_map = attributes.get(f"origin_{name}", value)
-        if abs(of_map - value) > MAX_ORIGIN_DIFFERENCE:
-            raise BadInput(f"{path} is a map of another place: its origin's {name} is {of_map:g}, "
-                           f"that of {scene.folder} is {value:g}; give the scene that it was made "
-                           "for, or trace again")
-    if attributes.get("scene_hash") not in (None, scene.content_hash()):
-        warnings.warn(f"{path} was made for another scene than {scene.folder}, or that has changed "
-                      "since: outlines, devices and the origin are those of the scene",
-                      stacklevel=2)
 
 
 def _altitudes(text: str | None) -> list[float] | None:
@@ -188,29 +154,25 @@ def compare(
     Published laws that hold at the scene's frequency are among them, fitted to nothing.
     With --truth they are compared with the truth map, too.
     """
-    from radiotwin.compare import DEFAULT_MODELS, compare_models, published_models, split_flights
-    from radiotwin.comparison_output import judge_also, write_comparison
+    from radiotwin.compare import split_flights
+    from radiotwin.comparison_output import compare_held_out
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
     from radiotwin.pieces import keep_pieces
-    from radiotwin.report import write_comparison_figures
+    from radiotwin.report import write_comparison_folder
     from radiotwin.scene import Scene
     from radiotwin.survey import read_truth
 
     require_writable(out / "compare.json")
     world = Scene.load(scene)
     data = in_frame_of(world, read_measurements(measurements, devices), shift)
-    train, test = split_flights(data, held_out)
+    split_flights(data, held_out)  # refuses before a map is read
     truth_map = read_truth(world, truth) if truth else None
-    twins, maps = judge_also(also or [], truth_map, test.flights)
-    models = (*DEFAULT_MODELS, *published_models(world.config.radio.frequency_hz),
-              *["raytrace"] * raytrace)
     with keep_pieces() as pieces:
-        comparison = compare_models(train, test, world, truth_map, seed=seed, models=models,
-                                    twins=twins, maps=maps)
+        comparison = compare_held_out(data, world, truth_map, held_out=held_out, raytrace=raytrace,
+                                      also=also or [], seed=seed)
     notice(pieces.progress)
-    write_comparison(comparison, world, out)
-    write_comparison_figures(comparison, world, truth_map, out)
+    write_comparison_folder(comparison, world, out, truth_map)
     print_comparison(comparison)
     say(f"wrote {out}")
 

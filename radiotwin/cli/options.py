@@ -59,9 +59,7 @@ def parse_origin(text: str | None) -> "Origin | None":
     Raises:
         BadInput: anything else, or a place that is not on the earth.
     """
-    from pydantic import ValidationError
-
-    from radiotwin.tables import Origin
+    from radiotwin.tables import as_origin
 
     if text is None:
         return None
@@ -70,10 +68,9 @@ def parse_origin(text: str | None) -> "Origin | None":
         raise BadInput(f"--origin {text!r} is not two or three numbers; give LATITUDE,LONGITUDE or "
                        "LATITUDE,LONGITUDE,ALTITUDE in degrees and metres")
     try:
-        return Origin.model_validate(dict(zip(Origin.model_fields, values)))
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise BadInput(f"--origin {text!r}: {first['loc'][0]}: {first['msg']}") from None
+        return as_origin(values)
+    except BadInput as error:
+        raise BadInput(f"--{error}") from None
 
 
 def in_frame_of(scene: "Scene | None", measurements: "Measurements",

@@ -1,17 +1,23 @@
-"""The commands that build scenes and export them: build-scene, export-scene."""
+"""The commands that build scenes and export: build-scene, export-scene, export."""
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
-from radiotwin.cli.options import SceneFolder, parse_bounds, parse_numbers, parse_origin
+from radiotwin.cli.options import (
+    OnlyDevices,
+    PointsFile,
+    SceneFolder,
+    SceneOption,
+    parse_bounds,
+    parse_numbers,
+    parse_origin,
+    split_names,
+)
 from radiotwin.console import console, result, say
 from radiotwin.errors import BadInput
-
-if TYPE_CHECKING:
-    from radiotwin.scene.report import BuildReport
 
 Bounds = tuple[float, float, float, float]
 
@@ -20,6 +26,7 @@ def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module to the app."""
     app.command("build-scene")(build_scene)
     app.command("export-scene")(export_scene)
+    app.command("export")(export)
 
 
 def build_scene(
@@ -74,25 +81,20 @@ def build_scene(
 
     A report lists its contents and all problems that were found.
     """
-    from radiotwin.footprints import map_suffix
+    from radiotwin.build import build_scene as build
     from radiotwin.scene.report import print_report
 
-    common = _given(frequency_hz=frequency_hz, devices=devices, uavs=uavs, seed=seed,
-                    origin=parse_origin(origin), step_m=step,
-                    altitudes_m=None if altitudes is None else
-                    tuple(parse_numbers("--altitudes", altitudes)),
-                    extent_m=None if extent is None else parse_bounds("--extent", extent))
-    of_cities = _given(scale=scale, up=up)
-    of_maps = _given(height_default=height_default, material_table=material_table,
-                     overpass=overpass or None)
-    pairs, bounds = _pairs(material or []), _bounds(bbox)
-    if map_suffix(source):
-        _refuse(of_cities, f"{source} is a map")
-        report = _build_from_map(source, out, common, pairs, bounds, of_maps, check)
-    else:
-        _refuse(of_maps, f"{source} is not a map (.osm, .osm.pbf, .geojson, .gpkg)")
-        options = common | of_cities | _given(materials=pairs or None, bbox=bounds)
-        report = _build_from_city(source, out, options, check)
+    report = build(source, out, frequency_hz=frequency_hz, materials=_pairs(material or []),
+                   bbox=_bounds(bbox), devices=devices, uavs=uavs, seed=seed,
+                   origin=parse_origin(origin), scale=scale, up=up,
+                   default_height_m=height_default, material_table=material_table,
+                   overpass=overpass, step_m=step,
+                   altitudes_m=None if altitudes is None else
+                   parse_numbers("--altitudes", altitudes),
+                   extent_m=None if extent is None else parse_bounds("--extent", extent),
+                   check_only=check)
+    if overpass:
+        say(f"wrote {source} (© OpenStreetMap contributors, ODbL)")
     print_report(report, console)
     result("scene", asdict(report))
     if report.folder:
@@ -116,61 +118,33 @@ def export_scene(
     say(f"wrote {out}" + (f": {', '.join(_content(out))}" if out.is_dir() else ""))
 
 
-def _build_from_city(source: str, out: Path | None, options: dict[str, Any],
-                     check: bool) -> "BuildReport":
-    from radiotwin.scene.build import BuildOptions
-    from radiotwin.scene.build import build_scene as build
-    from radiotwin.scene.presets import build_preset_scene
-    from radiotwin.scene.sources import scene_name
+def export(
+    source: Annotated[Path, typer.Argument(
+        metavar="TWIN", help="Folder of a twin, or a radio map (.nc) whose lattice has the "
+                             "points.")],
+    scene: SceneOption,
+    points: PointsFile,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for nodes.csv and losses.csv.")],
+    to: Annotated[str, typer.Option("--to", help="Program to write for: ns3.")] = "ns3",
+    devices: OnlyDevices = None,
+) -> None:
+    """Write the losses between devices and points for a network simulator.
 
-    if source.startswith("preset:"):
-        if options:
-            raise BadInput(f"{source} is built as it is published; the option for "
-                           f"{', '.join(options)} cannot be used with it. Build it without, then "
-                           "change scene.toml")
-        name = source.removeprefix("preset:")
-        return build_preset_scene(name, out or Path("scenes") / name, check_only=check)
-    out = out or Path("scenes") / scene_name(source)
-    return build(source, out, BuildOptions(**options), check_only=check)
+    One loss for each pair: nothing moves.
+    """
+    from radiotwin.point_gains import export_ns3
+    from radiotwin.radiomap import RadioMap
+    from radiotwin.scene import Scene
+    from radiotwin.trace import read_points
+    from radiotwin.twin import Twin
 
-
-def _build_from_map(source: str, out: Path | None, common: dict[str, Any], pairs: dict[str, str],
-                    bbox_deg: Bounds | None, of_maps: dict[str, Any], check: bool) -> "BuildReport":
-    from radiotwin.footprints import (
-        MapOptions,
-        build_scene_from_map,
-        map_name,
-        read_material_table,
-        with_pairs,
-    )
-    from radiotwin.footprints.material_table import STANDARD
-    from radiotwin.footprints.overpass import download_osm
-    from radiotwin.scene.build import BuildOptions
-
-    table = STANDARD
-    if "material_table" in of_maps:
-        table = read_material_table(of_maps["material_table"])
-    height_m = of_maps.get("height_default", 10.0)
-    options = MapOptions(bbox_deg, height_m, with_pairs(table, pairs))
-    options.check()
-    if "overpass" in of_maps:
-        if bbox_deg is None:
-            raise BadInput("--overpass downloads an area; give it with --bbox "
-                           "SOUTH,WEST,NORTH,EAST")
-        download_osm(Path(source), bbox_deg)
-        say(f"wrote {source} (© OpenStreetMap contributors, ODbL)")
-    out = out or Path("scenes") / map_name(source)
-    return build_scene_from_map(source, out, options, BuildOptions(**common), check)
-
-
-def _given(**options: Any) -> dict[str, Any]:
-    return {name: value for name, value in options.items() if value is not None}
-
-
-def _refuse(options: dict[str, Any], reason: str) -> None:
-    if options:
-        names = ", ".join("--" + name.replace("_", "-") for name in options)
-        raise BadInput(f"{reason}: {names} cannot be used with it; leave it out")
+    if to != "ns3":
+        raise BadInput(f"--to {to!r} is unknown; allowed is ns3")
+    world = Scene.load(scene)
+    model = RadioMap.load(source) if source.suffix == ".nc" else Twin.load(source)
+    pairs = export_ns3(model, world, read_points(points, world.config.origin), out,
+                       devices=split_names(devices))
+    say(f"wrote {out / 'nodes.csv'}, {out / 'losses.csv'}: {pairs:,} pairs of a device and a point")
 
 
 def _content(folder: Path) -> list[str]:

@@ -44,9 +44,11 @@ def doctor() -> None:
 
     Each problem comes with its remedy.
     """
-    from radiotwin.doctor import print_diagnosis
+    from radiotwin.doctor import diagnose, print_diagnosis
 
-    diagnosis = print_diagnosis(console)
+    with console.status("checking this machine"):
+        diagnosis = diagnose()
+    print_diagnosis(diagnosis, console)
     result("doctor", {"healthy": diagnosis.healthy, **asdict(diagnosis)})
     if not diagnosis.healthy:
         raise typer.Exit(1)
@@ -61,19 +63,15 @@ def cache(
     where it was. The folder is that of the environment variable RADIOTWIN_CACHE, and the oldest
     parts are removed when there are more bytes than RADIOTWIN_MAX_CACHE_BYTES.
     """
-    from radiotwin.budgets import CACHE_BYTES
-    from radiotwin.pieces import PieceStore, pieces_folder
+    from radiotwin.pieces import cache_content, clear_cache
 
-    store = PieceStore(pieces_folder())
-    by_kind: dict[str, list[int]] = {}
-    for _, size, path in store.files():
-        by_kind.setdefault(path.stem.rpartition("-")[0], []).append(size)
-    total = sum(map(sum, by_kind.values()))
-    result("cache", {"folder": str(store.folder), "bytes": total, "limit_bytes": CACHE_BYTES.limit,
-                     "parts": {kind: len(sizes) for kind, sizes in sorted(by_kind.items())}})
-    if by_kind:
-        rows = [[kind, len(sizes), sum(sizes) / 1e6] for kind, sizes in sorted(by_kind.items())]
+    content = cache_content()
+    parts = content["parts"]
+    result("cache", content | {"parts": {kind: each["parts"] for kind, each in parts.items()}})
+    if parts:
+        rows = [[kind, each["parts"], each["bytes"] / 1e6] for kind, each in parts.items()]
         print_rows("Finished parts", {"of": "left", "parts": "right", "size [MB]": "right"}, rows)
-    say(f"{store.folder}: {total / 1e6:.1f} MB of at most {CACHE_BYTES.limit / 1e6:,.0f} MB")
+    say(f"{content['folder']}: {content['bytes'] / 1e6:.1f} MB of at most "
+        f"{content['limit_bytes'] / 1e6:,.0f} MB")
     if clear:
-        say(f"removed {store.clear():,} parts")
+        say(f"removed {clear_cache():,} parts")

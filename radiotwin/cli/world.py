@@ -50,12 +50,12 @@ def trace(
     A killed run is resumed, a finished one is reused.
     """
     from radiotwin.scene import Scene
-    from radiotwin.trace import trace_map
+    from radiotwin.trace import trace_map, truth_path
 
     scene, names = Scene.load(folder), split_names(devices)
     settings = _settings(scene, scene.lattice.positions_m, names, quality, target_db, solver=solver,
                          combining=combining, seed=seed)
-    out = out or folder / ("-".join(["truth", *(names or [])])[:100] + ".nc")
+    out = out or truth_path(scene, names)
     facts = trace_map(scene, settings, out, names).dataset.attrs
     say(f"wrote {out}: {facts['links']} links, {facts['links_detected']} detected, "
         f"{facts['links_below_sensitivity']} below sensitivity, {facts['links_without_path']} "
@@ -170,8 +170,8 @@ def survey(
     pattern: Annotated[str, typer.Option(
         help="random-waypoint, lawnmower or random-walk.")] = "random-waypoint",
     noise_db: Annotated[float | None, typer.Option(
-        help="Standard deviation of the receivers' error [1; 0 for --truth segmented, which has "
-             "shadowing of its own].")] = None,
+        help="Standard deviation of the receivers' error [1; 0 where the truth has "
+             "shadowing of its own, as segmented has].")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of paths and noise.")] = 0,
 ) -> None:
     """Fly the scene's UAVs through a truth map.
@@ -182,8 +182,6 @@ def survey(
     from radiotwin.survey import fly_survey, read_truth
 
     scene = Scene.load(folder)
-    if noise_db is None:
-        noise_db = 0.0 if truth == "segmented" else 1.0
     measurements = fly_survey(scene, read_truth(scene, truth), flights=flights, pattern=pattern,
                               seed=seed, noise_db=noise_db)
     measurements.write(out)

@@ -21,9 +21,9 @@ from radiotwin.files import atomic_folder, require_writable
 from radiotwin.inputs import is_within
 from radiotwin.links import site_of
 from radiotwin.scene import Scene
-from radiotwin.scene.build import SCENE_FILES, check_target
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import SceneConfig, write_config
+from radiotwin.scene.folder import SCENE_FILES, check_target
 from radiotwin.scene.materials import itu_material, traceable
 from radiotwin.scene.names import unique_name
 from radiotwin.scene.preview import draw_preview

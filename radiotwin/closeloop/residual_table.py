@@ -1,13 +1,10 @@
-"""Write the held-out residuals of all links, before and after, as a table."""
-
-from pathlib import Path
+"""The held-out residuals of all links of a close-loop, before and after."""
 
 import numpy as np
 import pandas as pd
 
-from radiotwin.cells import write_csv
+from radiotwin.closeloop.residuals import Residuals
 from radiotwin.closeloop.run import Loop
-from radiotwin.files import atomic_path
 
 
 def residual_table(loop: Loop) -> pd.DataFrame:
@@ -36,7 +33,6 @@ def residual_table(loop: Loop) -> pd.DataFrame:
         "after_db": after_db})
 
 
-def write_residuals(loop: Loop, path: Path) -> None:
-    """Write `residuals.csv.gz`, completely or not at all."""
-    with atomic_path(path) as temporary:
-        write_csv(residual_table(loop), temporary, "%.4f")
+def residuals(loop: Loop) -> Residuals:
+    """Return the held-out residuals of a close-loop, see `residual_table`."""
+    return Residuals(residual_table(loop), loop.origin)

@@ -27,6 +27,7 @@ from radiotwin.closeloop.residual_tests import ResidualDependence, residual_depe
 from radiotwin.closeloop.selection import SelectionResult, add_shadowing, forward_selection
 from radiotwin.closeloop.sensitivity import Detectable, detectable
 from radiotwin.closeloop.thinning import thin_links
+from radiotwin.display.summary import Summary, count, some
 from radiotwin.effects.params import Parameter
 from radiotwin.effects.registry import catalogue
 from radiotwin.effects.unexplained_trend import UnexplainedTrend
@@ -102,6 +103,22 @@ class Loop:
             return "unexplained"
         sure = step.probabilities[NONE] >= self.criteria.min_probability
         return "none" if sure else "undecided"
+
+    def __repr__(self) -> str:
+        return self._summary.text()
+
+    def _repr_html_(self) -> str:
+        return self._summary.html()
+
+    @property
+    def _summary(self) -> Summary:
+        names = some(each.effect.name for each in self.after.whole.effects) or "no effect"
+        error = f"RMSE {self.before.rmse_db():.2f} dB before, {self.after.rmse_db():.2f} dB after"
+        return Summary("Loop", f"verdict {self.verdict}: {names}, base {self.base}, {error}", (
+            ("verdict", self.verdict), ("effects", names), ("base", self.base),
+            ("error on held-out links", error),
+            ("held out", f"by {self.folds.by}, {count(self.folds.count, 'fold')}"),
+            ("links", f"{len(self.links):,}")))
 
     @cached_property
     def prediction(self) -> CombinedPrediction:

@@ -15,7 +15,7 @@ from radiotwin.errors import BadInput
 from radiotwin.frames import between_frames, is_same_frame, read_frame
 from radiotwin.geodesy import to_local
 from radiotwin.inputs import require_within
-from radiotwin.measurements import refuse_limits
+from radiotwin.measurement_columns import refuse_limits
 from radiotwin.scene import Scene
 from radiotwin.tables import name_fault
 

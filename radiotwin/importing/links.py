@@ -14,7 +14,7 @@ from radiotwin.importing.settings import POSITION, Settings, Wide
 from radiotwin.importing.source import Source
 from radiotwin.importing.tally import Tally
 from radiotwin.importing.times import calendar_days, seconds
-from radiotwin.measurements import refuse_limits
+from radiotwin.measurement_columns import refuse_limits
 from radiotwin.tables import name_fault
 
 ANGLES = ("heading", "pitch", "roll")

@@ -12,7 +12,8 @@ from radiotwin.importing.lengths import METRES, in_metres
 from radiotwin.importing.links import LIMITS_DEG
 from radiotwin.importing.settings import POSITION, Settings, check_position
 from radiotwin.importing.source import Source, read_source
-from radiotwin.measurements import DEVICE_OPTIONAL, refuse_limits
+from radiotwin.measurement_columns import refuse_limits
+from radiotwin.measurements import DEVICE_OPTIONAL
 
 
 def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:

@@ -11,7 +11,8 @@ from radiotwin.importing.position_table import read_positions
 from radiotwin.importing.settings import POSITION, Settings
 from radiotwin.importing.source import Source
 from radiotwin.importing.tally import Tally
-from radiotwin.measurements import DEVICE_OPTIONAL, MAX_COORDINATE_M
+from radiotwin.measurement_columns import MAX_COORDINATE_M
+from radiotwin.measurements import DEVICE_OPTIONAL
 
 MOVING_M = 1.0  # a device whose positions differ by more than this is not at rest
 

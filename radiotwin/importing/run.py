@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +18,10 @@ from radiotwin.importing.links import build_links
 from radiotwin.importing.positions import PositionedLinks, add_positions
 from radiotwin.importing.report import make_report
 from radiotwin.importing.settings import Settings
-from radiotwin.importing.settings_file import write_settings
+from radiotwin.importing.settings_file import read_settings, write_settings
 from radiotwin.importing.source import Source, read_source
 from radiotwin.importing.tally import Tally
-from radiotwin.measurements import OPTIONAL, REQUIRED, Measurements
+from radiotwin.measurements import OPTIONAL, REQUIRED, Measurements, read_measurements
 from radiotwin.tables import Origin
 
 HASHED_AT_ONCE = 500_000  # rows; bounds the memory of that
@@ -85,6 +85,34 @@ def import_file(path: Path | str, settings: Settings, out: Path | str, compress:
         text = json.dumps(report, indent=1, ensure_ascii=False)
         (folder / "import.json").write_text(text + "\n", "utf-8")
     return report
+
+
+def import_measurements(path: Path | str, out: Path | str,
+                        columns: Mapping[str, str] | Path | str | None = None, *,
+                        compress: bool = False,
+                        on_progress: Callable[[str], None] = lambda step: None,
+                        **settings: Any) -> Measurements:
+    """Import a file of measurements into a folder, and return them.
+
+    Args:
+        path: `.csv`, `.csv.gz`, `.parquet` or `.geojson`.
+        out: folder, see `import_file`; its `import.json` counts what was left out.
+        columns: column of each quantity, such as `{"latitude": "lat", "level": "rsrp"}`; or a TOML
+            file with these and all other settings.
+        compress: write `measurements.csv.gz` instead of `measurements.csv`.
+        on_progress: called with the name of each step.
+        settings: fields of `Settings`, such as `level_unit="dBm"`; they replace those of the file.
+
+    Raises:
+        BadInput: names file, row and column, or the setting; nothing is written.
+    """
+    path, out = Path(path), Path(out)
+    mapping = None if isinstance(columns, Mapping) else columns
+    given: dict[str, Any] = {"columns": columns} if isinstance(columns, Mapping) else {}
+    given |= {name: str(value) if isinstance(value, Path) else value
+              for name, value in settings.items()}
+    import_file(path, read_settings(mapping, given, path.parent), out, compress, on_progress)
+    return read_measurements(out / ("measurements.csv.gz" if compress else "measurements.csv"))
 
 
 def _check_target(out: Path) -> None:

@@ -97,7 +97,8 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
         leave_out(twice, "they are in the file twice")
     low_z = np.isnan(receiver_m[:, 2])
     if low_z.any() and scene is not None:
-        leave_out(low_z, "their receiver's height is empty, and the 3D map needs it")
+        leave_out(low_z, "their receiver's height is empty, and the 3D map needs it: fill in "
+                  "receiver_z_m, or import the file again with height=always 1.5")
     elif low_z.any():
         notes.append(f"{low_z.sum():,} receiver heights are empty and taken for "
                      f"{ASSUMED_HEIGHT_M} m")
@@ -152,7 +153,8 @@ def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | N
         level_db, np.full(len(level_db), -np.inf), receiver_m, device_m, device, receiver,
         flight, _column(table, "time_s"), heading_deg % 360,
         list(measurements.devices["device"].iloc[kept_devices]), list(receiver_names),
-        list(flight_names), _frequency_hz(measurements, scene), scene.city if scene else None,
+        list(flight_names), _frequency_hz(measurements, scene),
+        scene.city if scene is not None else None,
         is_gain, anchors, notes, _column(table, "pitch_deg"), _column(table, "roll_deg"),
         _column(table, "quality"))
     declared_db = None

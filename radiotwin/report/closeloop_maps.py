@@ -5,17 +5,12 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.figure import Figure
 
+from radiotwin.display.style import GAIN_COLOURS, RESIDUAL_COLOURS, residual_range_db
 from radiotwin.report.closeloop_data import EffectData, LoopData
 from radiotwin.report.effect_markers import mark
 from radiotwin.report.labels import join_names, name_label
 from radiotwin.report.map_background import MapBackground
-from radiotwin.report.style import (
-    GAIN_COLOURS,
-    RESIDUAL_COLOURS,
-    draw_legend_below,
-    new_figure,
-    residual_range_db,
-)
+from radiotwin.report.style import draw_legend_below, new_figure
 
 MAX_RAYS = 1500
 MIN_CONTRIBUTION_DB = 0.5  # links that an effect changes by less are not drawn

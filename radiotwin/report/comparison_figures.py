@@ -7,10 +7,11 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from radiotwin.compare import Comparison
+from radiotwin.display.style import plain
 from radiotwin.radiomap import RadioMap
 from radiotwin.report.labels import MODELS
 from radiotwin.report.map_figures import model_maps_figure, panels, true_positions_m
-from radiotwin.report.style import LOS_COLOUR, NLOS_COLOUR, plain, save
+from radiotwin.report.style import LOS_COLOUR, NLOS_COLOUR, save
 from radiotwin.scene import Scene
 from radiotwin.scene.preview import draw_heights, height_grid
 

@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from radiotwin.display.style import plain
 from radiotwin.report.binning import BinMeans, bin_index, bin_means
 from radiotwin.report.closeloop_data import EffectData
 from radiotwin.report.closeloop_maps import (
@@ -20,15 +21,7 @@ from radiotwin.report.closeloop_maps import (
 )
 from radiotwin.report.labels import parameter_label
 from radiotwin.report.map_background import MapBackground
-from radiotwin.report.style import (
-    AFTER,
-    BEFORE,
-    FITTED,
-    hide_spines,
-    new_figure,
-    plain,
-    shorten,
-)
+from radiotwin.report.style import AFTER, BEFORE, FITTED, hide_spines, new_figure, shorten
 
 BINS = 24
 MAX_BARS = 40

@@ -7,10 +7,11 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.patheffects import withStroke
 
+from radiotwin.display.style import plain
 from radiotwin.effects.removed_obstacle import buildings
 from radiotwin.report.closeloop_data import EffectData
 from radiotwin.report.labels import name_label
-from radiotwin.report.style import FOUND, plain
+from radiotwin.report.style import FOUND
 
 HALO = [withStroke(linewidth=2.5, foreground="white")]
 Label = tuple[str, np.ndarray]

@@ -22,7 +22,7 @@ from radiotwin.budgets import PICTURE_BYTES, PICTURE_PIXELS
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_file
 from radiotwin.inputs import read_bytes, require_within
-from radiotwin.report.texts import shown, shown_data
+from radiotwin.texts import shown, shown_data
 
 MAX_ROWS = 5000  # of a table
 MAX_NOTES = 200

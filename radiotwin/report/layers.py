@@ -4,11 +4,11 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.compare import comparable_db
-from radiotwin.measurements import MAX_COORDINATE_M
+from radiotwin.display.style import level_range_db, residual_range_db
+from radiotwin.measurement_columns import MAX_COORDINATE_M
 from radiotwin.radiomap import RadioMap
 from radiotwin.report.packing import pack, pack_db, pack_m
 from radiotwin.report.run_folder import TRUTH, Run
-from radiotwin.report.style import level_range_db, residual_range_db
 
 # More would make the page too large for a browser; then every n-th is taken, and a note is added.
 MAX_VALUES = 2_000_000  # of all maps together, 2 bytes each

@@ -8,16 +8,10 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
 from radiotwin.compare import comparable_db
+from radiotwin.display.style import DIFFERENCE_COLOURS, GAIN_COLOURS, level_range_db, plain
 from radiotwin.radiomap import RadioMap
 from radiotwin.report.labels import MODELS
-from radiotwin.report.style import (
-    DIFFERENCE_COLOURS,
-    GAIN_COLOURS,
-    level_range_db,
-    new_figure,
-    plain,
-    save,
-)
+from radiotwin.report.style import new_figure, save
 from radiotwin.scene import Scene
 from radiotwin.scene.preview import height_grid
 

@@ -18,7 +18,7 @@ from radiotwin.inputs import is_within, require_within
 from radiotwin.measurements import read_measurements
 from radiotwin.radiomap import RadioMap
 from radiotwin.records import Record, read_record, validated
-from radiotwin.report.run_tables import PLANNING, POSITION, RESIDUALS, TRACK, read_table
+from radiotwin.run_tables import PLANNING, POSITION, RESIDUALS, TRACK, read_table
 from radiotwin.scene import Scene
 from radiotwin.survey import segmented_truth
 from radiotwin.twin import Twin

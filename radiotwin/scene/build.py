@@ -1,8 +1,7 @@
 """Any Mitsuba or Sionna RT city into a checked scene folder that needs nothing outside itself."""
 
-import os
 from collections import Counter
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from radiotwin.cells import write_csv
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder
 from radiotwin.geodesy import local_crs
-from radiotwin.inputs import is_within
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import (
@@ -25,6 +23,7 @@ from radiotwin.scene.config import (
     parse_config,
     write_config,
 )
+from radiotwin.scene.folder import check_target
 from radiotwin.scene.importer import ImportedCity, import_city
 from radiotwin.scene.material_mapping import settle
 from radiotwin.scene.materials import constants
@@ -48,7 +47,6 @@ from radiotwin.scene.writer import CityShape, write_city
 from radiotwin.tables import MAX_COORDINATE_M, Origin
 
 MIN_STEP_M = 0.01  # of a lattice
-SCENE_FILES = frozenset({"scene.toml", "city.xml", "meshes", "preview.png", "buildings.csv"})
 
 
 @dataclass(frozen=True)
@@ -229,30 +227,6 @@ def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, optio
                 write_csv(buildings, folder / "buildings.csv")
             draw_preview(Scene.load(folder), folder / "preview.png")
     return _report(city, shapes, plan, declared, options, None if check_only else out_folder)
-
-
-def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | None = None) -> None:
-    """Raise BadInput if writing the folder would erase something else.
-
-    Args:
-        folder: Folder to write.
-        allowed: Names that it may hold.
-        source: File that must not lie in it.
-    """
-    try:
-        held = os.listdir(folder)
-    except (FileNotFoundError, NotADirectoryError):
-        held = []
-    except (OSError, ValueError) as error:  # ValueError: a null character in the name
-        raise BadInput(f"cannot write {folder}: {getattr(error, 'strerror', None) or error}; "
-                       "choose another output folder") from None
-    foreign = sorted(set(held) - allowed)
-    if foreign:
-        raise BadInput(f"{folder} holds {', '.join(foreign[:5])}, which the new content would "
-                       "erase; move it away or choose another output folder")
-    if source is not None and is_within(source, folder):
-        raise BadInput(f"{source} lies in {folder}, which the new scene would replace; choose "
-                       "another output folder")
 
 
 def _city_shapes(city: ImportedCity, frequency_hz: float

@@ -9,7 +9,10 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from radiotwin.console import print_table
+from radiotwin.errors import BadInput
 from radiotwin.scene.problems import Problem
+from radiotwin.scene.scene import Scene
 
 _COLOURS = {"error": "bold red", "warning": "yellow", "fixed": "green"}
 _TITLE: dict[str, Any] = {"title_justify": "left", "title_style": "bold"}
@@ -81,6 +84,17 @@ class BuildReport:
         """Whether there is an error among the problems."""
         return any(problem.severity == "error" for problem in self.problems)
 
+    def load_scene(self) -> Scene:
+        """Load the scene that was written.
+
+        Raises:
+            BadInput: it was only checked.
+        """
+        if self.folder is None:
+            raise BadInput(f"{self.source} was only checked, no scene was written; build it "
+                           "without check_only")
+        return Scene.load(self.folder)
+
 
 def print_report(report: BuildReport, console: Console) -> None:
     """Print the report as tables, the problems last.
@@ -90,6 +104,8 @@ def print_report(report: BuildReport, console: Console) -> None:
         console: Where to print it.
     """
     facts = Table(title="Scene from " + escape(report.source), show_header=False, **_TITLE)
+    facts.add_column()
+    facts.add_column(overflow="fold")
     facts.add_row("shapes, triangles", f"{report.shapes:,}, {report.triangles:,}")
     if report.altitudes_m:
         x_min, x_max, y_min, y_max = report.extent_m
@@ -106,14 +122,16 @@ def print_report(report: BuildReport, console: Console) -> None:
         facts.add_row("devices, UAVs", f"{report.devices}, {report.uavs}")
     for subject, finding in report.facts:
         facts.add_row(subject, escape(finding))
-    console.print(facts)
+    print_table(facts, console)
     if report.materials:
-        console.print(_material_table(report))
+        print_table(_material_table(report), console)
     console.print(_problem_table(report) if report.problems else "No problems found.")
 
 
 def _problem_table(report: BuildReport) -> Table:
     table = Table(title="Problems", show_header=False, show_lines=True, **_TITLE)
+    table.add_column()
+    table.add_column(overflow="fold")
     for problem in report.problems:
         table.add_row(Text(problem.severity, style=_COLOURS[problem.severity]),
                       Text(problem.message))
@@ -122,10 +140,10 @@ def _problem_table(report: BuildReport) -> Table:
 
 def _material_table(report: BuildReport) -> Table:
     table = Table(title=f"Materials at {report.frequency_hz / 1e9:g} GHz", **_TITLE)
-    table.add_column("material")
-    table.add_column("kind")
+    table.add_column("material", overflow="fold")
+    table.add_column("kind", overflow="fold")
     for heading in ("shapes", "relative permittivity", "conductivity [S/m]"):
-        table.add_column(heading, justify="right")
+        table.add_column(heading, justify="right", overflow="fold")
     for use in report.materials:
         table.add_row(use.name, use.kind + ("" if use.in_range else " (out of range)"),
                       f"{use.shapes:,}", f"{use.relative_permittivity:.3f}",

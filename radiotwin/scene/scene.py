@@ -11,6 +11,7 @@ import numpy as np
 
 from radiotwin.antennas import Antenna, Pattern, read_pattern
 from radiotwin.budgets import SHAPES
+from radiotwin.display.summary import Summary, count, some
 from radiotwin.errors import BadInput
 from radiotwin.inputs import open_input, read_bytes, require_within
 from radiotwin.scene.citymap import CityMap
@@ -19,6 +20,11 @@ from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.vegetation import Vegetation
 
 if TYPE_CHECKING:
+    import xarray as xr
+    from geopandas import GeoDataFrame
+    from matplotlib.axes import Axes
+
+    from radiotwin.display import PlotFrame
     from radiotwin.radiomap import RadioMap
 
 _BLOCK_BYTES = 2**20
@@ -57,6 +63,102 @@ class Scene:
         scene._check_devices()
         _ = scene.device_antennas, scene.uav_antenna  # report a broken file before any work
         return scene
+
+    def save(self, folder: Path | str) -> None:
+        """Write a copy of the scene folder, with the configuration of this object.
+
+        Args:
+            folder: Scene folder to write; a scene that is already in it is replaced.
+
+        Raises:
+            BadInput: The folder holds something else or this scene, or cannot be written.
+        """
+        from radiotwin.scene.folder import copy_scene
+
+        copy_scene(self, Path(folder))
+
+    def plot(self, ax: "Axes | None" = None, *, geographic: bool | None = None) -> "Axes":
+        """Draw buildings, vegetation, devices and the UAVs' starts from above.
+
+        Args:
+            ax: Axes of matplotlib to draw into; None: a new figure.
+            geographic: Whether axes are longitude and latitude; None: where the origin is known.
+
+        Returns:
+            The axes.
+
+        Raises:
+            BadInput: Longitude and latitude are wanted and the scene has no origin.
+        """
+        from radiotwin.scene.plot import plot_scene
+
+        return plot_scene(self, ax, geographic)
+
+    def draw_outlines(self, ax: "Axes", frame: "PlotFrame") -> None:
+        """Draw the outlines of the buildings into axes that have a frame."""
+        from radiotwin.scene.plot import draw_outlines
+
+        draw_outlines(ax, self, frame)
+
+    def to_xarray(self, step_m: float = 1.0) -> "xr.Dataset":
+        """Return the heights over the extent as a raster.
+
+        Args:
+            step_m: Width of a cell [m].
+
+        Returns:
+            Variable `height_m` (y, x) of the highest surface [m], 0 on the ground.
+        """
+        from radiotwin.scene.plot import scene_raster
+
+        return scene_raster(self, step_m)
+
+    def to_geodataframe(self, layer: str = "buildings") -> "GeoDataFrame":
+        """Return buildings or devices as rows with a geometry, in metres of the local frame.
+
+        Args:
+            layer: `buildings` (`building, material, height_m` and their outline) or `devices`.
+
+        Raises:
+            BadInput: GeoPandas is not installed, or another layer.
+        """
+        from radiotwin.scene.plot import scene_table
+
+        return scene_table(self, layer)
+
+    def __len__(self) -> int:
+        """Return the number of declared devices."""
+        return len(self.config.devices)
+
+    def __bool__(self) -> bool:
+        return True  # a scene without devices is one, too
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave the 3D map out: it is read again from the folder where it is needed."""
+        return {"folder": Path(os.path.abspath(self.folder)), "config": self.config}
+
+    def __repr__(self) -> str:
+        return self._summary.text()
+
+    def _repr_html_(self) -> str:
+        return self._summary.html()
+
+    @property
+    def _summary(self) -> Summary:
+        config, (x_min, x_max, y_min, y_max) = self.config, self.config.extent.bounds
+        anchors = sum(device.role == "anchor" for device in config.devices)
+        size = f"{x_max - x_min:g} × {y_max - y_min:g} m"
+        frequency = f"{config.radio.frequency_hz / 1e9:g} GHz"
+        devices, uavs = count(len(self), "device"), count(len(config.uavs), "UAV")
+        origin = config.origin
+        place = "not known" if origin is None else (
+            f"latitude {origin.latitude_deg:g}°, longitude {origin.longitude_deg:g}°")
+        return Summary("Scene", f"{config.name}, {size}, {devices}, {uavs}, {frequency}", (
+            ("folder", str(self.folder)), ("extent", size), ("origin", place),
+            ("frequency", frequency), ("sensitivity", f"{config.radio.sensitivity_dbm:g} dBm"),
+            ("devices", f"{devices}, {count(anchors, 'anchor')}"), ("UAVs", uavs),
+            ("altitudes", some(f"{z:g}" for z in config.lattice.altitudes_m) + " m"),
+            ("lattice step", f"{config.lattice.step_m:g} m")))
 
     @property
     def xml_path(self) -> Path:

@@ -11,24 +11,26 @@ from radiotwin.scene import Scene
 from radiotwin.scene.config import UavConfig
 from radiotwin.survey.grid import MOVE_COST, FlightGrid
 from radiotwin.survey.patterns import PATTERNS
-from radiotwin.survey.truth import require_possible
+from radiotwin.survey.truth import read_truth, require_possible
 
 _MAX_FLIGHTS = 100_000  # far beyond any campaign: a typing error
 _MAX_NOISE_DB = 50.0  # as is this: receivers are off by some decibels
 
 
-def fly_survey(scene: Scene, truth: RadioMap, *, flights: int, pattern: str, seed: int,
-               noise_db: float = 1.0) -> Measurements:
+def fly_survey(scene: Scene, truth: RadioMap | str = "traced", *, flights: int = 5,
+               pattern: str = "random-waypoint", seed: int = 0, noise_db: float | None = None
+               ) -> Measurements:
     """Fly and measure.
 
     Args:
         scene: UAVs, devices and sensitivity.
-        truth: Map over the scene's lattice; where it has `sigma_db`, shadowing is drawn anew for
-            every link.
+        truth: Map over the scene's lattice, or what `read_truth` takes for one; where it has
+            `sigma_db`, shadowing is drawn anew for every link.
         flights: Number of flights; in each, every UAV of the scene flies once.
         pattern: Key of `PATTERNS`.
         seed: Seed of paths and noise; the n-th flight does not depend on the number of flights.
-        noise_db: Standard deviation of the receiver's measurement error [dB].
+        noise_db: Standard deviation of the receiver's measurement error [dB]; None: 1, and 0 with a
+            truth that has shadowing of its own (`sigma_db`).
 
     Returns:
         The measurements; unknown devices are without x and y.
@@ -37,6 +39,10 @@ def fly_survey(scene: Scene, truth: RadioMap, *, flights: int, pattern: str, see
         BadInput: An unknown pattern, no flight, no UAV, a map of another scene, or one with gains
             that physics does not allow.
     """
+    if isinstance(truth, str):
+        truth = read_truth(scene, truth)
+    if noise_db is None:
+        noise_db = 0.0 if "sigma_db" in truth.dataset else 1.0
     _check(scene, truth, flights, pattern, noise_db)
     limit_db = scene.config.gain_limit_db
     row_of = {name: row for row, name in enumerate(truth.devices)}

@@ -51,4 +51,5 @@ def segmented_truth(scene: Scene) -> RadioMap:
         [device.device for device in scene.config.devices], scene.lattice, np.array(gain_db),
         np.array(los), np.array(sigma_db),
         {"source": "segmented", "frequency_hz": scene.config.radio.frequency_hz,
-         "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene.content_hash()})
+         "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene.content_hash()}
+    ).placed(scene.config.origin)

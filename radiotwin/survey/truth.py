@@ -9,7 +9,7 @@ from radiotwin.scene import Scene
 from radiotwin.survey.statistical import segmented_truth
 
 
-def read_truth(scene: Scene, truth: str) -> RadioMap:
+def read_truth(scene: Scene, truth: str = "traced") -> RadioMap:
     """Return the radio map that a command's option `--truth` names.
 
     Args:

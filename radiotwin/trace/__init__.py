@@ -2,8 +2,8 @@
 
 from radiotwin.trace.pilot import Rung, choose_quality
 from radiotwin.trace.points import read_points, trace_gains, trace_points
-from radiotwin.trace.run import trace_map
+from radiotwin.trace.run import trace_map, truth_path
 from radiotwin.trace.settings import QUALITIES, SolverSettings
 
 __all__ = ["QUALITIES", "Rung", "SolverSettings", "choose_quality", "read_points", "trace_gains",
-           "trace_map", "trace_points"]
+           "trace_map", "trace_points", "truth_path"]

@@ -85,7 +85,7 @@ class _LateSolver:
         return self._solver.solve(device_m, points_m, ends)
 
 
-def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings,
+def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | None = None,
                  out_path: Path | str | None = None, devices: list[str] | None = None
                  ) -> pd.DataFrame:
     """Trace the gains from a scene's devices to any points.
@@ -93,7 +93,7 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings,
     Args:
         scene: City, devices and radio.
         points_m: (n, 3) positions [m].
-        settings: Settings with solver `paths`.
+        settings: Settings with solver `paths`; None: those of quality `default`.
         out_path: CSV file (.csv or .csv.gz); None writes nothing.
         devices: Names; None: all devices of the scene.
 
@@ -113,6 +113,8 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings,
         if not str(out_path).endswith((".csv", ".csv.gz")):
             raise BadInput(f"{out_path}: unknown format; allowed are .csv and .csv.gz")
         require_writable(out_path)
+    settings = settings or SolverSettings.of_quality()
+    points_m = np.asarray(points_m, dtype=float).reshape(-1, 3)
     index = device_indices(scene, devices)
     ROWS.check(len(index) * len(points_m), "points times devices")
     inside = scene.city.inside(points_m)

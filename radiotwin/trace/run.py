@@ -23,8 +23,18 @@ from radiotwin.trace.sionna_scene import library_versions
 from radiotwin.trace.solver import IMPOSSIBLE_DB
 
 
-def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
-              devices: list[str] | None = None) -> RadioMap:
+def truth_path(scene: Scene, devices: list[str] | None = None) -> Path:
+    """Return the file that a scene's traced map is written to unless another is named.
+
+    Args:
+        scene: that is traced.
+        devices: names of those that are traced; None: all.
+    """
+    return scene.folder / ("-".join(["truth", *(devices or [])])[:100] + ".nc")
+
+
+def trace_map(scene: Scene, settings: SolverSettings | None = None,
+              out_path: Path | str | None = None, devices: list[str] | None = None) -> RadioMap:
     """Trace the radio map of a scene's lattice and write it.
 
     Each finished batch is kept in the scene's `cache/trace-<hash>`, named by the hash of all that
@@ -33,8 +43,8 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
 
     Args:
         scene: City, devices and lattice.
-        settings: Settings of the solver.
-        out_path: NetCDF file to write.
+        settings: Settings of the solver; None: those of quality `default`.
+        out_path: NetCDF file to write; None: `truth_path`.
         devices: Names, in the map's order; None: all devices of the scene.
 
     Returns:
@@ -47,6 +57,8 @@ def trace_map(scene: Scene, settings: SolverSettings, out_path: Path | str,
             be written.
         RunFailed: No usable libLLVM, or gains that physics does not allow. Nothing is written then.
     """
+    settings = settings or SolverSettings.of_quality()
+    out_path = truth_path(scene, devices) if out_path is None else out_path
     index = device_indices(scene, devices)
     MAP_VALUES.check(len(index) * math.prod(scene.lattice.shape),
                      f"{scene.folder}: lattice positions times devices")

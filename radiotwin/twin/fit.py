@@ -23,10 +23,12 @@ from radiotwin.twin.twin import Twin
 # of a law differ by 0.02 dB (root mean square; 0.08 dB at most), two to four of its standard errors
 # then, and about one of those with fewer. The time to train a network is in proportion to them.
 MAX_LINKS, THINNED_LINKS = 1_000_000, 300_000
+HEIGHT_NEEDED = ("with a 3D map every position needs one. Fill it in, in metres above the ground "
+                 "of the scene (about 1.5 for a phone in the hand)")
 
 
-def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmented_nn", seed: int,
-             start: Twin | None = None, allow_indoor: bool = False) -> Twin:
+def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmented_nn",
+             seed: int = 0, start: Twin | None = None, allow_indoor: bool = False) -> Twin:
     """Learn the channel from the anchors' links, then locate the unknown devices with it.
 
     A published law (`radiotwin.channel.published`) is taken as it stands and needs no anchor.
@@ -106,9 +108,9 @@ def _check_heights(measurements: Measurements) -> None:
     empty = np.flatnonzero(measurements.table["receiver_z_m"].isna())
     if len(empty):
         raise BadInput(f"measurements, row {empty[0] + 2}, column receiver_z_m: the receiver's "
-                       "height is empty; with a 3D map every position needs one")
+                       f"height is empty; {HEIGHT_NEEDED}, or import the file again with one for "
+                       "all rows, radiotwin import --columns \"…,height=always 1.5\"")
     measured = np.unique(measurements.device_index)
     for index in measured[np.isnan(measurements.device_m[measured, 2])]:
         raise BadInput(f"devices, row {index + 2}, column z_m: the height of device "
-                       f"{measurements.devices['device'][index]!r} is empty; with a 3D map every "
-                       "position needs one")
+                       f"{measurements.devices['device'][index]!r} is empty; {HEIGHT_NEEDED}")

@@ -1,20 +1,24 @@
 """Devices of unknown position in a file of measurements, located by a corrected twin."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 
+from radiotwin.alignment import in_known_frame
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.errors import BadInput
 from radiotwin.geodesy import to_geographic
 from radiotwin.links import LinkData, prepare_links
 from radiotwin.localize import PositionEstimate, locate, misfit, whole_area
 from radiotwin.measurements import Measurements
+from radiotwin.progress import progress
 from radiotwin.scene import Scene
 from radiotwin.twin.twin import Twin
 
+NOT_BY_PATHS = ("and following paths from every position where a device may be takes too long: "
+                "locate cannot use such a twin. close-loop --base twin makes one for it, and "
+                "fit --model raytrace locates devices along with the twin")
 MAX_NAMED = 5  # receivers in a note
 MIN_WIDENING = 1.2  # of residuals, from which a file's links are unlike those learnt from
 
@@ -31,25 +35,22 @@ def check_can_locate(twin: Twin, scene: Scene | None) -> None:
             the other way round.
     """
     if twin.channel.follows_paths:
-        raise BadInput("the twin's base is 'raytrace', and following paths from every position "
-                       "where a device may be takes too long; `radiotwin fit --model raytrace` "
-                       "locates devices along with the twin, and close-loop --base twin makes one "
-                       "for locate")
+        raise BadInput(f"the twin's base is 'raytrace', {NOT_BY_PATHS}")
     if twin.fitted is None:
         raise BadInput("the twin was not made by `radiotwin close-loop`, or by an earlier version "
                        "of it; run that on measurements of devices whose positions are known")
     twin.require_map(scene)
 
 
-def locate_file(measurements: Measurements, twin: Twin, scene: Scene | None,
-                on_progress: Callable[[], None]) -> tuple[pd.DataFrame, list[str]]:
+def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None = None
+                   ) -> tuple[pd.DataFrame, list[str]]:
     """Locate the devices of role unknown.
 
     Args:
-        measurements: their links, and others.
+        measurements: their links, and others; converted into the twin's frame where both say where
+            on the earth they lie.
         twin: made by `close-loop`.
         scene: the 3D map, if the twin was made with one.
-        on_progress: called after each device.
 
     Returns:
         a row a device: `device, x_m, y_m, radius_m` (of 90 % of the probability), `links`, and
@@ -62,6 +63,7 @@ def locate_file(measurements: Measurements, twin: Twin, scene: Scene | None,
     check_can_locate(twin, scene)
     model = twin.fitted
     assert model is not None
+    measurements = in_known_frame(measurements, twin.origin, "the twin")
     unknown = measurements.select(~measurements.is_anchor[measurements.device_index])
     if unknown.table.empty:
         raise BadInput("no link is to a device of role unknown; set the role of those that are to "
@@ -82,7 +84,8 @@ def locate_file(measurements: Measurements, twin: Twin, scene: Scene | None,
                     limit_db=links.limit_db if twin.limit_db is None else
                     np.full(len(links), twin.limit_db))
     area_m = scene.config.extent.bounds if scene is not None else whole_area(model, links)
-    found = list(locate(model, links, area_m, on_progress))
+    with progress("locating", total=len(np.unique(links.device))) as advance:
+        found = list(locate(model, links, area_m, lambda: advance(1)))
     widening = _widening(model, links, found)
     if widening > 1.0:
         notes.append("all positions are uncertain: where devices are located, residuals are "
@@ -114,7 +117,7 @@ def position_errors(positions: pd.DataFrame, truth: pd.DataFrame) -> dict[str, f
     """Return how far located devices are from their true positions.
 
     Args:
-        positions: as of `locate_file`.
+        positions: as of `locate_devices`.
         truth: `device, x_m, y_m`.
 
     Returns:

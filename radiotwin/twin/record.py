@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from radiotwin.channel.stored import MAX_DB, MAX_SD_DB
 from radiotwin.effects.params import Seconds
-from radiotwin.measurements import MAX_COORDINATE_M
+from radiotwin.measurement_columns import MAX_COORDINATE_M
 from radiotwin.tables import Origin
 
 SCHEMA, SCHEMA_1 = "radiotwin.twin/2", "radiotwin.twin/1"

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 import radiotwin
 from radiotwin.channel import ChannelModel
 from radiotwin.channel.path_kriging import PathKriging
 from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.channel.residual_field import ResidualField
+from radiotwin.display import Summary, geo_data_frame
+from radiotwin.display.summary import count, some
 from radiotwin.effects.correlated_shadowing import NAME as SHADOWING
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.fold_model import FittedEffect
@@ -26,7 +30,12 @@ from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
 from radiotwin.tables import Origin
+from radiotwin.twin.plot import plot_positions
 from radiotwin.twin.store import decode_twin, encode_twin, read_twin, write_twin
+
+if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
+    from matplotlib.axes import Axes
 
 CHUNK, CHUNK_WITH_EFFECTS = 200_000, 20_000  # links predicted at once: bounds memory
 
@@ -165,7 +174,7 @@ class Twin:
                       "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene_hash,
                       "radiotwin_version": radiotwin.__version__}
         return MapStream(list(rows), scene.lattice, attributes, ("gain_db", "los", "sigma_db"),
-                         make)
+                         make).placed(scene.config.origin)
 
     def save(self, folder: Path | str) -> None:
         """Write the twin's folder, whole or not at all.
@@ -184,6 +193,63 @@ class Twin:
             BadInput: not a twin's folder, a damaged one, or effects that are not installed.
         """
         return cls(**read_twin(folder))
+
+    def plot(self, ax: Axes | None = None, *, scene: Scene | None = None,
+             geographic: bool | None = None) -> Axes:
+        """Draw where the devices are; circles hold 90 % of the probability.
+
+        Args:
+            ax: axes of matplotlib to draw into; None: a new figure.
+            scene: whose buildings are outlined; None: none are.
+            geographic: whether axes are longitude and latitude; None: where the origin is known.
+
+        Returns:
+            The axes.
+
+        Raises:
+            BadInput: longitude and latitude are wanted and the origin is not known.
+        """
+        origin = self.origin if scene is None else self.origin or scene.config.origin
+        return plot_positions(self.devices, ax, origin, scene, geographic)
+
+    def to_geodataframe(self) -> GeoDataFrame:
+        """Return a row for each device, with a point in metres of the local frame.
+
+        Columns are those of `TwinDevice`; a device that could not be located has no geometry.
+
+        Raises:
+            BadInput: GeoPandas is not installed.
+        """
+        table = pd.DataFrame([asdict(each) for each in self.devices]).drop(columns="second_mode")
+        return geo_data_frame(table, self.origin, position_m=self.device_m)
+
+    def __len__(self) -> int:
+        """Return the number of devices."""
+        return len(self.devices)
+
+    def __bool__(self) -> bool:
+        return True
+
+    def __repr__(self) -> str:
+        return self._summary.text()
+
+    def _repr_html_(self) -> str:
+        return self._summary.html()
+
+    @property
+    def _summary(self) -> Summary:
+        unknown = [each for each in self.devices if each.role == "unknown"]
+        located = sum(each.located for each in unknown)
+        limit = "not known" if self.limit_db is None else (
+            f"{self.limit_db:g} {'dB' if self.level == 'gain_db' else 'dBm'}")
+        found = f"{located} of {len(unknown)} unknown ones located"
+        return Summary("Twin", f"{self.description}, {count(len(self), 'device')}, {found}, "
+                       f"{self.level}", (
+            ("channel", self.channel.name),
+            ("effects", some(each.effect.name for each in self.effects) or "none"),
+            ("devices", some(each.device for each in self.devices)), ("unknown devices", found),
+            ("level", self.level), ("limit of detection", limit),
+            ("scene", str(self.provenance.get("scene", "none")))))
 
     def encode(self) -> tuple[str, bytes]:
         """Return the contents of the twin's two files: the record, and the channel."""

@@ -68,7 +68,7 @@ def test_the_next_run_says_what_it_took_and_writes_the_same(small_scene, flown, 
 
 def test_ctrl_c_in_what_keeps_nothing_says_so():
     text = ("import radiotwin.cli.tools as tools, radiotwin.doctor, time;"
-            "radiotwin.doctor.print_diagnosis = lambda *_: (print('ready', flush=True), time.sleep(60));" + MAIN)
+            "radiotwin.doctor.diagnose = lambda: (print('ready', flush=True), time.sleep(60));" + MAIN)
     child = subprocess.Popen([sys.executable, "-c", text, "doctor"], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
                              text=True, env=os.environ)
     assert child.stdout is not None and child.stdout.readline() == "ready\n"

@@ -78,7 +78,8 @@ def test_the_real_command(run_installed, run, tmp_path):
 
 @pytest.mark.parametrize("arguments, part", [
     ("fit nothing.csv --scene nowhere --json", "does not exist"), ("fit --json", "Missing argument"),
-    ("fit a.csv --nope 3 --json", "No such option"), ("nothing --json", "No such command")])
+    ("fit a.csv --nope 3 --json", "No such option"), ("nothing --json", "No such command"),
+    ("trace scene --json", "No such option"), *((f"{command} --nope --json", "No such option") for command in TABLES)])
 def test_an_error_is_json_too(arguments, part, run, tmp_path):
     done = run(arguments, tmp_path)
     error = json.loads(done.stdout)["error"]

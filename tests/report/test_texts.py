@@ -2,8 +2,9 @@
 
 import pytest
 
-from radiotwin.report.style import plain, shorten
-from radiotwin.report.texts import MAX_TEXT, shown, shown_data
+from radiotwin.display.style import plain
+from radiotwin.report.style import shorten
+from radiotwin.texts import MAX_TEXT, shown, shown_data
 
 
 @pytest.mark.parametrize("text, expected", [

@@ -46,7 +46,7 @@ def test_a_device_is_found_by_three_packets_of_each_gateway_and_by_the_silence_o
         used.append(links)
         return plain(model, links, *others)
     monkeypatch.setattr(module, "locate", locate)
-    found, _ = module.locate_file(Measurements(table, devices), twin, None, lambda: None)
+    found, _ = module.locate_devices(Measurements(table, devices), twin)
     silent = np.isnan(gain_db)
     assert 20 < silent.sum() < 70 and np.isnan(used[0].level_db).sum() == silent.sum()
     assert np.all(used[0].limit_db == LIMIT_DB) and found["links"].tolist() == [GATEWAYS * PACKETS]

@@ -7,7 +7,7 @@ import pandas as pd
 
 from radiotwin.cells import read_cells, refuse
 from radiotwin.errors import BadInput
-from radiotwin.measurements import MAX_COORDINATE_M
+from radiotwin.measurement_columns import MAX_COORDINATE_M
 from radiotwin.records import MAX_NUMBER
 
 POSITION = ("x_m", "y_m", "z_m")

@@ -1,0 +1,148 @@
+"""Held-out residuals of a close-loop, as an object that is drawn and saved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from radiotwin.cells import write_csv
+from radiotwin.display import PlotFrame, Summary, new_axes
+from radiotwin.display.style import RESIDUAL_COLOURS, plain, residual_range_db
+from radiotwin.display.summary import count
+from radiotwin.errors import BadInput
+from radiotwin.files import atomic_path
+from radiotwin.frames import read_frame
+from radiotwin.link_view import links_dataset, links_table, of_device, plot_links
+from radiotwin.run_tables import RESIDUALS, read_table
+from radiotwin.scene import Scene
+from radiotwin.tables import Origin
+
+if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
+    from matplotlib.axes import Axes
+
+WHEN = ("before", "after")
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Measured minus predicted levels of links that took no part in the prediction.
+
+    Attributes:
+        table: one row for each link, columns as of `residual_table`: `before_db` is of the base,
+            `after_db` of base and effects; NaN where the link was not detected or never held out.
+        origin: of the local frame; None where it is not known.
+    """
+
+    table: pd.DataFrame
+    origin: Origin | None = None
+
+    @classmethod
+    def load(cls, path: Path | str) -> Residuals:
+        """Read a `residuals.csv.gz`.
+
+        Args:
+            path: `.csv` or `.csv.gz`; `frame.toml` in its folder says where the frame is.
+
+        Raises:
+            BadInput: names file, row and column of the first value that cannot be used.
+        """
+        path = Path(path)
+        kinds = {"time_s": "number or nothing", "measured_db": "number or nothing"}
+        return cls(read_table(path, RESIDUALS, kinds), read_frame(path.parent))
+
+    def save(self, path: Path | str) -> None:
+        """Write `.csv` or `.csv.gz`, completely or not at all.
+
+        Raises:
+            BadInput: another format, or a file that cannot be written.
+        """
+        if not str(path).endswith((".csv", ".csv.gz")):
+            raise BadInput(f"{path}: unknown format; allowed are .csv and .csv.gz")
+        with atomic_path(path) as temporary:
+            write_csv(self.table, temporary, "%.4f")
+
+    def rmse_db(self, when: str = "after") -> float:
+        """Return the root mean square of a residual [dB], `before` or `after`."""
+        return _rmse_db(self._values_db(self.table, when))
+
+    def plot(self, when: str = "after", device: str | None = None, ax: Axes | None = None, *,
+             scene: Scene | None = None, geographic: bool | None = None) -> Axes:
+        """Draw the residual of each link at its moving end: red where less was measured.
+
+        Args:
+            when: `before` the effects were added, or `after`.
+            device: whose links are drawn; None: all links, large residuals over small ones.
+            ax: axes of matplotlib to draw into; None: a new figure.
+            scene: whose buildings are outlined; None: none are.
+            geographic: whether axes are longitude and latitude; None: where the origin is known.
+
+        Returns:
+            The axes.
+
+        Raises:
+            BadInput: no such device, or longitude and latitude without an origin.
+        """
+        table = of_device(self.table, device)
+        values_db = self._values_db(table, when)
+        origin = self.origin
+        if scene is not None and origin is None:
+            origin = scene.config.origin
+        frame, ax = PlotFrame.choose(origin, geographic), new_axes(ax)
+        known, high_db = np.isfinite(values_db), residual_range_db(values_db)
+        plot_links(table[known], values_db[known], ax, frame, scene, "measured − predicted [dB]",
+                   False, cmap=RESIDUAL_COLOURS, vmin=-high_db, vmax=high_db)
+        whose = "" if device is None else f" of device {plain(device)}"
+        ax.set_title(f"held-out residual{whose}, {when}: RMSE {_rmse_db(values_db):.2f} dB")
+        return ax
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return the columns as variables over the dimension `link`, with units."""
+        return links_dataset(self.table, self.origin)
+
+    def to_geodataframe(self) -> GeoDataFrame:
+        """Return the links with a point at the end that moves, in metres of the local frame.
+
+        Raises:
+            BadInput: GeoPandas is not installed.
+        """
+        return links_table(self.table, self.origin)
+
+    def __len__(self) -> int:
+        """Return the number of links."""
+        return len(self.table)
+
+    def __bool__(self) -> bool:
+        return True
+
+    def __repr__(self) -> str:
+        return self._summary.text()
+
+    def _repr_html_(self) -> str:
+        return self._summary.html()
+
+    @property
+    def _summary(self) -> Summary:
+        rmse = [f"{self.rmse_db(when):.2f} dB" for when in WHEN]
+        known = int(np.isfinite(self.table["after_db"]).sum())
+        return Summary("Residuals", f"{count(len(self), 'link')}, RMSE {rmse[0]} before, {rmse[1]} "
+                       "after", (
+            ("links", f"{len(self):,}"), ("with a residual", f"{known:,}"),
+            ("devices", f"{self.table['device'].nunique():,}"),
+            ("receivers", f"{self.table['receiver'].nunique():,}"),
+            ("RMSE before", rmse[0]), ("RMSE after", rmse[1])))
+
+    def _values_db(self, table: pd.DataFrame, when: str) -> np.ndarray:
+        if when not in WHEN:
+            raise BadInput(f"when = {when!r}: allowed are {', '.join(WHEN)}")
+        return table[f"{when}_db"].to_numpy(dtype=float)
+
+
+def _rmse_db(values_db: np.ndarray) -> float:
+    known = values_db[np.isfinite(values_db)]
+    return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")

@@ -1,0 +1,130 @@
+"""Axes of a plot from above: metres of the local frame, or degrees where its origin is known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from radiotwin.errors import BadInput
+from radiotwin.geodesy import to_geographic
+from radiotwin.tables import Origin
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import PathCollection, QuadMesh
+
+TICKS = 6  # of an axis in degrees, whose labels are long
+LABEL_SHARE = 0.85  # of the height of the axes that a colour bar takes
+
+
+def new_axes(ax: Axes | None) -> Axes:
+    """Return axes to draw into.
+
+    Args:
+        ax: given by the user; None: those of a new figure of pyplot, which notebooks show.
+    """
+    if ax is not None:
+        return ax
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(figsize=(7.0, 5.6), layout="constrained")[1]
+
+
+@dataclass(frozen=True)
+class PlotFrame:
+    """Coordinates of the axes.
+
+    Attributes:
+        origin: of the local frame; None: axes are in metres.
+    """
+
+    origin: Origin | None = None
+
+    @classmethod
+    def choose(cls, origin: Origin | None, geographic: bool | None) -> PlotFrame:
+        """Return the frame of a plot.
+
+        Args:
+            origin: of the local frame; None: not known.
+            geographic: True: longitude and latitude, False: metres, None: longitude and latitude
+                where the origin is known.
+
+        Raises:
+            BadInput: longitude and latitude are wanted and the origin is not known.
+        """
+        if geographic and origin is None:
+            raise BadInput("longitude and latitude cannot be drawn: the origin of the frame is not "
+                           "known; give the scene an [origin], or plot with geographic=False")
+        return cls(None if geographic is False else origin)
+
+    def at(self, x_m: Any, y_m: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return coordinates on the axes of points of the local frame [m], in any shape."""
+        x_m, y_m = np.asarray(x_m, dtype=float), np.asarray(y_m, dtype=float)
+        if self.origin is None:
+            return x_m, y_m
+        return to_geographic(self.origin, x_m, y_m)
+
+    def prepare(self, ax: Axes) -> None:
+        """Label the axes, and give both the same scale on the ground."""
+        if self.origin is None:
+            ax.set(xlabel="x, east [m]", ylabel="y, north [m]", aspect="equal")
+            return
+        from matplotlib.ticker import MaxNLocator
+
+        shrinkage = float(np.cos(np.radians(self.origin.latitude_deg)))
+        ax.set(xlabel="longitude [°]", ylabel="latitude [°]",
+               aspect=1 / max(shrinkage, 1e-3))
+        ax.ticklabel_format(useOffset=False, style="plain")
+        ax.xaxis.set_major_locator(MaxNLocator(TICKS))
+        ax.tick_params(axis="x", labelrotation=25)
+
+
+METRES = PlotFrame()
+
+
+def draw_cells(ax: Axes, frame: PlotFrame, x_m: np.ndarray, y_m: np.ndarray, values: np.ndarray,
+               **look: Any) -> QuadMesh:
+    """Draw values in cells around the positions of a grid.
+
+    Args:
+        ax: to draw into.
+        frame: of the axes.
+        x_m: (nx,) ascending [m].
+        y_m: (ny,) ascending [m].
+        values: (ny, nx); NaN stays empty.
+        look: of `Axes.pcolormesh`.
+    """
+    corners = frame.at(*np.meshgrid(_edges(x_m, y_m), _edges(y_m, x_m)))
+    return ax.pcolormesh(*corners, values, rasterized=True, linewidth=0, **look)
+
+
+def draw_points(ax: Axes, frame: PlotFrame, x_m: np.ndarray, y_m: np.ndarray,
+                **look: Any) -> PathCollection:
+    """Draw points of the local frame [m]; `look` is that of `Axes.scatter`."""
+    return ax.scatter(*frame.at(x_m, y_m), **look)
+
+
+def add_colour_bar(ax: Axes, drawn: Any, label: str, extend: str = "neither") -> None:
+    """Add a colour bar beside the axes."""
+    ax.figure.colorbar(drawn, ax=ax, label=label, shrink=LABEL_SHARE, extend=extend)
+
+
+def add_legend(ax: Axes) -> None:
+    """Add a legend below the axes where something in them has a label."""
+    handles, labels = ax.get_legend_handles_labels()
+    if handles:
+        by_label = dict(zip(labels, handles))
+        ax.legend(by_label.values(), by_label, loc="upper center", bbox_to_anchor=(0.5, -0.18),
+                  ncols=3, frameon=False)
+
+
+def _edges(along_m: np.ndarray, across_m: np.ndarray) -> np.ndarray:
+    """Return the (n + 1,) borders of cells; a single one is as wide as those across."""
+    if len(along_m) > 1:
+        step_m = np.diff(along_m)
+    else:
+        step_m = np.diff(across_m)[:1] if len(across_m) > 1 else np.ones(1)
+    middle_m = along_m[:-1] + np.diff(along_m) / 2
+    return np.concatenate([[along_m[0] - step_m[0] / 2], middle_m, [along_m[-1] + step_m[-1] / 2]])

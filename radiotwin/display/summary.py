@@ -1,0 +1,66 @@
+"""Summaries of objects: one line for a terminal, a small table for a notebook."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from html import escape
+
+from radiotwin.texts import shown
+
+MAX_CELL = 300  # characters of a cell; names come from strangers' files
+MAX_LINE = 200
+_NAMED = 5
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Facts about an object.
+
+    Attributes:
+        kind: its class.
+        line: what it is, without its class.
+        facts: subject and finding of each row of the table.
+    """
+
+    kind: str
+    line: str
+    facts: tuple[tuple[str, str], ...] = ()
+
+    def text(self) -> str:
+        """Return `<Kind: line>`, on one line."""
+        return f"<{self.kind}: {' '.join(shown(self.line, MAX_LINE).split())}>"
+
+    def html(self) -> str:
+        """Return a table; every text is escaped."""
+        rows = "".join(
+            f'<tr><th style="text-align:left">{escape(shown(subject, MAX_CELL))}</th>'
+            f'<td style="text-align:left">{escape(shown(finding, MAX_CELL))}</td></tr>'
+            for subject, finding in self.facts)
+        return (f"<div><strong>{escape(self.kind)}</strong>: {escape(shown(self.line, MAX_CELL))}"
+                f"<table>{rows}</table></div>")
+
+
+def count(number: int, noun: str) -> str:
+    """Return a number with its noun.
+
+    >>> count(1, "device"), count(1200, "link")
+    ('1 device', '1,200 links')
+    """
+    return f"{number:,} {noun}" + "s" * (number != 1)
+
+
+def some(names: Iterable[str]) -> str:
+    """Return the first names of a list, and how many there are."""
+    names = [str(name) for name in names]
+    more = f", … ({len(names):,} in all)" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + more
+
+
+def span(low: float, high: float, unit: str) -> str:
+    """Return a range of values with its unit; a dash where nothing is finite.
+
+    >>> span(-101.26, -60.0, "dB")
+    '−101.3 to −60 dB'
+    """
+    if not (low <= high):
+        return "–"
+    return f"{round(low, 1):g} to {round(high, 1):g} {unit}".replace("-", "−")

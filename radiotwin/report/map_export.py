@@ -1,0 +1,91 @@
+"""Write the radio map of a file or of a twin in the format of another program, or as a picture."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from radiotwin.errors import BadInput
+from radiotwin.export import EXPORTERS, check_format, select, write_map
+from radiotwin.files import require_writable
+from radiotwin.map_file import MapStream
+from radiotwin.radiomap import RadioMap
+from radiotwin.report.map_figures import write_picture
+from radiotwin.scene import Scene
+from radiotwin.twin import Twin
+
+FORMATS: dict[str, Callable[[RadioMap, Scene, Path], None]] = EXPORTERS | {".png": write_picture}
+MAX_ORIGIN_DIFFERENCE = 1e-6  # [degrees, or metres of altitude] of one place, after rounding
+
+
+def check_map_target(path: Path | str, scene: Scene) -> None:
+    """Check that a map of a scene can be written under a file name, before it is made.
+
+    Args:
+        path: file to write; its suffix chooses the format.
+        scene: of the map.
+
+    Raises:
+        BadInput: an unknown format, one that needs an origin where the scene has none, or a file
+            that cannot be written.
+    """
+    check_format(Path(path), scene, FORMATS)
+    require_writable(path)
+
+
+def export_map(source: RadioMap | Twin, scene: Scene, path: Path | str, *,
+               devices: Sequence[str] | None = None, altitudes_m: Sequence[float] | None = None,
+               name: str = "the radio map") -> RadioMap | MapStream:
+    """Write a radio map as `.nc`, `.csv`, `.npz`, `.tif`, `.kmz` or `.png`.
+
+    The map of a twin is made block by block where the format allows it.
+
+    Args:
+        source: map, or twin whose map is written.
+        scene: that it was made for.
+        path: file to write; its suffix chooses the format.
+        devices: names, in the order wanted; None: all.
+        altitudes_m: altitudes of the lattice [m]; None: all.
+        name: of the source in messages.
+
+    Returns:
+        What was written.
+
+    Raises:
+        BadInput: as `check_map_target`, a map of another place, or no such device or altitude.
+    """
+    path = Path(path)
+    check_map_target(path, scene)
+    if isinstance(source, RadioMap):
+        check_map_place(name, source.attributes, scene)
+        whole: RadioMap | MapStream = source
+    else:
+        whole = source.map_stream(scene)
+    selected = select(whole, None if devices is None else list(devices),
+                      None if altitudes_m is None else list(altitudes_m))
+    write_map(selected, scene, path, FORMATS)
+    return selected
+
+
+def check_map_place(name: str, attributes: dict[str, Any], scene: Scene) -> None:
+    """Refuse a map of another city, which would get the outlines and the origin of this one.
+
+    Args:
+        name: of the map in messages.
+        attributes: of the map.
+        scene: that is given with it.
+
+    Raises:
+        BadInput: their origins differ.
+    """
+    origin = scene.config.origin
+    for key, value in ({} if origin is None else origin.model_dump()).items():
+        of_map = attributes.get(f"origin_{key}", value)
+        if abs(of_map - value) > MAX_ORIGIN_DIFFERENCE:
+            raise BadInput(f"{name} is a map of another place: its origin's {key} is {of_map:g}, "
+                           f"that of {scene.folder} is {value:g}; give the scene that it was made "
+                           "for, or trace again")
+    if attributes.get("scene_hash") not in (None, scene.content_hash()):
+        warnings.warn(f"{name} was made for another scene than {scene.folder}, or that has changed "
+                      "since: outlines, devices and the origin are those of the scene",
+                      stacklevel=3)

@@ -1,0 +1,177 @@
+"""Draw a scene from above into any axes, and give it to GIS programs as a table or a raster."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from radiotwin.display import PlotFrame, geo_data_frame, new_axes
+from radiotwin.display.axes import METRES, add_colour_bar, add_legend, draw_cells, draw_points
+from radiotwin.display.style import plain
+from radiotwin.errors import BadInput
+from radiotwin.scene.citymap import GROUND_M
+from radiotwin.scene.reader import read_city
+
+if TYPE_CHECKING:
+    from geopandas import GeoDataFrame
+    from matplotlib.axes import Axes
+
+    from radiotwin.scene.scene import Scene
+
+Bounds = tuple[float, float, float, float]
+GROUND_COLOUR = "#eef0ee"
+VEGETATION_COLOUR = "#7fb069"
+BUILDING_M = 2.0  # lowest height that is outlined
+MIN_HEIGHT_M = 0.5  # of what is drawn as a building
+PLOT_CELLS = 400  # along the longer side of a plot
+MARKS = (("anchor", "^", 110, "#d1495b", "anchor"),
+         ("unknown", "*", 170, "#f08a00", "device to be found"))
+"""Role, marker, size, colour and label of devices."""
+LAYERS = ("buildings", "devices")
+
+
+def height_grid(scene: Scene, cells: int = 1000) -> tuple[np.ndarray, Bounds]:
+    """Sample the heights over the scene's extent.
+
+    Args:
+        scene: Scene with its 3D map.
+        cells: Number of cells along the longer side.
+
+    Returns:
+        (ny, nx) heights, south first [m], and (x_min, x_max, y_min, y_max) [m].
+    """
+    x_m, y_m = _centres(scene, cells)
+    return scene.city.height_at(*np.meshgrid(x_m, y_m)), scene.config.extent.bounds
+
+
+def plot_scene(scene: Scene, ax: Axes | None, geographic: bool | None) -> Axes:
+    """Draw heights, vegetation, devices and the UAVs' starts; see `Scene.plot`."""
+    from matplotlib import colormaps
+
+    frame, ax = PlotFrame.choose(scene.config.origin, geographic), new_axes(ax)
+    x_m, y_m = _centres(scene, PLOT_CELLS)
+    height_m = scene.city.height_at(*np.meshgrid(x_m, y_m))
+    built = height_m[height_m > MIN_HEIGHT_M]
+    top_m = max(float(np.percentile(built, 99.5)), 1.0) if len(built) else 1.0
+    ax.set_facecolor(GROUND_COLOUR)
+    drawn = draw_cells(ax, frame, x_m, y_m, np.ma.masked_less(height_m, MIN_HEIGHT_M),
+                       cmap=colormaps["YlGnBu"], vmin=0, vmax=top_m)
+    add_colour_bar(ax, drawn, "height [m]", "max" if height_m.max() > top_m else "neither")
+    draw_vegetation(ax, scene, frame)
+    draw_devices(ax, scene, frame)
+    frame.prepare(ax)
+    add_legend(ax)
+    ax.set_title(f"{plain(scene.config.name)} ({scene.config.radio.frequency_hz / 1e9:g} GHz)")
+    return ax
+
+
+def draw_outlines(ax: Axes, scene: Scene, frame: PlotFrame) -> None:
+    """Draw the outlines of the buildings.
+
+    Args:
+        ax: to draw into.
+        scene: whose buildings are drawn.
+        frame: of the axes.
+    """
+    x_m, y_m = _centres(scene, PLOT_CELLS)
+    grid_m = np.meshgrid(x_m, y_m)
+    built = scene.city.height_at(*grid_m) > BUILDING_M
+    if built.any() and not built.all():
+        ax.contour(*frame.at(*grid_m), built.astype(float), levels=[0.5], colors="black",
+                   linewidths=0.5, alpha=0.6)
+
+
+def draw_vegetation(axes: Axes, scene: Scene, frame: PlotFrame = METRES) -> None:
+    """Draw declared vegetation.
+
+    Args:
+        axes: to draw into.
+        scene: Scene that declares it.
+        frame: of the axes.
+    """
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    for number, each in enumerate(scene.config.vegetation):
+        rings = [Path(np.column_stack(frame.at(*np.array([*ring, ring[0]]).T)), closed=True)
+                 for ring in each.rings_m]
+        axes.add_patch(PathPatch(Path.make_compound_path(*rings), facecolor=VEGETATION_COLOUR,
+                                 edgecolor="none", alpha=0.45, zorder=1.5,
+                                 label="" if number else "vegetation"))
+
+
+def draw_devices(axes: Axes, scene: Scene, frame: PlotFrame = METRES) -> None:
+    """Mark anchors, devices to be found and the UAVs' starts, labelled for a legend.
+
+    Args:
+        axes: to draw into.
+        scene: Scene that declares them.
+        frame: of the axes.
+    """
+    outline: dict[str, Any] = {"edgecolors": "white", "linewidths": 0.9, "zorder": 3,
+                               "clip_on": False}
+    for role, marker, size, colour, label in MARKS:
+        points = np.array([(device.x_m, device.y_m) for device in scene.config.devices
+                           if device.role == role]).reshape(-1, 2)
+        if len(points):
+            draw_points(axes, frame, *points.T, marker=marker, s=size, color=colour, label=label,
+                        **outline)
+    starts = np.array([(uav.start_x_m, uav.start_y_m) for uav in scene.config.uavs]).reshape(-1, 2)
+    if len(starts):
+        draw_points(axes, frame, *starts.T, marker="x", s=80, color="black", linewidths=2.2,
+                    label="UAV start", zorder=3)
+
+
+def scene_raster(scene: Scene, step_m: float) -> xr.Dataset:
+    """Return the heights over the extent; see `Scene.to_xarray`."""
+    if not step_m > 0:
+        raise BadInput(f"step_m = {step_m:g} is not possible; give a length in metres, above 0")
+    x_min, x_max, y_min, y_max = scene.config.extent.bounds
+    x_m, y_m = (np.arange(low + step_m / 2, high, step_m)
+                for low, high in ((x_min, x_max), (y_min, y_max)))
+    attributes = {"name": scene.config.name}
+    if scene.config.origin is not None:
+        attributes |= {f"origin_{name}": value
+                       for name, value in scene.config.origin.model_dump().items()}
+    height_m = scene.city.height_at(*np.meshgrid(x_m, y_m)).astype(np.float32)
+    units = {"units": "m"}
+    return xr.Dataset(
+        {"height_m": (("y", "x"), height_m,
+                      units | {"long_name": "highest surface above the ground datum"})},
+        {"y": ("y", y_m, units | {"long_name": "north"}),
+         "x": ("x", x_m, units | {"long_name": "east"})}, attributes)
+
+
+def scene_table(scene: Scene, layer: str) -> GeoDataFrame:
+    """Return buildings or devices as rows with a geometry; see `Scene.to_geodataframe`."""
+    if layer not in LAYERS:
+        raise BadInput(f"layer {layer!r} is unknown; allowed are {', '.join(LAYERS)}")
+    origin = scene.config.origin
+    if layer == "devices":
+        rows = [(each.device, each.role, each.x_m, each.y_m, each.z_m)
+                for each in scene.config.devices]
+        table = pd.DataFrame(rows, columns=["device", "role", "x_m", "y_m", "z_m"])
+        return geo_data_frame(table, origin, position_m=scene.device_m)
+    import shapely
+
+    found, outlines = [], []
+    for shape in read_city(scene.xml_path):
+        corners_m = shape.mesh.vertices[shape.mesh.faces]
+        if corners_m[..., 2].max() < GROUND_M:
+            continue
+        flat = np.asarray(shapely.polygons(corners_m[..., :2]))
+        outlines.append(shapely.union_all(flat[shapely.area(flat) > 0], grid_size=1e-3))
+        found.append((shape.name, shape.material.name, float(corners_m[..., 2].max())))
+    table = pd.DataFrame(found, columns=["building", "material", "height_m"])
+    return geo_data_frame(table, origin, geometry=np.array(outlines, dtype=object))
+
+
+def _centres(scene: Scene, cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return x (nx,) and y (ny,) of cells over the extent [m]."""
+    x_min, x_max, y_min, y_max = scene.config.extent.bounds
+    cell_m = max(x_max - x_min, y_max - y_min) / cells
+    return (np.arange(x_min + cell_m / 2, x_max, cell_m),
+            np.arange(y_min + cell_m / 2, y_max, cell_m))
