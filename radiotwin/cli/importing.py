@@ -9,6 +9,7 @@ import typer
 
 from radiotwin.cli.options import parse_origin
 from radiotwin.console import print_rows, say
+from radiotwin.errors import BadInput
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -17,11 +18,15 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(
-        metavar="FILE", help=".csv, .csv.gz, .parquet, or .geojson of points.")],
+    files: Annotated[list[Path], typer.Argument(
+        metavar="FILES…", help="Logs, folders of logs, or zip files of them: texts with columns "
+                               "(.csv, .tsv, .txt, .log, also .gz), JSON lines, .geojson of "
+                               "points, .parquet, .xlsx.")],
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="Folder for measurements.csv, devices.csv, import.toml and "
                             "import.json.")],
+    format: Annotated[str | None, typer.Option(
+        "--format", help="Name of a known format [found by its columns].")] = None,
     columns: Annotated[str | None, typer.Option(
         metavar="FILE.toml|NAME=COLUMN,…",
         help="Column of each quantity: latitude=lat,longitude=lon,level=rsrp,device=cell; or a "
@@ -29,8 +34,20 @@ def import_(
     wide: Annotated[list[str] | None, typer.Option(
         metavar="NAME=COLUMN,…", help="Levels of many receivers or devices in one row: "
                                       "level=*_rss,receiver=*; may be repeated.")] = None,
+    only: Annotated[list[str] | None, typer.Option(
+        metavar="COLUMN=A|B", help="Keep the rows in which a column is one of these; may be "
+                                   "repeated.")] = None,
+    delimiter: Annotated[str | None, typer.Option(
+        help="Of a text: , ; | or tab [found].")] = None,
+    encoding: Annotated[str | None, typer.Option(
+        help="Of a text, such as cp1252 [found].")] = None,
+    decimal: Annotated[str | None, typer.Option(help="Decimal mark, . or , [found].")] = None,
+    lines_before_header: Annotated[int | None, typer.Option(help="Of a text [found].")] = None,
+    lines_after_table: Annotated[int | None, typer.Option(help="Of a text [found].")] = None,
     level_unit: Annotated[str | None, typer.Option(
         help="dBm, mW, W (received power), or dB (gain).")] = None,
+    level_offset_db: Annotated[float | None, typer.Option(
+        help="Added to each level, such as a cable's loss.")] = None,
     length_unit: Annotated[str | None, typer.Option(help="m or ft.")] = None,
     time_format: Annotated[str | None, typer.Option(
         help="epoch s, epoch ms, ISO 8601, or a strftime format.")] = None,
@@ -62,14 +79,19 @@ def import_(
         help="Table of fixed receivers, in the same form.")] = None,
     gzip: Annotated[bool, typer.Option("--gzip", help="Write measurements.csv.gz.")] = False,
 ) -> None:
-    """Import measurements from a table of any layout.
+    """Import measurements from logs and tables of any layout.
 
-    The other commands read the result. A report counts what was left out.
+    Known formats are recognised; of others the columns are declared. Several files become one
+    table with one origin, each of them a flight. The other commands read the result. A report counts what was left out.
     """
-    from radiotwin.importing import import_file, parse_columns, read_settings
+    from radiotwin.importing import import_files, parse_columns, read_settings
     from radiotwin.progress import progress
 
     given: dict[str, Any] = {
+        "format": format, "only": _choices(only), "encoding": encoding, "decimal": decimal,
+        "delimiter": "\t" if delimiter in ("tab", "\\t") else delimiter,
+        "lines_before_header": lines_before_header, "lines_after_table": lines_after_table,
+        "level_offset_db": level_offset_db,
         "level_unit": level_unit, "length_unit": length_unit,
         "time_format": time_format, "time_zone": time_zone,
         "not_detected": _values(not_detected), "not_measured": _values(not_measured),
@@ -84,14 +106,14 @@ def import_(
         given["columns"] = parse_columns(columns)
         mapping = None
     given = {name: value for name, value in given.items() if value is not None}
-    settings = read_settings(mapping, given, file.parent)
+    settings = read_settings(mapping, given, files[0].parent)
     with progress("importing", total=None) as advance:
-        report = import_file(file, settings, out, gzip, lambda step: advance(1, step))
+        report = import_files(files, settings, out, gzip, lambda step: advance(1, step))
     _print(report)
     say(f"wrote {out}: {report['written']} links, {report['not_detected']} not detected; "
         f"{report['devices']} devices ({report['anchors']} anchors), {report['receivers']} "
         f"receivers, {report['flights']} flights")
-    again = ["radiotwin", "import", file, "--columns", out / "import.toml", "-o", out]
+    again = ["radiotwin", "import", *files, "--columns", out / "import.toml", "-o", out]
     say(f"again: {shlex.join(map(str, [*again, *['--gzip'] * gzip]))}")
 
 
@@ -102,7 +124,13 @@ def _print(report: dict[str, Any]) -> None:
     rows += [["kept", "", report["kept"], ""]]
     if report["written"] != report["kept"]:
         rows += [["local means", "", report["written"], ""]]
-    print_rows(f"Readings of {report['file']}",
+    files = report["files"]
+    if len(files) > 1:
+        print_rows("Files", {"file": "left", "rows": "right", "readings": "right",
+                             "format": "left"},
+                   [[each["file"], each["rows"], each["readings"], each["format"] or "declared"]
+                    for each in files])
+    print_rows(f"Readings of {files[0]['file'] if len(files) == 1 else f'{len(files)} files'}",
                {"": "left", "column": "left", "readings": "right", "first": "left"}, rows)
     print_rows("Ranges", {"column": "left", "min": "right", "median": "right", "max": "right",
                           "unit": "left", "empty": "right"},
@@ -115,6 +143,19 @@ def _print(report: dict[str, Any]) -> None:
             .format(**report["origin"]))
     for text in report["warnings"]:
         say(f"note: {text}")
+
+
+def _choices(texts: list[str] | None) -> dict[str, list[str]] | None:
+    """Parse `COLUMN=A|B`."""
+    if texts is None:
+        return None
+    chosen = {}
+    for text in texts:
+        column, equals, values = text.partition("=")
+        if not (column.strip() and equals):
+            raise BadInput(f"--only {text!r} is not COLUMN=A|B; for example Type=LTE")
+        chosen[column.strip()] = [value.strip() for value in values.split("|")]
+    return chosen
 
 
 def _number(value: float | None, name: str) -> str:

@@ -1,14 +1,18 @@
 """Settings of an import: the same in its TOML file and in the options of the command line."""
 
+import codecs
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from radiotwin.errors import BadInput
 from radiotwin.tables import Number, Origin, Table
 
 Spec = Annotated[str, Field(min_length=1)]
 """Name of a column of the file, or `always VALUE` for a constant."""
 Positive = Annotated[Number, Field(gt=0)]
+DELIMITERS = (",", ";", "\t", "|")
+BY_DAY, BY_FILE, BY_POSITION = "by day", "by file", "by position"
 POSITION = ("latitude", "longitude", "altitude", "height", "x", "y", "z")
 
 
@@ -54,7 +58,7 @@ class Columns(Position):
     level: Spec | None = None
     device: Spec | None = None
     receiver: Spec = "always receiver"
-    flight: Spec = "always flight"
+    flight: Spec | None = None
     time: Spec | None = None
     device_latitude: Spec | None = None
     device_longitude: Spec | None = None
@@ -68,6 +72,7 @@ class Columns(Position):
     pitch: Spec | None = None
     roll: Spec | None = None
     quality: Spec | None = None
+    snr: Spec | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -91,6 +96,7 @@ class Wide(Position):
     level: Spec | list[Spec]
     receiver: Spec | None = None
     device: Spec | None = None
+    level_offset_db: Number = 0.0
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -102,9 +108,21 @@ class Wide(Position):
 
 
 class Settings(Table):
-    """Settings of an import."""
+    """Settings of an import.
 
+    The lines and marks of a text are found in each file where they are not declared.
+    """
+
+    format: str | None = Field(None, max_length=50, description="name of a known format")
+    encoding: str | None = Field(None, max_length=50)
+    delimiter: Literal[",", ";", "\t", "|"] | None = None
+    decimal: Literal[".", ","] | None = None
+    lines_before_header: int | None = Field(None, ge=0, le=100)
+    lines_after_table: int | None = Field(None, ge=0, le=10_000)
+    only: dict[Spec, list[Number | str]] = Field(
+        {}, description="column -> texts of the rows that are kept")
     level_unit: Literal["dBm", "dB", "mW", "W"] | None = None
+    level_offset_db: Number = Field(0.0, description="added to each level")
     length_unit: Literal["m", "ft"] | None = None
     time_format: str | None = Field(
         None, max_length=200,
@@ -132,16 +150,9 @@ class Settings(Table):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if not self.wide and not self.columns.level:
-            raise ValueError("columns.level is missing: which column holds the level? For example "
-                             'level = "rsrp"')
         if self.wide and self.columns.level:
             raise ValueError("columns.level and wide cannot both be given: the levels are in one "
                              "column or in many")
-        wide_devices = self.wide and all(block.device for block in self.wide)
-        if not self.columns.device and not wide_devices:
-            raise ValueError("columns.device is missing: which device was heard? A column, "
-                             '"always NAME", or "by position"')
         if self.average_m and self.columns.quality:
             raise ValueError("average_m writes the number of readings into quality; leave "
                              "columns.quality out")
@@ -150,3 +161,35 @@ class Settings(Table):
             if None not in both and both[0] >= both[1]:
                 raise ValueError(f"{low} = {both[0]:g} must be less than {high} = {both[1]:g}")
         return self
+
+    @field_validator("encoding")
+    @classmethod
+    def _known(cls, name: str | None) -> str | None:
+        try:
+            if name is not None:
+                codecs.getincrementaldecoder(name)
+                "a".encode(name)  # of some names are no texts
+        except (LookupError, ValueError):
+            raise ValueError("unknown; allowed are utf-8, utf-16, cp1252, latin-1 and other names "
+                             "that Python knows") from None
+        return name
+
+    def require_columns(self, source: str) -> None:
+        """Check that there are columns of levels and of devices, and the levels' unit.
+
+        Args:
+            source: the file, for the message.
+
+        Raises:
+            BadInput: names all that is missing.
+        """
+        missing = []
+        if not self.wide and not self.columns.level:
+            missing += ["columns.level is missing: which column holds the level? For example "
+                        'level = "rsrp"']
+        wide_devices = self.wide and all(block.device for block in self.wide)
+        if not self.columns.device and not wide_devices:
+            missing += ["columns.device is missing: which device was heard? A column, "
+                        '"always NAME", or "by position"']
+        if missing:
+            raise BadInput(f"{source}: {'; '.join(missing)}")

@@ -61,6 +61,31 @@ def read_settings(path: Path | str | None, given: Mapping[str, Any],
         raise BadInput("\n".join(reversed(lines.values()))) from None
 
 
+def merged(settings: Settings, defaults: Mapping[str, Any]) -> Settings:
+    """Return settings with defaults for what they do not declare.
+
+    Args:
+        settings: of the import.
+        defaults: fields of `Settings`; a position counts only where none is declared.
+
+    Raises:
+        BadInput: both together are not allowed.
+    """
+    own = settings.model_dump(exclude_unset=True, exclude_none=True)
+    columns = dict(defaults.get("columns", {}))
+    declared = set(own.get("columns", {}))
+    for prefix in ("", "device_"):
+        for group in (("latitude", "longitude", "x", "y"), ("altitude", "height", "z")):
+            names = {prefix + name for name in group}
+            if declared & names:
+                columns = {name: spec for name, spec in columns.items() if name not in names}
+    data = {**defaults, **own, "columns": columns | own.get("columns", {})}
+    try:
+        return Settings.model_validate(data)
+    except ValidationError as error:
+        raise BadInput("\n".join(_message(problem, None) for problem in error.errors())) from None
+
+
 def _table_of(settings: Path, name: str, data_folder: Path | None) -> Path:
     """Return the path of a table that a settings file names, which may be a stranger's."""
     path = settings.parent / name

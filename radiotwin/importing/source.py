@@ -1,6 +1,7 @@
 """A file of measurements as a table whose cells can be named in a message."""
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +12,10 @@ from numpy.typing import ArrayLike
 from radiotwin.budgets import CELLS, COLUMNS, ROWS
 from radiotwin.cells import as_numbers, listed, read_cells, shown
 from radiotwin.errors import BadInput
+from radiotwin.importing.dialect import find_dialect
+from radiotwin.importing.log_files import BINARIES, TEXTS, LogFile
+from radiotwin.importing.settings import Settings
+from radiotwin.importing.text_table import read_text_table
 from radiotwin.inputs import read_json
 from radiotwin.tables import name_fault
 
@@ -19,7 +24,7 @@ EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
 ALWAYS = "always "
 """Prefix of a constant in place of a column's name."""
 _ROWS_AT_ONCE = 1_000_000  # of which stripped texts are made
-FORMATS = (".csv", ".parquet", ".geojson", ".json")
+_TEMPLATE = re.compile(r"\{([^{}]+)\}")
 
 
 @dataclass(frozen=True)
@@ -27,34 +32,61 @@ class Source:
     """A table whose index is the position of each row in the file.
 
     Attributes:
-        path: of the file.
+        path: of the file, or a name of several, for messages.
         table: cells as in the file.
         where: index -> `row 7`, as the file's user counts.
+        notes: on how the file was read.
     """
 
-    path: Path
+    path: Path | str
     table: pd.DataFrame
     where: Callable[[int], str]
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.table)
 
     def cells(self, spec: str, purpose: str) -> pd.Series:
-        """Return the cells of a column, or a constant.
+        """Return the cells of a column, a constant, or texts made of several columns.
 
         Args:
-            spec: name of a column, or `always VALUE`.
+            spec: name of a column, `always VALUE`, or a text with names in braces, such as
+                `{Date} {Time}`, which is empty where one of these cells is.
             purpose: what they are needed for, for the message.
 
         Raises:
             BadInput: no such column.
         """
+        if spec in self.table:
+            return self.table[spec]
         if spec.startswith(ALWAYS):
             return pd.Series(spec.removeprefix(ALWAYS), index=self.table.index)
-        if spec not in self.table:
-            raise BadInput(f"{self.path}: column {spec!r} ({purpose}) is missing; the file has "
+        self.require({purpose: spec})
+        pieces = _TEMPLATE.split(spec)  # constant, name, constant, name, …
+        columns = {name: as_text(self.table[name]) for name in pieces[1::2]}
+        text = pd.Series(pieces[0], index=self.table.index, dtype=str)
+        for name, constant in zip(pieces[1::2], pieces[2::2]):
+            text = text + columns[name] + constant
+        for cells in columns.values():
+            text = text.mask(cells == "", "")
+        return text
+
+    def require(self, specs: Mapping[str, str]) -> None:
+        """Check that the file has all columns of a mapping.
+
+        Args:
+            specs: what they are needed for -> as in `cells`.
+
+        Raises:
+            BadInput: names all that are missing.
+        """
+        missing = [f"{name!r} ({purpose})" for purpose, spec in specs.items()
+                   for name in columns_of(spec, self.table) if name not in self.table]
+        if missing:
+            several = len(missing) > 1
+            raise BadInput(f"{self.path}: column{'s' * several} {', '.join(missing)} "
+                           f"{'are' if several else 'is'} missing; the file has "
                            f"{listed(self.table.columns)}. Correct the mapping")
-        return self.table[spec]
 
     def text(self, spec: str, purpose: str) -> pd.Series:
         """Return the cells as stripped texts, `""` where empty.
@@ -90,7 +122,7 @@ class Source:
 
     def without_cells(self) -> "Source":
         """Return the same file for messages only, without the memory of its cells."""
-        return Source(self.path, self.table.iloc[:0], self.where)
+        return Source(self.path, self.table.iloc[:0], self.where, self.notes)
 
     def numbers(self, spec: str, purpose: str) -> np.ndarray:
         """Return the cells as numbers, (n,); NaN where empty.
@@ -154,26 +186,55 @@ def as_text(cells: pd.Series) -> pd.Series:
     return text.mask(cells.isna() | text.str.lower().isin(EMPTY), "")
 
 
-def read_source(path: Path | str) -> Source:
+def columns_of(spec: str, header: Iterable[object]) -> list[str]:
+    """Return the names of columns in an entry of a mapping.
+
+    Args:
+        spec: as in `Source.cells`.
+        header: names of the file's columns; a name may have braces itself.
+    """
+    if spec.startswith(ALWAYS) and spec not in header:
+        return []
+    return _TEMPLATE.findall(spec) if _TEMPLATE.search(spec) and spec not in header else [spec]
+
+
+def read_source(file: LogFile | Path | str, settings: Settings | None = None,
+                expected: Sequence[Collection[str]] = ()) -> Source:
     """Open a file of measurements.
 
     Args:
-        path: `.csv`, `.csv.gz`, `.parquet`, or `.geojson` of points.
+        file: of one of the formats of `log_files`.
+        settings: with what is declared about a text; the rest is found.
+        expected: sets of columns, of which a text's header is likely to have one, in lower case.
 
     Raises:
         BadInput: another format, unreadable, or without rows.
     """
-    path = Path(path)
-    if path.suffix not in FORMATS and path.suffixes[-2:] != [".csv", ".gz"]:
-        raise BadInput(f"{path}: unknown format; allowed are .csv.gz, {', '.join(FORMATS)}")
-    if path.suffix in (".geojson", ".json"):
-        source = Source(path, _read_geojson(path), lambda index: f"feature {index + 1}")
+    if not isinstance(file, LogFile):
+        file = LogFile(Path(file), Path(file).name)
+    if file.suffix == ".parquet":
+        source = Source(file.path, read_cells(file.path), lambda index: f"row {index + 1}")
+    elif file.suffix in (".geojson", ".json"):
+        source = Source(file.path, _read_geojson(file.path), lambda index: f"feature {index + 1}")
+    elif file.suffix in TEXTS:
+        source = _read_text(file, settings or Settings(), expected)
     else:
-        first = 1 if path.suffix == ".parquet" else 2
-        source = Source(path, read_cells(path), lambda index: f"row {index + first}")
+        raise BadInput(f"{file}: unknown format; allowed are {', '.join((*TEXTS, *BINARIES))}, and "
+                       "the first ones with .gz")
     if not len(source):
-        raise BadInput(f"{path}: has no rows; it needs at least one measurement")
+        raise BadInput(f"{file}: has no rows; it needs at least one measurement")
     return source
+
+
+def _read_text(file: LogFile, settings: Settings, expected: Sequence[Collection[str]]) -> Source:
+    """Read a text: by the faster parser where it is plain CSV."""
+    dialect = find_dialect(file, settings, expected)
+    description = dialect.described()
+    if not description and file.member is None and file.suffix == ".csv":
+        return Source(file.path, read_cells(file.path), lambda index: f"row {index + 2}")
+    table, lines = read_text_table(file, dialect)
+    notes = (f"{file.name}: {description}",) if description else ()
+    return Source(str(file), table, lambda index: f"line {lines[index]}", notes)
 
 
 def _read_geojson(path: Path) -> pd.DataFrame:

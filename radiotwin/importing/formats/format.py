@@ -1,0 +1,60 @@
+"""A known format: which columns hold what, in which unit, and where that is described."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from radiotwin.importing.source import columns_of
+
+MADE_UP = "made-up"
+"""Tried on a file that was made up after the description only."""
+
+
+@dataclass(frozen=True)
+class Format:
+    """The mapping of a known format.
+
+    Attributes:
+        name: as of `--format`.
+        title: of the program that writes it.
+        columns: quantity of `Columns` -> entry of a mapping, or several, of which the first counts
+            whose columns the file has; names in any case.
+        signature: columns by which a file is recognised.
+        level: what the level is, with its unit.
+        source: of the description.
+        settings: others than `columns`.
+        tried_on: `MADE_UP`, or which original.
+        caution: of the units, which is printed at every import.
+    """
+
+    name: str
+    title: str
+    columns: Mapping[str, str | tuple[str, ...]]
+    signature: tuple[str, ...]
+    level: str
+    source: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    tried_on: str = MADE_UP
+    caution: str = ""
+
+    def fits(self, header: Iterable[str]) -> bool:
+        """Return whether a header has the signature."""
+        return {name.lower() for name in self.signature} <= {name.lower() for name in header}
+
+    def mapping(self, header: Iterable[str]) -> dict[str, str]:
+        """Return the entries of `columns` for a header, without what it does not have.
+
+        Args:
+            header: names of the file's columns.
+        """
+        actual = {name.lower(): name for name in header}
+        result = {}
+        for quantity, entries in self.columns.items():
+            for entry in (entries,) if isinstance(entries, str) else entries:
+                names = columns_of(entry, actual)
+                if all(name.lower() in actual for name in names):
+                    for name in names:
+                        entry = entry.replace(name, actual[name.lower()])
+                    result[quantity] = entry
+                    break
+        return result
