@@ -42,12 +42,16 @@ def import_(
     encoding: Annotated[str | None, typer.Option(
         help="Of a text, such as cp1252 [found].")] = None,
     decimal: Annotated[str | None, typer.Option(help="Decimal mark, . or , [found].")] = None,
+    header: Annotated[str | None, typer.Option(
+        metavar="NAME,…", help="Names of the columns of a text without a header.")] = None,
     lines_before_header: Annotated[int | None, typer.Option(help="Of a text [found].")] = None,
     lines_after_table: Annotated[int | None, typer.Option(help="Of a text [found].")] = None,
     level_unit: Annotated[str | None, typer.Option(
         help="dBm, mW, W (received power), or dB (gain).")] = None,
     level_offset_db: Annotated[float | None, typer.Option(
         help="Added to each level, such as a cable's loss.")] = None,
+    band_hz: Annotated[str | None, typer.Option(
+        metavar="LOW,HIGH", help="Band whose power counts, of a spectrum scan.")] = None,
     length_unit: Annotated[str | None, typer.Option(help="m or ft.")] = None,
     time_format: Annotated[str | None, typer.Option(
         help="epoch s, epoch ms, ISO 8601, or a strftime format.")] = None,
@@ -91,7 +95,9 @@ def import_(
         "format": format, "only": _choices(only), "encoding": encoding, "decimal": decimal,
         "delimiter": "\t" if delimiter in ("tab", "\\t") else delimiter,
         "lines_before_header": lines_before_header, "lines_after_table": lines_after_table,
+        "header": header.split(",") if header else None,
         "level_offset_db": level_offset_db,
+        "band_hz": band_hz.split(",") if band_hz else None,
         "level_unit": level_unit, "length_unit": length_unit,
         "time_format": time_format, "time_zone": time_zone,
         "not_detected": _values(not_detected), "not_measured": _values(not_measured),

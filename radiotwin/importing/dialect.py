@@ -3,6 +3,7 @@
 import codecs
 import csv
 import re
+from collections import Counter
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import IO
@@ -34,6 +35,8 @@ class Dialect:
         decimal: `.` or `,`.
         before: lines before the header.
         after: lines after the last row, blank ones not counted.
+        repeated: a name of a column that occurs more than once, or `""`.
+        names: of the columns where there is no header.
     """
 
     encoding: str = "utf-8"
@@ -41,41 +44,56 @@ class Dialect:
     decimal: str = "."
     before: int = 0
     after: int = 0
+    repeated: str = ""
+    names: tuple[str, ...] = ()
 
     def described(self) -> str:
         """Return what differs from comma-separated UTF-8, or `""`."""
         parts = [f"separated by {_NAMES[self.delimiter]}" * (self.delimiter != ","),
                  "decimal commas" * (self.decimal == ","),
                  f"encoding {self.encoding}" * (not self.encoding.startswith("utf-8")),
-                 _lines(self.before, "before the header"), _lines(self.after, "after the table")]
+                 "no header" * bool(self.names), _lines(self.before, "before the header"),
+                 _lines(self.after, "after the table")]
+        if self.repeated:
+            parts.append(f"column {shown(self.repeated)} occurs more than once: the others are "
+                         f"{self.repeated}.2, …")
         return ", ".join(filter(None, parts))
 
 
-def find_dialect(file: LogFile, settings: Settings,
-                 expected: Sequence[Collection[str]]) -> Dialect:
+def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collection[str]],
+                 names: Sequence[str]) -> Dialect:
     """Find how a text holds a table; what is declared is not looked for.
 
     Args:
         file: of text.
         settings: with what is declared.
         expected: sets of columns, of which the header is likely to have one, in lower case.
+        names: of the columns, if the text has no header.
 
     Raises:
         BadInput: it is no text, not in the declared encoding, or its decimal mark is ambiguous.
     """
     with file.open() as content:
         head, tail, whole, encoding = _scan(content, file, settings.encoding)
-    lines = head.decode(encoding, "replace").splitlines()
+    lines = head.decode(encoding, "replace").removeprefix("\ufeff").splitlines()
     lines = (lines if whole else lines[:-1])[:_LINES]
-    before, delimiter = _header(lines, settings, expected)
-    header = _fields(lines[before], delimiter) if before < len(lines) else []
-    rows = [_fields(line, delimiter) for line in lines[before + 1:]]
+    if names:
+        before = settings.lines_before_header or 0
+        delimiter = settings.delimiter or _delimiter(lines[before:], len(names))
+        header, first = list(names), before
+    else:
+        before, delimiter = _header(lines, settings, expected)
+        header = _fields(lines[before], delimiter) if before < len(lines) else []
+        first = before + 1
+    rows = [_fields(line, delimiter) for line in lines[first:]]
     decimal = settings.decimal or _decimal(file, delimiter, rows)
     after = settings.lines_after_table
     if after is None:
         last = tail.decode(encoding, "replace").splitlines()
-        after = _trailer(lines[before + 1:] if whole else last[1:], delimiter, header)
-    return Dialect(encoding, delimiter, decimal, before, after)
+        after = _trailer(lines[first:] if whole else last[1:], delimiter, header)
+    stripped = [name.strip() for name in header]
+    repeated = next((name for i, name in enumerate(stripped) if name and name in stripped[:i]), "")
+    return Dialect(encoding, delimiter, decimal, before, after, repeated, tuple(names))
 
 
 def fits(row: Sequence[str], columns: int) -> bool:
@@ -84,11 +102,20 @@ def fits(row: Sequence[str], columns: int) -> bool:
 
 
 def header_names(fields: Sequence[str]) -> list[str]:
-    """Return names of columns: without a last empty one, others that are empty are numbered."""
-    names = [name.strip() for name in fields]
+    """Return names of columns: without a last empty one, empty and repeated ones numbered."""
+    names = [re.sub("[\u200b\ufeff]", "", name).strip() for name in fields]  # of no width
     if len(names) > 1 and not names[-1]:
         names = names[:-1]
-    return [name or f"column {number}" for number, name in enumerate(names, start=1)]
+    names = [name or f"column {number}" for number, name in enumerate(names, start=1)]
+    used, count = set(names), Counter[str]()
+    for i, name in enumerate(names):
+        count[name] += 1
+        if count[name] > 1:
+            while f"{name}.{count[name]}" in used:
+                count[name] += 1
+            names[i] = f"{name}.{count[name]}"
+            used.add(names[i])
+    return names
 
 
 def _lines(number: int, where: str) -> str:
@@ -134,6 +161,12 @@ def _fields(line: str, delimiter: str) -> list[str]:
         return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
     except csv.Error:
         return []
+
+
+def _delimiter(lines: list[str], columns: int) -> str:
+    """Return the delimiter with which most lines have so many fields."""
+    return max(DELIMITERS, key=lambda each: sum(fits(_fields(line, each), columns)
+                                                for line in lines))
 
 
 def _header(lines: list[str], settings: Settings,

@@ -128,11 +128,11 @@ def _links_of(source: Source, level: LevelColumn, shared: pd.DataFrame, settings
                 raise BadInput(f"{source.path}: {name} {shown(spec)} of column {level.spec} "
                                f"{fault}")
             links[name] = spec
-    levels = read_levels(source, level.spec, settings)
-    offset_db = settings.level_offset_db + level.offset_db
-    if "snr" in links:
+    offset_db: float | np.ndarray = settings.level_offset_db + level.offset_db
+    if "snr" in links:  # below the noise, RSSI is that of the noise (Semtech, SX1276, 5.5.5)
         offset_db = offset_db + np.minimum(links.pop("snr").fillna(0.0).to_numpy(), 0.0)
-    links["level_db"] = levels.db + offset_db
+    levels = read_levels(source, level.spec, settings, offset_db)
+    links["level_db"] = levels.db
     unmeasured = levels.not_measured
     links = tally.drop(links, unmeasured, "not measured", level.spec, source.where)
     links = tally.drop(links, levels.impossible[~unmeasured], "impossible level", level.spec,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePath, PurePosixPath
 from typing import IO
 
-from radiotwin.budgets import FILE_BYTES, IMPORT_FILES
+from radiotwin.budgets import FILE_BYTES, IMPORT_FILES, Budget
 from radiotwin.errors import BadInput
 from radiotwin.inputs import bounded, is_within, open_gzip, open_input
 
@@ -59,6 +59,24 @@ class LogFile:
                     yield content
             except zipfile.BadZipFile as error:
                 raise BadInput(f"{self} is damaged ({error}); make the zip file again") from None
+
+    def read_text(self, budget: Budget) -> str:
+        """Read a text in UTF-8.
+
+        Args:
+            budget: of its bytes.
+
+        Raises:
+            BadInput: it cannot be read, is too large, or no UTF-8.
+        """
+        with self.open() as file:
+            data = file.read(budget.limit + 1)
+        budget.check(len(data), self)
+        try:
+            return data.decode("utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise BadInput(f"{self} is not text in UTF-8 (byte {error.start + 1}); save it as "
+                           "UTF-8") from None
 
 
 def list_files(paths: Iterable[Path | str], without: Iterable[str]) -> tuple[list[LogFile], int]:

@@ -9,8 +9,9 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.budgets import ROWS
+from radiotwin.cells import listed
 from radiotwin.errors import BadInput
-from radiotwin.importing.formats import find_format, format_named, signatures
+from radiotwin.importing.formats import FORMATS, expected, find_format, format_named
 from radiotwin.importing.levels import LEVEL_COLUMN
 from radiotwin.importing.links import build_links
 from radiotwin.importing.log_files import LogFile, flight_names
@@ -65,14 +66,13 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
     level_columns: dict[str, str] = {}
     formats, notes = set(), []
     rows = 0
-    expected = [_expected(settings), *signatures()]
-    if settings.format:
-        expected = [{name.lower() for name in format_named(settings.format).signature}]
+    may_be = expected([format_named(settings.format)] if settings.format else FORMATS,
+                      _declared_columns(settings))
     by_default = BY_FILE if len(files) > 1 else "always flight"
     for file, name in zip(files, flight_names(files)):
         on_progress(f"reading {file.name}" if len(files) > 1 else "reading")
         with problems.noted():
-            source = read_source(file, settings, expected)
+            source = read_source(file, settings, may_be)
             own, format_name, caution = _settings_of(source, settings, by_default)
             source = _numbered_from(source, rows, file.name if len(files) > 1 else "")
             wheres.append((rows, source.where))
@@ -109,7 +109,7 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
                 list(dict.fromkeys(notes)), formats.pop() if len(formats) == 1 else None)
 
 
-def _expected(settings: Settings) -> set[str]:
+def _declared_columns(settings: Settings) -> set[str]:
     """Return the columns that the mapping names, in lower case."""
     specs = settings.columns.model_dump(exclude_none=True).values()
     names = {name.lower() for spec in specs for name in columns_of(spec, ())}
@@ -128,10 +128,8 @@ def _settings_of(source: Source, settings: Settings,
     if settings.format:
         found = format_named(settings.format)
         if not found.fits(header):
-            missing = [name for name in found.signature
-                       if name.lower() not in map(str.lower, header)]
-            raise BadInput(f"{source.path} is not of format {found.name}: column {missing[0]!r} is "
-                           f"missing; it has {', '.join(header[:50])}")
+            raise BadInput(f"{source.path} is not of format {found.name}, which has the columns "
+                           f"{', '.join(found.signature)}; it has {listed(header)}")
     elif not settings.columns.level and not settings.wide:
         found = find_format(header)
     defaults: Mapping[str, Any] = {"columns": {"flight": flight}}

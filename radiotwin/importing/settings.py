@@ -117,10 +117,14 @@ class Settings(Table):
     encoding: str | None = Field(None, max_length=50)
     delimiter: Literal[",", ";", "\t", "|"] | None = None
     decimal: Literal[".", ","] | None = None
+    header: list[Spec] = Field([], max_length=5000, description="names of the columns of a text "
+                                                                "without a header")
     lines_before_header: int | None = Field(None, ge=0, le=100)
     lines_after_table: int | None = Field(None, ge=0, le=10_000)
     only: dict[Spec, list[Number | str]] = Field(
         {}, description="column -> texts of the rows that are kept")
+    band_hz: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = Field(
+        None, description="edges of the band whose power counts, of a spectrum scan")
     level_unit: Literal["dBm", "dB", "mW", "W"] | None = None
     level_offset_db: Number = Field(0.0, description="added to each level")
     length_unit: Literal["m", "ft"] | None = None
@@ -156,6 +160,8 @@ class Settings(Table):
         if self.average_m and self.columns.quality:
             raise ValueError("average_m writes the number of readings into quality; leave "
                              "columns.quality out")
+        if self.band_hz and self.band_hz[0] >= self.band_hz[1]:
+            raise ValueError("band_hz: give the lower edge first, such as [433.05e6, 434.79e6]")
         for low, high in (("min_level", "max_level"), ("min_distance_m", "max_distance_m")):
             both = getattr(self, low), getattr(self, high)
             if None not in both and both[0] >= both[1]:

@@ -1,7 +1,7 @@
 """A file of measurements as a table whose cells can be named in a message."""
 
 import re
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,20 +9,22 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from radiotwin.budgets import CELLS, COLUMNS, ROWS
+from radiotwin.budgets import CELLS, COLUMNS, DOCUMENT_BYTES, ROWS
 from radiotwin.cells import as_numbers, listed, read_cells, shown
 from radiotwin.errors import BadInput
 from radiotwin.importing.dialect import find_dialect
+from radiotwin.importing.json_lines import read_json_lines
 from radiotwin.importing.log_files import BINARIES, TEXTS, LogFile
 from radiotwin.importing.settings import Settings
 from radiotwin.importing.text_table import read_text_table
-from radiotwin.inputs import read_json
+from radiotwin.inputs import parse_json
 from radiotwin.tables import name_fault
 
 EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
 """Texts, in lower case, of cells without a value."""
 ALWAYS = "always "
 """Prefix of a constant in place of a column's name."""
+_HEAD_BYTES = 2**16  # in which the first line is looked for
 _ROWS_AT_ONCE = 1_000_000  # of which stripped texts are made
 _TEMPLATE = re.compile(r"\{([^{}]+)\}")
 
@@ -198,14 +200,42 @@ def columns_of(spec: str, header: Iterable[object]) -> list[str]:
     return _TEMPLATE.findall(spec) if _TEMPLATE.search(spec) and spec not in header else [spec]
 
 
+@dataclass(frozen=True)
+class WithoutHeader:
+    """A text whose file has no header.
+
+    Attributes:
+        first_line: regular expression of its whole first line.
+        names: of its columns.
+        read: returns cells and the line of each row, where it is no table with these columns.
+    """
+
+    first_line: str
+    names: tuple[str, ...] = ()
+    read: Callable[[LogFile, Settings], tuple[pd.DataFrame, np.ndarray]] | None = None
+
+
+@dataclass(frozen=True)
+class Expected:
+    """What a file may have.
+
+    Attributes:
+        columns: sets of columns, of which a header is likely to have one, in lower case.
+        without_header: formats of texts without a header.
+    """
+
+    columns: tuple[frozenset[str], ...] = ()
+    without_header: tuple[WithoutHeader, ...] = ()
+
+
 def read_source(file: LogFile | Path | str, settings: Settings | None = None,
-                expected: Sequence[Collection[str]] = ()) -> Source:
+                expected: Expected = Expected()) -> Source:
     """Open a file of measurements.
 
     Args:
         file: of one of the formats of `log_files`.
         settings: with what is declared about a text; the rest is found.
-        expected: sets of columns, of which a text's header is likely to have one, in lower case.
+        expected: what it may have.
 
     Raises:
         BadInput: another format, unreadable, or without rows.
@@ -214,8 +244,8 @@ def read_source(file: LogFile | Path | str, settings: Settings | None = None,
         file = LogFile(Path(file), Path(file).name)
     if file.suffix == ".parquet":
         source = Source(file.path, read_cells(file.path), lambda index: f"row {index + 1}")
-    elif file.suffix in (".geojson", ".json"):
-        source = Source(file.path, _read_geojson(file.path), lambda index: f"feature {index + 1}")
+    elif file.suffix == ".geojson" or (file.suffix == ".json" and _is_document(file)):
+        source = Source(str(file), _read_geojson(file), lambda index: f"feature {index + 1}")
     elif file.suffix in TEXTS:
         source = _read_text(file, settings or Settings(), expected)
     else:
@@ -226,20 +256,43 @@ def read_source(file: LogFile | Path | str, settings: Settings | None = None,
     return source
 
 
-def _read_text(file: LogFile, settings: Settings, expected: Sequence[Collection[str]]) -> Source:
+def _read_text(file: LogFile, settings: Settings, expected: Expected) -> Source:
     """Read a text: by the faster parser where it is plain CSV."""
-    dialect = find_dialect(file, settings, expected)
-    description = dialect.described()
-    if not description and file.member is None and file.suffix == ".csv":
-        return Source(file.path, read_cells(file.path), lambda index: f"row {index + 2}")
-    table, lines = read_text_table(file, dialect)
-    notes = (f"{file.name}: {description}",) if description else ()
+    first = _first_line(file)
+    kind = next((each for each in expected.without_header
+                 if re.fullmatch(each.first_line, first)), None)
+    notes: tuple[str, ...] = ()
+    if first.startswith("{"):
+        table, lines = read_json_lines(file)
+    elif kind is not None and kind.read is not None:
+        table, lines = kind.read(file, settings)
+    else:
+        names = settings.header or (list(kind.names) if kind is not None else [])
+        dialect = find_dialect(file, settings, expected.columns, names)
+        description = dialect.described()
+        if not description and file.member is None and file.suffix == ".csv":
+            return Source(file.path, read_cells(file.path), lambda index: f"row {index + 2}")
+        notes = (f"{file.name}: {description}",) * bool(description)
+        table, lines = read_text_table(file, dialect)
     return Source(str(file), table, lambda index: f"line {lines[index]}", notes)
 
 
-def _read_geojson(path: Path) -> pd.DataFrame:
+def _first_line(file: LogFile) -> str:
+    """Return the first line that is not blank, or as much of it as is enough to recognise it."""
+    with file.open() as content:
+        head = content.read(_HEAD_BYTES).decode("latin-1").removeprefix("\u00ef\u00bb\u00bf")
+    return next((line for line in map(str.strip, head.splitlines()) if line), "")
+
+
+def _is_document(file: LogFile) -> bool:
+    """Return whether a JSON file is one document: its first line is none by itself, or GeoJSON."""
+    first = _first_line(file)
+    return "FeatureCollection" in first or not (first.startswith("{") and first.endswith("}"))
+
+
+def _read_geojson(path: LogFile) -> pd.DataFrame:
     """Return one row per point: longitude, latitude, altitude (RFC 7946, 3.1.1) and properties."""
-    data = read_json(path, "GeoJSON file")
+    data = parse_json(path.read_text(DOCUMENT_BYTES), path)
     features = data.get("features") if isinstance(data, dict) else None
     if not isinstance(features, list):
         raise BadInput(f"{path} is not a GeoJSON FeatureCollection; allowed is one of points")
@@ -255,7 +308,7 @@ def _read_geojson(path: Path) -> pd.DataFrame:
     return pd.DataFrame(points)
 
 
-def _point(path: Path, number: int, feature: object) -> dict[str, object]:
+def _point(path: LogFile, number: int, feature: object) -> dict[str, object]:
     """Return the properties and coordinates of a GeoJSON feature."""
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
     kind = geometry.get("type") if isinstance(geometry, dict) else None

@@ -9,10 +9,10 @@ from itertools import islice
 import numpy as np
 import pandas as pd
 
-from radiotwin.budgets import CELLS, COLUMNS, ROW_BYTES, ROWS
-from radiotwin.cells import shown
+from radiotwin.budgets import CELLS, COLUMNS, ROWS
 from radiotwin.errors import BadInput
 from radiotwin.importing.dialect import COMMA, Dialect, fits, header_names
+from radiotwin.importing.lines import Lines
 from radiotwin.importing.log_files import LogFile
 from radiotwin.spreadsheet import unquoted, without_quotes
 
@@ -33,7 +33,7 @@ def read_text_table(file: LogFile, dialect: Dialect) -> tuple[pd.DataFrame, np.n
         BadInput: no header, a repeated name, or a row with too few or too many fields.
     """
     with file.open() as content, io.TextIOWrapper(content, dialect.encoding, newline="") as text:
-        lines = _Lines(text, file)
+        lines = Lines(text, file)
         for _ in islice(lines, dialect.before):
             pass
         reader = csv.reader(lines, delimiter=dialect.delimiter, skipinitialspace=True)
@@ -46,38 +46,15 @@ def read_text_table(file: LogFile, dialect: Dialect) -> tuple[pd.DataFrame, np.n
             raise BadInput(f"{file} is not text in {dialect.encoding}; give --encoding") from None
 
 
-class _Lines:
-    """Lines of a text, counted and bounded."""
-
-    def __init__(self, text: io.TextIOWrapper, file: LogFile) -> None:
-        self._text, self._file, self.number = text, file, 0
-
-    def __iter__(self) -> Iterator[str]:
-        return self
-
-    def __next__(self) -> str:
-        line = self._text.readline(ROW_BYTES.limit)
-        if not line:
-            raise StopIteration
-        if len(line) == ROW_BYTES.limit and not line.endswith(("\n", "\r")):
-            ROW_BYTES.refuse(f"{self._file}: line {self.number + 1}",
-                             f"a line of {ROW_BYTES.limit:,} characters and more")
-        self.number += 1
-        return line if self.number > 1 else line.removeprefix("\ufeff")
-
-
 def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
-          lines: _Lines) -> tuple[pd.DataFrame, np.ndarray]:
-    fields = next(filter(None, reader), [])
-    COLUMNS.check(len(fields), f"{file}: header")
-    names = [unquoted(name) for name in header_names(fields)]
+          lines: Lines) -> tuple[pd.DataFrame, np.ndarray]:
+    names = list(dialect.names)
+    if not names:
+        fields = next(filter(None, reader), [])
+        COLUMNS.check(len(fields), f"{file}: header")
+        names = header_names([unquoted(name) for name in fields])
     if not names:
         raise BadInput(f"{file} is empty; it needs a row with the names of the columns")
-    repeated = pd.Index(names, dtype=object).duplicated()
-    if repeated.any():
-        raise BadInput(f"{file}: line {lines.number}: column "
-                       f"{shown(names[int(np.argmax(repeated))])} occurs twice; every name must be "
-                       "unique")
     chunk_rows = max(_CHUNK_CELLS // len(names), 1)
     chunks, numbers = [], []
     rows: list[list[str]] = []
@@ -101,7 +78,7 @@ def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
     return pd.concat(chunks, ignore_index=True), np.array(numbers, dtype=np.int64)
 
 
-def _without_last(reader: Iterator[list[str]], lines: _Lines,
+def _without_last(reader: Iterator[list[str]], lines: Lines,
                   after: int) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows that are not blank, with their lines, without the last ones."""
     waiting: deque[tuple[int, list[str]]] = deque()

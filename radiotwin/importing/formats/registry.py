@@ -1,17 +1,27 @@
 """All known formats."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.formats import phone
+from radiotwin.importing.formats import drive_test, lora, phone, scanner
 from radiotwin.importing.formats.format import Format
+from radiotwin.importing.source import Expected
 
-FORMATS: tuple[Format, ...] = (*phone.FORMATS,)
+FORMATS: tuple[Format, ...] = (*phone.FORMATS, *drive_test.FORMATS, *lora.FORMATS,
+                              *scanner.FORMATS)
 
 
-def signatures() -> list[set[str]]:
-    """Return the columns by which each format is recognised, in lower case."""
-    return [{name.lower() for name in each.signature} for each in FORMATS]
+def expected(formats: Iterable[Format], columns: Collection[str] = ()) -> Expected:
+    """Return what a file may have.
+
+    Args:
+        formats: that it may be of.
+        columns: of a declared mapping, in lower case.
+    """
+    formats = list(formats)
+    signatures = [frozenset(name.lower() for name in each.signature) for each in formats]
+    return Expected((frozenset(columns), *signatures),
+                    tuple(each.without_header for each in formats if each.without_header))
 
 
 def find_format(header: Iterable[str]) -> Format | None:
