@@ -179,7 +179,7 @@ def _header(lines: list[str], settings: Settings,
     places = range(min(len(lines), _HEADER_LINES))
     if settings.lines_before_header is not None:
         places = range(settings.lines_before_header, settings.lines_before_header + 1)
-    best, result = (0.0, 0), (settings.lines_before_header or 0, delimiters[0])
+    best, result = (-1.0, 0), (settings.lines_before_header or 0, delimiters[0])
     for delimiter in delimiters:
         rows = [_fields(line, delimiter) for line in lines]
         counts = [len(row) for row in rows]

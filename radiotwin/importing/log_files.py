@@ -182,8 +182,8 @@ def _in_folder(folder: Path, excluded: set[Path]) -> tuple[list[LogFile], int]:
     """Return all files with a known suffix in a folder and below; links to outside are refused."""
     files, others = [], 0
     for root, folders, names in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        for name in sorted(names):
+        folders[:] = (name for name in folders if not name.startswith("."))
+        for name in names:
             path = Path(root) / name
             file = LogFile(path, path.relative_to(folder).as_posix())
             if name.startswith(".") or path.resolve() in excluded:
@@ -195,11 +195,12 @@ def _in_folder(folder: Path, excluded: set[Path]) -> tuple[list[LogFile], int]:
                 raise BadInput(f"{path} is a link that leads out of {folder}; give the file itself")
             files.append(file)
             IMPORT_FILES.check(len(files), folder)
-    return files, others
+    return sorted(files, key=lambda file: file.name), others
 
 
 def _is_hidden(name: PurePosixPath) -> bool:
-    return any(part.startswith(".") or part == "__MACOSX" for part in name.parts)
+    return any((part.startswith(".") and part != "..") or part == "__MACOSX"
+               for part in name.parts)
 
 
 def _resolved(path: Path) -> Path:

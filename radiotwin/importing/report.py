@@ -87,7 +87,8 @@ def _ranges(table: pd.DataFrame, links: pd.DataFrame) -> dict[str, dict[str, Any
 
 def _file_warnings(others: int) -> Iterator[str]:
     if others:
-        yield f"{others} files of other formats are left out"
+        yield (f"{others} files of other formats are left out" if others > 1
+               else "1 file of another format is left out")
 
 
 def _position_warnings(measurements: Measurements) -> Iterator[str]:

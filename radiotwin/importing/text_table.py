@@ -36,7 +36,8 @@ def read_text_table(file: LogFile, dialect: Dialect) -> tuple[pd.DataFrame, np.n
         lines = Lines(text, file)
         for _ in islice(lines, dialect.before):
             pass
-        reader = csv.reader(lines, delimiter=dialect.delimiter, skipinitialspace=True)
+        reader = csv.reader(lines, delimiter=dialect.delimiter, skipinitialspace=True,
+                            strict=True)
         try:
             return _read(file, dialect, reader, lines)
         except csv.Error as error:
