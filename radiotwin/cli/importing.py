@@ -81,6 +81,10 @@ def import_(
         help="Table: device, latitude, longitude, height, or x, y, z.")] = None,
     receivers: Annotated[str | None, typer.Option(
         help="Table of fixed receivers, in the same form.")] = None,
+    track: Annotated[list[str] | None, typer.Option(
+        metavar="[RECEIVER=]FILE", help="Positions over time, where the log has none: .gpx, .nmea, "
+                                        "PX4 .ulg, or a table with time, latitude, longitude, "
+                                        "altitude; may be repeated.")] = None,
     gzip: Annotated[bool, typer.Option("--gzip", help="Write measurements.csv.gz.")] = False,
 ) -> None:
     """Import measurements from logs and tables of any layout.
@@ -106,6 +110,7 @@ def import_(
         "min_distance_m": min_distance_m, "max_distance_m": max_distance_m,
         "average_m": average_m, "average": average,
         "origin": parse_origin(origin), "crs": crs, "devices": devices, "receivers": receivers,
+        "track": _tracks(track),
         "wide": [parse_columns(text) for text in wide] if wide else None}
     mapping = columns
     if columns is not None and "=" in columns and not columns.endswith(".toml"):
@@ -149,6 +154,15 @@ def _print(report: dict[str, Any]) -> None:
             .format(**report["origin"]))
     for text in report["warnings"]:
         say(f"note: {text}")
+
+
+def _tracks(texts: list[str] | None) -> list[dict[str, str]] | None:
+    """Parse `FILE` or `RECEIVER=FILE`."""
+    if texts is None:
+        return None
+    pairs = [(text.rpartition("=")[2], text.rpartition("=")[0]) for text in texts]
+    return [{"file": file, **({"receiver": receiver} if receiver else {})}
+            for file, receiver in pairs]
 
 
 def _choices(texts: list[str] | None) -> dict[str, list[str]] | None:

@@ -27,12 +27,14 @@ MIN_SAMPLE = 20  # values from which a share or a range says something
 YEARS = (1990, 2100)
 
 
-def make_report(logs: Logs, others: int, kept: int, tally: Tally, positioned: PositionedLinks,
-                measurements: Measurements, settings: Settings) -> dict[str, Any]:
+def make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Tally,
+                positioned: PositionedLinks, measurements: Measurements,
+                settings: Settings) -> dict[str, Any]:
     """Make the content of `import.json`.
 
     Args:
         logs: what was read.
+        notes: on how it was read.
         others: number of files that have a format that is not read.
         kept: readings that were not left out.
         tally: readings that were left out; with `kept` they add up to `readings`.
@@ -56,7 +58,7 @@ def make_report(logs: Logs, others: int, kept: int, tally: Tally, positioned: Po
         if len(time_s) else None,
         "origin": None if origin is None else origin.model_dump(),
         "ranges": _ranges(table, positioned.links),
-        "warnings": [*logs.notes, *_file_warnings(others),
+        "warnings": [*notes, *_file_warnings(others),
                      *_position_warnings(measurements),
                      *_level_warnings(positioned, measurements, tally, logs.readings),
                      *_time_and_angle_warnings(table),

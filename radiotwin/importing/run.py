@@ -21,6 +21,7 @@ from radiotwin.importing.settings import Settings
 from radiotwin.importing.settings_file import write_settings
 from radiotwin.importing.source import Source
 from radiotwin.importing.tally import Tally
+from radiotwin.importing.tracks import add_tracks
 from radiotwin.measurements import OPTIONAL, REQUIRED, Measurements
 from radiotwin.tables import Origin
 
@@ -54,11 +55,13 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
     out = Path(out)
     _check_target(out)
     paths = [paths] if isinstance(paths, (str, Path)) else paths
-    files, others = list_files(paths, filter(None, (settings.devices, settings.receivers)))
+    tables = [settings.devices, settings.receivers, *(track.file for track in settings.track)]
+    files, others = list_files(paths, filter(None, tables))
     tally = Tally()
     logs = read_logs(files, settings, tally, on_progress)
     on_progress("positions")
-    positioned = add_positions(logs.source, logs.links, settings, tally)
+    links, notes = add_tracks(logs.source, logs.links, settings, tally)
+    positioned = add_positions(logs.source, links, settings, tally)
     positioned = _filtered(logs.source, positioned, settings, tally)
     if positioned.links.empty:
         reasons = "; ".join(f"{number} {reason}" for (reason, _), number in tally.left_out.items())
@@ -71,7 +74,7 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
         table = average(table, settings.average_m, settings.average)
     measurements = _measurements(table, positioned.devices, logs.level_column,
                                  positioned.frame.origin)
-    report = make_report(logs, others, kept, tally, positioned, measurements, settings)
+    report = make_report(logs, [*logs.notes, *notes], others, kept, tally, positioned, measurements, settings)
     on_progress("writing")
     used = settings.model_copy(update={"origin": positioned.frame.origin,
                                        "format": settings.format or logs.format})

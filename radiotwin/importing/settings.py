@@ -107,6 +107,14 @@ class Wide(Position):
         return self
 
 
+class TrackFile(Table):
+    """Positions of a receiver over time."""
+
+    file: Spec
+    receiver: Spec | None = None
+    time_offset_s: Number = 0.0
+
+
 class Settings(Table):
     """Settings of an import.
 
@@ -148,6 +156,9 @@ class Settings(Table):
         description="of x and y, such as EPSG:32612; without one they are local")
     devices: str | None = Field(None, description="table of the devices' positions")
     receivers: str | None = Field(None, description="table of the fixed receivers' positions")
+    track: list[TrackFile] = Field([], description="positions over time; of all receivers, or one")
+    track_max_gap_s: Positive = Field(
+        5.0, description="largest time between two positions of a track that are interpolated")
     origin: Origin | None = None
     columns: Columns = Columns()
     wide: list[Wide] = []
