@@ -42,6 +42,8 @@ def import_(
     encoding: Annotated[str | None, typer.Option(
         help="Of a text, such as cp1252 [found].")] = None,
     decimal: Annotated[str | None, typer.Option(help="Decimal mark, . or , [found].")] = None,
+    sheet: Annotated[str | None, typer.Option(help="Name of the sheet of a workbook [the first]."
+                                              )] = None,
     header: Annotated[str | None, typer.Option(
         metavar="NAME,…", help="Names of the columns of a text without a header.")] = None,
     lines_before_header: Annotated[int | None, typer.Option(help="Of a text [found].")] = None,
@@ -67,6 +69,12 @@ def import_(
         help="Leave weaker levels out [dBm, or dB for gains].")] = None,
     max_level: Annotated[float | None, typer.Option(
         help="Leave stronger levels out [dBm, or dB for gains].")] = None,
+    thin_m: Annotated[float | None, typer.Option(
+        help="Of a receiver that stays within this distance, as in a hover, keep one reading: "
+             "that of the median level.")] = None,
+    place_m: Annotated[float | None, typer.Option(
+        help="Positions of a device that are farther apart are different places, each a device "
+             "NAME@1, NAME@2, ….")] = None,
     min_distance_m: Annotated[float | None, typer.Option(help="Leave shorter links out.")] = None,
     max_distance_m: Annotated[float | None, typer.Option(help="Leave longer links out.")] = None,
     average_m: Annotated[float | None, typer.Option(
@@ -90,13 +98,15 @@ def import_(
     """Import measurements from logs and tables of any layout.
 
     Known formats are recognised; of others the columns are declared. Several files become one
-    table with one origin, each of them a flight. The other commands read the result. A report counts what was left out.
+    table with one origin, each of them a flight. The other commands read the result. A report
+    counts what was left out.
     """
     from radiotwin.importing import import_files, parse_columns, read_settings
     from radiotwin.progress import progress
 
     given: dict[str, Any] = {
-        "format": format, "only": _choices(only), "encoding": encoding, "decimal": decimal,
+        "format": format, "only": _choices(only), "sheet": sheet,
+        "encoding": encoding, "decimal": decimal,
         "delimiter": "\t" if delimiter in ("tab", "\\t") else delimiter,
         "lines_before_header": lines_before_header, "lines_after_table": lines_after_table,
         "header": header.split(",") if header else None,
@@ -108,7 +118,7 @@ def import_(
         "not_detected_at_or_below": not_detected_at_or_below,
         "min_level": min_level, "max_level": max_level,
         "min_distance_m": min_distance_m, "max_distance_m": max_distance_m,
-        "average_m": average_m, "average": average,
+        "thin_m": thin_m, "place_m": place_m, "average_m": average_m, "average": average,
         "origin": parse_origin(origin), "crs": crs, "devices": devices, "receivers": receivers,
         "track": _tracks(track),
         "wide": [parse_columns(text) for text in wide] if wide else None}

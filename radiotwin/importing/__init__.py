@@ -1,4 +1,4 @@
-"""Import of measurements from logs and tables of any layout, with a report of what was kept and left out."""
+"""Import of measurements from logs and tables of any layout, with a report of what was kept."""
 
 from radiotwin.importing.run import import_files
 from radiotwin.importing.settings import Settings

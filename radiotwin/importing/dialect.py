@@ -122,7 +122,8 @@ def _lines(number: int, where: str) -> str:
     return f"{number} line{'s' * (number > 1)} {where}" if number else ""
 
 
-def _scan(content: IO[bytes], file: LogFile, declared: str | None) -> tuple[bytes, bytes, bool, str]:
+def _scan(content: IO[bytes], file: LogFile,
+          declared: str | None) -> tuple[bytes, bytes, bool, str]:
     """Return the beginning, the end, whether the beginning is all, and the encoding."""
     head = tail = content.read(_BLOCK_BYTES)
     encoding = declared or next((name for bom, name in _BOMS if head.startswith(bom)), "utf-8")

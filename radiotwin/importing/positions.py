@@ -7,6 +7,7 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.frame import Frame, find_frame, to_geographic
+from radiotwin.importing.places import at_times, place_names
 from radiotwin.importing.position_table import read_positions
 from radiotwin.importing.settings import POSITION, Settings
 from radiotwin.importing.source import Source
@@ -32,6 +33,25 @@ class PositionedLinks:
     device_m: np.ndarray
     frame: Frame
 
+    def select(self, keep: np.ndarray, source: Source | None = None, tally: Tally | None = None,
+               reason: str = "") -> "PositionedLinks":
+        """Return some links with their devices.
+
+        Args:
+            keep: (n,) bool.
+            source: the file, for the place of the first link that is left out.
+            tally: counts the others, if there is one.
+            reason: why they are left out.
+        """
+        links = self.links
+        if tally is not None and source is not None:
+            links = tally.drop(links, ~keep, reason, "", source.where)
+        else:
+            links = links[keep]
+        devices = self.devices[self.devices["device"].isin(links["device"])]
+        return PositionedLinks(links, devices.reset_index(drop=True), self.device_m[keep],
+                               self.frame)
+
 
 def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
                   tally: Tally) -> PositionedLinks:
@@ -48,11 +68,14 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     """
     tables = {name: None if path is None else read_positions(path, name, settings)
               for name, path in (("receiver", settings.receivers), ("device", settings.devices))}
+    links = at_times(source, links, tables["device"])
     receivers = _positions(links, "", tables["receiver"], links["receiver"], settings.crs)
     devices = _positions(links, "device_", tables["device"], links["device"], settings.crs)
     frame = find_frame(settings.origin, receivers, devices)
     receiver_m, device_m = frame.local_m(receivers), frame.local_m(devices)
     del receivers, devices  # as much memory as the links themselves
+    if settings.place_m:
+        links = links.assign(device=place_names(source, links, device_m, settings.place_m))
     _check_near(source, links, receiver_m, "receiver")
     _check_near(source, links, device_m, "device")
     links = links.assign(**{f"receiver_{axis}_m": receiver_m[:, i] for i, axis in enumerate("xyz")})
@@ -109,8 +132,9 @@ def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
     if len(moving):
         raise BadInput(f"{source.path}: device {moving[0]!r} has positions "
                        f"{range_m.loc[moving[0]].max():.0f} m apart ({len(moving)} such devices); "
-                       "a device has one position: name it device = \"by position\", or leave its "
-                       "position out to have it found")
+                       "a device has one position: --place-m 5 makes one of each place that is 5 m "
+                       "from the others, device = \"by position\" one of each position; or leave "
+                       "its position out to have it found")
     devices = by_device.median()
     devices["role"] = np.where(devices[["x_m", "y_m"]].notna().all(axis=1), "anchor", "unknown")
     devices.loc[devices["role"] == "unknown", ["x_m", "y_m"]] = np.nan

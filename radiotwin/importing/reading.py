@@ -16,10 +16,11 @@ from radiotwin.importing.levels import LEVEL_COLUMN
 from radiotwin.importing.links import build_links
 from radiotwin.importing.log_files import LogFile, flight_names
 from radiotwin.importing.problems import Problems
+from radiotwin.importing.read_source import read_source
 from radiotwin.importing.repetition import without_repetition
 from radiotwin.importing.settings import BY_FILE, Settings
 from radiotwin.importing.settings_file import merged
-from radiotwin.importing.source import Source, as_text, columns_of, read_source
+from radiotwin.importing.source import Source, as_text, columns_of
 from radiotwin.importing.tally import Tally
 
 

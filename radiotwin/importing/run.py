@@ -13,6 +13,7 @@ from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder
 from radiotwin.frames import FRAME_FILE
 from radiotwin.importing.averaging import average
+from radiotwin.importing.clocks import clock_notes
 from radiotwin.importing.log_files import list_files
 from radiotwin.importing.positions import PositionedLinks, add_positions
 from radiotwin.importing.reading import read_logs
@@ -21,6 +22,7 @@ from radiotwin.importing.settings import Settings
 from radiotwin.importing.settings_file import write_settings
 from radiotwin.importing.source import Source
 from radiotwin.importing.tally import Tally
+from radiotwin.importing.thinning import stay_representatives
 from radiotwin.importing.tracks import add_tracks
 from radiotwin.measurements import OPTIONAL, REQUIRED, Measurements
 from radiotwin.tables import Origin
@@ -63,6 +65,11 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
     links, notes = add_tracks(logs.source, logs.links, settings, tally)
     positioned = add_positions(logs.source, links, settings, tally)
     positioned = _filtered(logs.source, positioned, settings, tally)
+    notes += clock_notes(positioned.links)
+    if settings.thin_m:
+        on_progress("thinning")
+        positioned = positioned.select(stay_representatives(positioned.links, settings.thin_m),
+                                       logs.source, tally, f"stay within {settings.thin_m:g} m")
     if positioned.links.empty:
         reasons = "; ".join(f"{number} {reason}" for (reason, _), number in tally.left_out.items())
         raise BadInput(f"{logs.source.path}: nothing is left of {logs.readings} readings: "
@@ -74,7 +81,8 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
         table = average(table, settings.average_m, settings.average)
     measurements = _measurements(table, positioned.devices, logs.level_column,
                                  positioned.frame.origin)
-    report = make_report(logs, [*logs.notes, *notes], others, kept, tally, positioned, measurements, settings)
+    report = make_report(logs, [*logs.notes, *notes], others, kept, tally, positioned,
+                         measurements, settings)
     on_progress("writing")
     used = settings.model_copy(update={"origin": positioned.frame.origin,
                                        "format": settings.format or logs.format})
@@ -120,12 +128,7 @@ def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,
             where = source.where(links.index[int(np.argmax(bad))])
             tally.count(text.format(limit), "", bad.sum(), where)
             keep &= ~bad
-    if keep.all():
-        return positioned
-    links = links[keep]
-    devices = positioned.devices
-    devices = devices[devices["device"].isin(links["device"])].reset_index(drop=True)
-    return PositionedLinks(links, devices, positioned.device_m[keep], positioned.frame)
+    return positioned if keep.all() else positioned.select(keep)
 
 
 def _measurements(table: pd.DataFrame, devices: pd.DataFrame, level: str,

@@ -125,6 +125,7 @@ class Settings(Table):
     encoding: str | None = Field(None, max_length=50)
     delimiter: Literal[",", ";", "\t", "|"] | None = None
     decimal: Literal[".", ","] | None = None
+    sheet: str | None = Field(None, max_length=200, description="of a workbook; the first one")
     header: list[Spec] = Field([], max_length=5000, description="names of the columns of a text "
                                                                 "without a header")
     lines_before_header: int | None = Field(None, ge=0, le=100)
@@ -149,6 +150,8 @@ class Settings(Table):
     max_level: Number | None = Field(None, description="[dBm, or dB for gains]")
     min_distance_m: Number | None = Field(None, ge=0)
     max_distance_m: Positive | None = None
+    thin_m: Positive | None = Field(None, description="of a stay within it one reading is kept")
+    place_m: Positive | None = Field(None, description="between the places of a device")
     average_m: Positive | None = Field(None, description="length of the bins of the local mean")
     average: Literal["power", "median"] = "power"
     crs: str | None = Field(

@@ -4,8 +4,8 @@ import pytest
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.log_files import LogFile
+from radiotwin.importing.read_source import Expected, read_source
 from radiotwin.importing.settings import Settings
-from radiotwin.importing.source import Expected, read_source
 
 ROWS = [["Zeit", "Breite", "Länge", "Zelle", "RSRP"], ["1", "48.1", "11.5", "A", "-81.5"], ["2", "48.2", "11.6", "B", "-90.25"],
         ["3", "48.3", "11.7", "B", "-91.0"]]

@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
+from radiotwin.importing.read_source import read_source
 from radiotwin.importing.settings_file import read_settings
-from radiotwin.importing.source import read_source
 
 TEXT = "device,x,y,level\na,0,0,-80\nb,3,4,-90\n"
 

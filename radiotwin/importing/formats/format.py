@@ -5,7 +5,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from radiotwin.importing.source import WithoutHeader, columns_of
+from radiotwin.importing.read_source import WithoutHeader
+from radiotwin.importing.source import columns_of
 
 MADE_UP = "made-up"
 """Tried on a file that was made up after the description only."""

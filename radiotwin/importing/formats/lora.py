@@ -4,9 +4,9 @@ from radiotwin.importing.formats.format import Format
 
 SEMTECH = "Semtech, SX1276/77/78/79 data sheet, rev. 4, 5.5.5"
 _LEVEL = "power of the packet, dBm: RSSI, plus SNR where that is below 0"
-_CAUTION = ("the RSSI of a packet below the noise is mostly noise, so level = RSSI + SNR where SNR < "
-            f"0 ({SEMTECH}; at SNR = 0 the packet alone has 3 dB less). Packets that a gateway did "
-            "not hear are not in the file")
+_CAUTION = ("the RSSI of a packet below the noise is mostly noise, so level = RSSI + SNR where SNR "
+            f"is below 0 ({SEMTECH}; at SNR = 0 the packet alone has 3 dB less). Packets that a "
+            "gateway did not hear are not in the file")
 _MAPPER = (_CAUTION + ". Devices are the gateways, the receiver is the node that moves: the gain "
            "is that of both directions, and the level is that of the node's transmitter")
 _STACK = "https://www.thethingsindustries.com/docs/the-things-stack/concepts/data-formats/"

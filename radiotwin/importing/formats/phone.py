@@ -1,7 +1,7 @@
 """Programs of telephones that log cells, Wi-Fi and Bluetooth beacons."""
 
 from radiotwin.importing.formats.format import Format
-from radiotwin.importing.source import WithoutHeader
+from radiotwin.importing.read_source import WithoutHeader
 
 _UNKNOWN = 2147483647  # of Android's telephony, CellInfo.UNAVAILABLE
 _MIXED = ("levels are RSRP of LTE and NR, RSCP of UMTS, RSSI of GSM: they differ by more than "

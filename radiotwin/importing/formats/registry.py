@@ -5,7 +5,7 @@ from collections.abc import Collection, Iterable
 from radiotwin.errors import BadInput
 from radiotwin.importing.formats import drive_test, lora, phone, scanner
 from radiotwin.importing.formats.format import Format
-from radiotwin.importing.source import Expected
+from radiotwin.importing.read_source import Expected
 
 FORMATS: tuple[Format, ...] = (*phone.FORMATS, *drive_test.FORMATS, *lora.FORMATS,
                               *scanner.FORMATS)

@@ -1,8 +1,8 @@
 """Spectrum scanners."""
 
 from radiotwin.importing.formats.format import Format
+from radiotwin.importing.read_source import WithoutHeader
 from radiotwin.importing.rtl_power import read_rtl_power
-from radiotwin.importing.source import WithoutHeader
 
 FORMATS = (
     Format(

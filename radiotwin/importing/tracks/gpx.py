@@ -41,7 +41,8 @@ class _Points:
             self._point.setdefault(name, self._text.strip())
         elif name == "trkpt":
             ROWS.check(len(self.rows) + 1, self._path)
-            self.rows.append((self._time(), *(self._number(each) for each in ("lat", "lon", "ele"))))
+            self.rows.append((self._time(), self._number("lat"), self._number("lon"),
+                              self._number("ele")))
             self._point = None
 
     def _number(self, name: str) -> float:

@@ -9,8 +9,9 @@ import pandas as pd
 from radiotwin.cells import listed
 from radiotwin.errors import BadInput
 from radiotwin.importing.lengths import METRES
+from radiotwin.importing.read_source import read_source
 from radiotwin.importing.settings import Settings, TrackFile
-from radiotwin.importing.source import Source, read_source
+from radiotwin.importing.source import Source
 from radiotwin.importing.tally import Tally
 from radiotwin.importing.times import ISO, seconds
 from radiotwin.importing.tracks.fixes import COLUMNS, Fixes, make_fixes

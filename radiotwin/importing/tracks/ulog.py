@@ -75,7 +75,8 @@ def _attitude(topic: dict[str, np.ndarray], time_us: np.ndarray) -> dict[str, np
     """
     row = np.searchsorted(topic["timestamp"].astype(float), time_us, side="right") - 1
     w, x, y, z = (topic[f"q[{i}]"].astype(float)[row.clip(0)] for i in range(4))
-    angles = {"heading_deg": np.degrees(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))) % 360,
+    heading_rad = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+    angles = {"heading_deg": np.degrees(heading_rad) % 360,
               "pitch_deg": np.degrees(np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))),
               "roll_deg": np.degrees(np.arctan2(2 * (w * x + y * z), 1 - 2 * (x**2 + y**2)))}
     return {name: np.where(row >= 0, angle, np.nan) for name, angle in angles.items()}
