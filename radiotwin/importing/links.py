@@ -225,6 +225,28 @@ def _wide_columns(source: Source, block: Wide) -> list[LevelColumn]:
     return found
 
 
+def naming_notes(source: Source, settings: Settings) -> list[str]:
+    """Return notes on names that are made of those of columns, as a misspelt column would be.
+
+    Args:
+        source: the file.
+        settings: mapping.
+    """
+    notes = []
+    for block in settings.wide:
+        for end in ("device", "receiver"):
+            spec = getattr(block, end)
+            if not spec or "*" not in spec or spec == "*":
+                continue
+            columns = _wide_columns(source, block)
+            names = [column.own[end] for column in columns
+                     if not _names_a_column(source, column, column.own[end])]
+            if names:
+                notes.append(f"wide.{end} = {spec!r} is no column of the file: the {end}s are "
+                             f"named {listed(names)}")
+    return notes
+
+
 def _match(pattern: str, name: str) -> str | None:
     """Return the text that `*` stands for, the name if there is no `*`, or None (no match)."""
     if "*" not in pattern:

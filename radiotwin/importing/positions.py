@@ -85,7 +85,8 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
         tally.count(f"no position of receiver {name}", "", len(rows), source.where(rows.index[0]))
     if unknown.any():
         links, device_m = links[~unknown], device_m[~unknown]
-    table = _device_table(source, links, device_m, tables["device"])
+    table = _device_table(source, links, device_m, tables["device"],
+                          max(MOVING_M, 2 * (settings.place_m or 0.0)))
     return PositionedLinks(links, table, device_m, frame)
 
 
@@ -123,12 +124,12 @@ def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, nam
 
 
 def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
-                  table: pd.DataFrame | None) -> pd.DataFrame:
+                  table: pd.DataFrame | None, moving_m: float) -> pd.DataFrame:
     """Return the devices of the links as in `devices.csv`."""
     by_device = pd.DataFrame(device_m, columns=["x_m", "y_m", "z_m"], index=links.index).groupby(
         links["device"].to_numpy(), sort=False)
     range_m = by_device.max() - by_device.min()
-    moving = range_m.index[(range_m > MOVING_M).any(axis=1)]
+    moving = range_m.index[(range_m > moving_m).any(axis=1)]
     if len(moving):
         raise BadInput(f"{source.path}: device {moving[0]!r} has positions "
                        f"{range_m.loc[moving[0]].max():.0f} m apart ({len(moving)} such devices); "

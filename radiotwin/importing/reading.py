@@ -13,7 +13,7 @@ from radiotwin.cells import listed
 from radiotwin.errors import BadInput
 from radiotwin.importing.formats import FORMATS, expected, find_format, format_named
 from radiotwin.importing.levels import LEVEL_COLUMN
-from radiotwin.importing.links import build_links
+from radiotwin.importing.links import build_links, naming_notes
 from radiotwin.importing.log_files import LogFile, flight_names
 from radiotwin.importing.problems import Problems
 from radiotwin.importing.read_source import read_source
@@ -89,7 +89,8 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
             level_columns.setdefault(LEVEL_COLUMN[str(own.level_unit)], str(file))
             records.append({"file": file.name, "rows": count, "readings": count * per_row,
                             "format": format_name})
-            notes += [*source.notes, *([f"{file.name}: {caution}"] if caution else [])]
+            notes += [*source.notes, *naming_notes(source, own),
+                      *([f"{file.name}: {caution}"] if caution else [])]
     problems.check()
     if len(level_columns) > 1:
         (one, first), (other, second) = list(level_columns.items())[:2]

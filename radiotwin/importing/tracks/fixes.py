@@ -37,7 +37,9 @@ class Fixes:
         after = np.searchsorted(self.time_s, time_s).clip(1, max(len(self.time_s) - 1, 1))
         before = after - 1
         after = np.minimum(after, len(self.time_s) - 1)
-        gap_s = self.time_s[after] - self.time_s[before]
+        before = np.where(time_s == self.time_s[after], after, before)
+        gap_s = np.where(time_s == self.time_s[before], 0.0,
+                         self.time_s[after] - self.time_s[before])
         inside = (time_s >= self.time_s[before]) & (time_s <= self.time_s[after])
         inside &= gap_s <= max_gap_s
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -51,6 +53,8 @@ class Fixes:
             result[name] = np.where(inside, values[before] + share * step, np.nan)
         if "longitude" in result:
             result["longitude"] = (result["longitude"] + 180) % 360 - 180
+        if "heading_deg" in result:
+            result["heading_deg"] %= 360
         return result
 
 

@@ -93,8 +93,7 @@ def _days(seconds: np.ndarray, day: np.ndarray) -> np.ndarray:
         result[:first] -= np.cumsum(midnights[::-1])[::-1]
     for i in range(first + 1, len(day)):
         late = seconds[i] - seconds[i - 1] < -_DAY_S / 2
-        # A date that came before midnight is that of the day before.
-        if np.isnan(day[i]) or (late and day[i] == day[i - 1]):
+        if day[i] == day[i - 1]:  # no date has come since
             result[i] = result[i - 1] + late
     return result
 
