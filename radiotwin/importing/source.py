@@ -114,10 +114,6 @@ class Source:
                 self.refuse(spec, pd.Series(name, index=self.table.index), number == i, fault)
         return names.to_numpy(dtype=object)[number]
 
-    def without_cells(self) -> "Source":
-        """Return the same file for messages only, without the memory of its cells."""
-        return Source(self.path, self.table.iloc[:0], self.where, self.notes)
-
     def numbers(self, spec: str, purpose: str) -> np.ndarray:
         """Return the cells as numbers, (n,); NaN where empty.
 

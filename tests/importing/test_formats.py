@@ -1,7 +1,6 @@
 """Known formats, on files made up after their descriptions: which column is which, units and cautions."""
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -213,9 +212,10 @@ def test_no_format_takes_the_files_of_another(each):
 
 
 def test_the_documented_table_is_that_of_the_code():
+    """Of nested fields it has the last part of the name."""
     text = (Path(__file__).parents[2] / "docs" / "import.md").read_text(encoding="utf-8")
     for each in FORMATS:
-        fields = ", ".join(dict.fromkeys(
-            name for entries in each.columns.values() for name in ([entries] if isinstance(entries, str) else entries)))
+        entries = [name for entry in each.columns.values() for name in ([entry] if isinstance(entry, str) else entry)]
+        fields = ", ".join(dict.fromkeys(name.rpartition(".")[2] for name in entries))
         row = f"| `{each.name}` | {each.title} | {fields} | {each.level} | {each.source} | {each.tried_on} |"
-        assert row.replace("`", "") in re.sub("`", "", text), row
+        assert row in text, row

@@ -10,7 +10,7 @@ _CAUTION = ("the RSSI of a packet below the noise is mostly noise, so level = RS
 _MAPPER = (_CAUTION + ". Devices are the gateways, the receiver is the node that moves: the gain "
            "is that of both directions, and the level is that of the node's transmitter")
 _STACK = "https://www.thethingsindustries.com/docs/the-things-stack/concepts/data-formats/"
-_CHIRPSTACK = "https://www.chirpstack.io/docs/chirpstack/integrations/events.html"
+_CHIRPSTACK = "https://docs.rs/crate/chirpstack_api (integration.proto, gw.proto; JSON of proto3)"
 _UNITS = {"level_unit": "dBm", "length_unit": "m", "time_format": "ISO 8601"}
 
 
@@ -52,7 +52,7 @@ FORMATS = (
          "receiver": ("nodeaddr", "dev_id", "device_id"), "time": "time", "latitude": "lat",
          "longitude": "lon", "altitude": "alt"},
         ("time", "snr", "rssi", "freq", "lat", "lon", "alt", "hdop", "sats", "provider"),
-        _LEVEL, "https://ttnmapper.org, export of a user's measurements",
+        _LEVEL, "https://ttnmapper.org, export of a user; header and two rows quoted in a public README",
         {**_UNITS, "time_zone": "UTC"},
         caution=_MAPPER + ". Times are taken for UTC. alt may be 0 where the node has no height"),
     *_things_stack(""),

@@ -1,5 +1,7 @@
 """Positions and attitude of a PX4 flight log (ULog), read by pyulog."""
 
+import io
+from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +33,8 @@ def read_ulog(path: Path) -> Fixes:
         raise BadInput(f"{path}: PX4 flight logs need the package pyulog; `pip install "
                        "radiotwin[tracks]`, or convert it to GPX") from None
     try:
-        log = ULog(str(path), _TOPICS, disable_str_exceptions=True)
+        with redirect_stdout(io.StringIO()):  # on which it remarks on damage
+            log = ULog(str(path), _TOPICS, disable_str_exceptions=True)
         topics = {each.name: each.data for each in reversed(log.data_list)}  # instance 0 counts
         return _fixes(path, topics)
     except BadInput:
