@@ -142,7 +142,7 @@ def _links_of(source: Source, level: LevelColumn, shared: pd.DataFrame, settings
             links = tally.drop(links, links[name] == "", f"no {name}",
                                _spec(settings, level, name), source.where)
     for prefix in ("", "device_"):
-        if prefix + "latitude" in links:
+        if {prefix + name for name in LIMITS_DEG} <= set(links):
             for name in LIMITS_DEG:
                 _check_degrees(source, links, prefix, name, _spec(settings, level, prefix + name))
             no_fix = (links[prefix + "latitude"] == 0) & (links[prefix + "longitude"] == 0)

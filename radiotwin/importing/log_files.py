@@ -3,6 +3,7 @@
 import os
 import struct
 import zipfile
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -53,12 +54,9 @@ class LogFile:
             with open_gzip(self.path, _WHAT) as file:
                 yield file
             return
-        with open_archive(self.path) as archive, archive.open(self.member) as packed:
-            try:
-                with bounded(packed, self, self.member.lower().endswith(".gz")) as content:
-                    yield content
-            except zipfile.BadZipFile as error:
-                raise BadInput(f"{self} is damaged ({error}); make the zip file again") from None
+        with open_archive(self.path) as archive, open_member(archive, self.member, self) as packed:
+            with bounded(packed, self, self.member.lower().endswith(".gz")) as content:
+                yield content
 
     def read_text(self, budget: Budget) -> str:
         """Read a text in UTF-8.
@@ -149,6 +147,30 @@ def open_archive(path: Path) -> Iterator[zipfile.ZipFile]:
                     raise BadInput(f"{path}: {entry.filename[:200]!r} has an unusual compression; "
                                    "allowed are stored and deflated: make the zip file again")
             yield archive
+
+
+@contextmanager
+def open_member(archive: zipfile.ZipFile, name: str, source: object) -> Iterator[IO[bytes]]:
+    """Open a file in a zip file.
+
+    Args:
+        archive: from `open_archive`.
+        name: of the file in it.
+        source: for messages.
+
+    Yields:
+        binary file of at most as many bytes as the list of files declares.
+
+    Raises:
+        BadInput: it is damaged.
+    """
+    try:
+        with archive.open(name) as content:
+            yield content
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, struct.error, ValueError,
+            NotImplementedError, RuntimeError) as error:  # the last one of an encrypted file
+        raise BadInput(f"{source}: {name[:200]!r} is damaged ({str(error)[:200]}); make the zip "
+                       "file again") from None
 
 
 def _check_directory(file: IO[bytes], path: Path) -> None:

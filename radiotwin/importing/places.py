@@ -97,11 +97,10 @@ def place_names(source: Source, links: pd.DataFrame, device_m: np.ndarray,
         place = np.full(len(different_m), -1)
         centres_m = np.empty((0, 3))
         for i in np.argsort(first):
-            near = np.flatnonzero(np.linalg.norm(centres_m - different_m[i], axis=1) <= place_m)
-            if not len(near):
+            near = np.linalg.norm(centres_m - different_m[i], axis=1) <= place_m
+            place[i] = np.argmax(near) if near.any() else len(centres_m)
+            if not near.any():
                 centres_m = np.vstack([centres_m, different_m[i]])
-                near = [len(centres_m) - 1]
-            place[i] = near[0]
             if len(centres_m) > _MAX_PLACES:
                 raise BadInput(f"{source.path}: device {device!r} is at more than {_MAX_PLACES} "
                                f"places that are {place_m:g} m apart: it moves all the time. Take "

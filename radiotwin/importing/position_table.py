@@ -44,10 +44,10 @@ def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
     DEVICES.check(len(source), path)
     names = pd.Series(source.names(key, f"the {key}s' names"), index=source.table.index)
     source.refuse(key, names, names == "", f"is empty; every {key} needs a name")
-    since_s = until_s = None
+    period: dict[str, np.ndarray] = {}
     if key == "device" and "since" in source.table:
-        since_s, until_s = _period(source, settings)
-        names = numbered(names, since_s)
+        period = _period(source, settings)
+        names = numbered(names, period[SINCE])
     source.refuse(key, names, names.duplicated(), f"occurs twice; every {key} has one row")
     columns = {name: (spec, unit) for spec in map(str, source.table)
                for name, unit in [_quantity_and_unit(spec)] if name}
@@ -67,12 +67,10 @@ def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
             source.refuse(name, source.table[name], bad, reason)
 
         refuse_limits(refuse, name, numbers)
-    if since_s is not None:
-        others |= {SINCE: since_s, UNTIL: until_s}
-    return to_geographic(positions, settings.crs).assign(**others)
+    return to_geographic(positions, settings.crs).assign(**others, **period)
 
 
-def _period(source: Source, settings: Settings) -> tuple[np.ndarray, np.ndarray]:
+def _period(source: Source, settings: Settings) -> dict[str, np.ndarray]:
     """Return since when, and until when, a device was at a place [s]; NaN where not given."""
     since_s = seconds(source, "since", ISO, settings.time_zone)
     until_s = np.full(len(source), np.nan)
@@ -80,7 +78,7 @@ def _period(source: Source, settings: Settings) -> tuple[np.ndarray, np.ndarray]
         until_s = seconds(source, "until", ISO, settings.time_zone)
     source.refuse("until", source.cells("since", "since"), until_s <= since_s,
                   "is not before the time until which the device was there")
-    return since_s, until_s
+    return {SINCE: since_s, UNTIL: until_s}
 
 
 def _quantity_and_unit(spec: str) -> tuple[str | None, str | None]:

@@ -62,7 +62,9 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
     Raises:
         BadInput: all that is wrong, with file, row and column.
     """
-    problems, parts, records = Problems(), [], []
+    problems = Problems()
+    parts: list[pd.DataFrame] = []
+    records: list[dict[str, Any]] = []
     wheres: list[tuple[int, Callable[[int], str]]] = []
     level_columns: dict[str, str] = {}
     formats, notes = set(), []
@@ -139,7 +141,7 @@ def _settings_of(source: Source, settings: Settings,
         defaults = {**found.settings, "columns": {"flight": flight, **found.mapping(header)}}
     own = merged(settings, defaults)
     own.require_columns(str(source.path))
-    return own, found and found.name, found.caution if found else ""
+    return own, found.name if found else None, found.caution if found else ""
 
 
 def _numbered_from(source: Source, first: int, name: str) -> Source:

@@ -4,7 +4,6 @@ A line is `date, time, Hz low, Hz high, Hz step, samples, dB, dB, …`, one for 
 sweep; all lines of a sweep have one time. rtl_power writes the last bin twice.
 """
 
-import csv
 import io
 
 import numpy as np
@@ -50,8 +49,9 @@ def read_rtl_power(file: LogFile, settings: Settings) -> tuple[pd.DataFrame, np.
 
     with file.open() as content, io.TextIOWrapper(content, "ascii", "replace", newline="") as text:
         lines = Lines(text, file)
-        for fields in csv.reader(lines, skipinitialspace=True):
-            if not fields:
+        for line in lines:
+            fields = [field.strip() for field in line.split(",")]
+            if fields == [""]:
                 continue
             COLUMNS.check(len(fields), f"{file}: line {lines.number}")
             cells += len(fields)

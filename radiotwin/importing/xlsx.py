@@ -11,7 +11,7 @@ from typing import IO, Any
 from radiotwin.budgets import CELLS, COLUMNS, DOCUMENT_BYTES, FILE_BYTES
 from radiotwin.cells import listed
 from radiotwin.errors import BadInput
-from radiotwin.importing.log_files import LogFile, open_archive
+from radiotwin.importing.log_files import LogFile, open_archive, open_member
 
 _MAX_ROWS = 1_048_576  # of a sheet, by the format
 _BLOCK_BYTES = 2**20
@@ -73,10 +73,10 @@ def _check(file: LogFile) -> None:
         DOCUMENT_BYTES.check(sum(entry.file_size for entry in entries), file)
         for entry in entries:
             last = b""
-            with archive.open(entry) as content:
-                for block in iter(lambda content=content: content.read(_BLOCK_BYTES), b""):
+            with open_member(archive, entry.filename, file) as content:
+                while block := content.read(_BLOCK_BYTES):
                     # Entities can stand for any amount of text; UTF-16 would hide them.
-                    if b"<!" in last + block and b"<!DOCTYPE" in last + block or b"\0" in block:
+                    if b"<!DOCTYPE" in last + block or b"\0" in block:
                         raise BadInput(f"{file}: {entry.filename[:100]!r} is no XML of a workbook "
                                        "(it has a DOCTYPE or null characters); save it again")
                     last = block[-16:]

@@ -192,13 +192,18 @@ def test_px4_flight_log(track):
     np.testing.assert_allclose(fixes.values["latitude"], 48.1 + np.arange(5) / 20)
     np.testing.assert_allclose(fixes.values["heading_deg"], [0, 0, 90, 90, 0], atol=1e-4)  # to the right is clockwise
     np.testing.assert_allclose(fixes.values["roll_deg"], [0, 0, 0, 0, 90], atol=1e-4)
+    cut = ulog({"other": ([("float[9999999]", "a")], []), "vehicle_gps_position": GPS})[:-5]
+    np.testing.assert_allclose(read_ulog(track("c.ulg", cut)).values["altitude"], [500, 501])
     only = read_ulog(track("b.ulg", ulog({"vehicle_gps_position": GPS})))
     np.testing.assert_allclose(only.values["latitude"], [48.1, 48.2, 48.3])
     np.testing.assert_allclose(only.values["altitude"], [500, 501, 502])
 
 
 @pytest.mark.parametrize(("content", "message"), [
-    (b"no log", "cannot be read as a PX4 flight log"), (ulog({"vehicle_global_position": GLOBAL}), "has no GNSS position"),
+    (b"no log", "is no PX4 flight log"), (ulog({"vehicle_gps_position": GPS}) + bytes(100), "byte [0-9]+ is none of a ULog"),
+    (ulog({"vehicle_gps_position": ([("float[65000]", "a"), ("double[65000]", "b")], [])}), "vehicle_gps_position has an unusual format"),
+    (ulog({"vehicle_attitude": ([("other", "a")], [])}), "vehicle_attitude has an unusual format"),
+ (ulog({"vehicle_global_position": GLOBAL}), "has no GNSS position"),
     (ulog({"vehicle_gps_position": (GPS[0], [(0, 0, 1, 1, 1)])}), "never had a date")])
 def test_px4_flight_logs_that_cannot_be_used(track, content, message):
     pytest.importorskip("pyulog")

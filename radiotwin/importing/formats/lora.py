@@ -19,8 +19,9 @@ def _things_stack(prefix: str) -> tuple[Format, Format]:
     message, gateway = f"{prefix}uplink_message.", f"{prefix}uplink_message.rx_metadata."
     node = f"{prefix}end_device_ids.device_id"
     decoded = message + "decoded_payload."
-    common = {"level": gateway + "rssi", "snr": gateway + "snr",
-              "time": (message + "received_at", prefix + "received_at")}
+    common: dict[str, str | tuple[str, ...]] = {
+        "level": gateway + "rssi", "snr": gateway + "snr",
+        "time": (message + "received_at", prefix + "received_at")}
     name = "things-stack" + "-storage" * bool(prefix)
     title = "The Things Stack, uplink messages" + ", storage integration" * bool(prefix)
     return (

@@ -9,7 +9,7 @@ import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.tracks.fixes import Fixes, make_fixes
-from radiotwin.inputs import check_input
+from radiotwin.importing.tracks.ulog_messages import needed_messages
 
 _GPS = ("vehicle_gps_position", "sensor_gps")
 _TOPICS = ["vehicle_global_position", *_GPS, "vehicle_attitude"]
@@ -26,7 +26,7 @@ def read_ulog(path: Path) -> Fixes:
     Raises:
         BadInput: pyulog is not installed, the log is damaged, or has no position or no UTC.
     """
-    check_input(path, "PX4 flight log (.ulg)")
+    messages = needed_messages(path, _TOPICS)
     try:
         from pyulog import ULog
     except ImportError:
@@ -34,7 +34,7 @@ def read_ulog(path: Path) -> Fixes:
                        "radiotwin[tracks]`, or convert it to GPX") from None
     try:
         with redirect_stdout(io.StringIO()):  # on which it remarks on damage
-            log = ULog(str(path), _TOPICS, disable_str_exceptions=True)
+            log = ULog(messages, disable_str_exceptions=True)
         topics = {each.name: each.data for each in reversed(log.data_list)}  # instance 0 counts
         return _fixes(path, topics)
     except BadInput:
