@@ -168,7 +168,7 @@ def ulog(topics):
     for number, name in enumerate(topics):
         data += message("A", struct.pack("<BH", 0, number) + name.encode())
     for number, (fields, rows) in enumerate(topics.values()):
-        code = "<" + "".join(codes[kind.partition("[")[0]] * int((kind.partition("[")[2] or "1]")[:-1]) for kind, _ in fields)
+        code = "<" + "".join(codes.get(kind.partition("[")[0], "") * int((kind.partition("[")[2] or "1]")[:-1]) for kind, _ in fields)
         for row in rows:
             data += message("D", struct.pack("<H", number) + struct.pack(code, *row))
     return data
