@@ -111,7 +111,7 @@ def import_(
         "lines_before_header": lines_before_header, "lines_after_table": lines_after_table,
         "header": header.split(",") if header else None,
         "level_offset_db": level_offset_db,
-        "band_hz": band_hz.split(",") if band_hz else None,
+        "band_hz": _values(band_hz),
         "level_unit": level_unit, "length_unit": length_unit,
         "time_format": time_format, "time_zone": time_zone,
         "not_detected": _values(not_detected), "not_measured": _values(not_measured),
@@ -196,7 +196,7 @@ def _number(value: float | None, name: str) -> str:
 
 
 def _values(text: str | None) -> list[float | str] | None:
-    """Parse a list of levels; what is not a finite number is a text."""
+    """Parse a list of numbers; what is not a finite number is a text."""
     if text is None:
         return None
     values: list[float | str] = []

@@ -77,12 +77,13 @@ class LogFile:
                            "UTF-8") from None
 
 
-def list_files(paths: Iterable[Path | str], without: Iterable[str]) -> tuple[list[LogFile], int]:
+def list_files(paths: Iterable[Path | str],
+               without: Iterable[Path | str]) -> tuple[list[LogFile], int]:
     """List the files to import.
 
     Args:
         paths: files, folders (with all in them), and zip files.
-        without: paths that are no logs, such as tables of positions in the same folder.
+        without: files and folders that are no logs, such as tables of positions, or the output.
 
     Returns:
         the files, in the order of `paths` and by name in each, and how many of folders and zip
@@ -91,7 +92,7 @@ def list_files(paths: Iterable[Path | str], without: Iterable[str]) -> tuple[lis
     Raises:
         BadInput: a path cannot be read, or there are none or too many files.
     """
-    excluded = {Path(path).resolve() for path in without}
+    excluded = {_resolved(Path(path)) for path in without}
     found: dict[tuple[Path, str | None], LogFile] = {}
     others = 0
     for path in map(Path, paths):
@@ -204,11 +205,12 @@ def _in_folder(folder: Path, excluded: set[Path]) -> tuple[list[LogFile], int]:
     """Return all files with a known suffix in a folder and below; links to outside are refused."""
     files, others = [], 0
     for root, folders, names in os.walk(folder):
-        folders[:] = (name for name in folders if not name.startswith("."))
+        folders[:] = (name for name in folders if not name.startswith(".")
+                      and _resolved(Path(root) / name) not in excluded)
         for name in names:
             path = Path(root) / name
             file = LogFile(path, path.relative_to(folder).as_posix())
-            if name.startswith(".") or path.resolve() in excluded:
+            if name.startswith(".") or _resolved(path) in excluded:
                 continue
             if file.suffix not in (*TEXTS, *BINARIES):
                 others += 1

@@ -140,7 +140,7 @@ def _settings_of(source: Source, settings: Settings,
     if found is not None:
         defaults = {**found.settings, "columns": {"flight": flight, **found.mapping(header)}}
     own = merged(settings, defaults)
-    own.require_columns(str(source.path))
+    own.require_columns(str(source.path), header)
     return own, found.name if found else None, found.caution if found else ""
 
 

@@ -57,7 +57,7 @@ def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, o
     out = Path(out)
     _check_target(out)
     paths = [paths] if isinstance(paths, (str, Path)) else paths
-    tables = [settings.devices, settings.receivers, *(track.file for track in settings.track)]
+    tables = [out, settings.devices, settings.receivers, *(track.file for track in settings.track)]
     files, others = list_files(paths, filter(None, tables))
     tally = Tally()
     logs = read_logs(files, settings, tally, on_progress)

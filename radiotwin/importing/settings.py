@@ -1,10 +1,12 @@
 """Settings of an import: the same in its TOML file and in the options of the command line."""
 
 import codecs
+from collections.abc import Iterable
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
+from radiotwin.cells import listed
 from radiotwin.errors import BadInput
 from radiotwin.tables import Number, Origin, Table
 
@@ -194,11 +196,12 @@ class Settings(Table):
                              "that Python knows") from None
         return name
 
-    def require_columns(self, source: str) -> None:
-        """Check that there are columns of levels and of devices, and the levels' unit.
+    def require_columns(self, source: str, header: Iterable[str]) -> None:
+        """Check that there are columns of levels and of devices.
 
         Args:
             source: the file, for the message.
+            header: its columns.
 
         Raises:
             BadInput: names all that is missing.
@@ -212,4 +215,4 @@ class Settings(Table):
             missing += ["columns.device is missing: which device was heard? A column, "
                         '"always NAME", or "by position"']
         if missing:
-            raise BadInput(f"{source}: {'; '.join(missing)}")
+            raise BadInput(f"{source}: {'; '.join(missing)}. The file has {listed(header)}")

@@ -81,6 +81,12 @@ def test_tables_of_positions_in_the_folder_are_no_logs(logs, bring_all):
     assert len(table) == 3 and report["anchors"] == 1
 
 
+def test_the_output_in_the_folder_is_no_log(logs, tmp_path):
+    settings = read_settings(None, GIVEN | {"columns": MAPPING})
+    for _ in range(2):
+        assert len(import_files(logs, settings, logs / "out")["files"]) == 2
+
+
 def test_places_in_messages_name_the_file(logs, bring_all):
     (logs / "day 2" / "two.csv").write_text(HEAD + "11,b,5,5,-90\n12,b,five,5,-90\n")
     with pytest.raises(BadInput, match="two.csv: row 3, column x: 'five' is not a number"):
