@@ -19,7 +19,7 @@ def add_commands(app: typer.Typer) -> None:
 
 def import_(
     files: Annotated[list[Path], typer.Argument(
-        metavar="FILES…", help="Logs, folders of logs, or zip files of them: texts with columns "
+        metavar="FILES", help="Logs, folders of logs, or zip files of them: texts with columns "
                                "(.csv, .tsv, .txt, .log, also .gz), JSON lines, .geojson of "
                                "points, .parquet, .xlsx.")],
     out: Annotated[Path, typer.Option(
@@ -93,6 +93,8 @@ def import_(
         metavar="[RECEIVER=]FILE", help="Positions over time, where the log has none: .gpx, .nmea, "
                                         "PX4 .ulg, or a table with time, latitude, longitude, "
                                         "altitude; may be repeated.")] = None,
+    track_max_gap_s: Annotated[float | None, typer.Option(
+        help="Largest time between two positions of a track that are interpolated [5].")] = None,
     gzip: Annotated[bool, typer.Option("--gzip", help="Write measurements.csv.gz.")] = False,
 ) -> None:
     """Import measurements from logs and tables of any layout.
@@ -120,7 +122,7 @@ def import_(
         "min_distance_m": min_distance_m, "max_distance_m": max_distance_m,
         "thin_m": thin_m, "place_m": place_m, "average_m": average_m, "average": average,
         "origin": parse_origin(origin), "crs": crs, "devices": devices, "receivers": receivers,
-        "track": _tracks(track),
+        "track": _tracks(track), "track_max_gap_s": track_max_gap_s,
         "wide": [parse_columns(text) for text in wide] if wide else None}
     mapping = columns
     if columns is not None and "=" in columns and not columns.endswith(".toml"):

@@ -66,7 +66,7 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
     parts: list[pd.DataFrame] = []
     records: list[dict[str, Any]] = []
     wheres: list[tuple[int, Callable[[int], str]]] = []
-    level_columns: dict[str, str] = {}
+    level_column = ""
     formats, notes = set(), []
     rows = 0
     may_be = expected([format_named(settings.format)] if settings.format else FORMATS,
@@ -88,16 +88,12 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
                 continue
             parts.append(links)
             formats.add(format_name)
-            level_columns.setdefault(LEVEL_COLUMN[str(own.level_unit)], str(file))
+            level_column = LEVEL_COLUMN[str(own.level_unit)]  # one for all files
             records.append({"file": file.name, "rows": count, "readings": count * per_row,
                             "format": format_name})
             notes += [*source.notes, *naming_notes(source, own),
                       *([f"{file.name}: {caution}"] if caution else [])]
     problems.check()
-    if len(level_columns) > 1:
-        (one, first), (other, second) = list(level_columns.items())[:2]
-        raise BadInput(f"{first} holds {one}, {second} holds {other}; one import is of received "
-                       "power or of channel gain: import them apart")
     links = parts[0] if len(parts) == 1 else pd.concat(parts)
     starts = [start for start, _ in wheres]
 
@@ -108,7 +104,7 @@ def read_logs(files: list[LogFile], settings: Settings, tally: Tally,
     whole = Source(str(label), links.iloc[:0], where)
     if len(files) > 1:
         links = _without_copies(whole, links, starts, tally)
-    return Logs(whole, links, next(iter(level_columns)), rows,
+    return Logs(whole, links, level_column, rows,
                 sum(record["readings"] for record in records), records,
                 list(dict.fromkeys(notes)), formats.pop() if len(formats) == 1 else None)
 

@@ -96,7 +96,7 @@ def test_places_in_messages_name_the_file(logs, bring_all):
         bring_all(logs)
 
 
-def test_power_and_gain_are_not_mixed(logs, bring_all, tmp_path):
+def test_a_declared_unit_overrules_that_of_all_formats(logs, bring_all, tmp_path):
     wigle = "MAC,FirstSeen,RSSI,CurrentLatitude,CurrentLongitude,Type\na,2024-01-01 00:00:00,-60,48,11,WIFI\n"
     (tmp_path / "w.csv").write_text(wigle)
     (tmp_path / "v.csv").write_text(wigle.replace("-60", "-61"))
