@@ -89,6 +89,7 @@ ROWS = Budget("ROWS", 50_000_000, "rows", "a table")
 ROW_BYTES = Budget("ROW_BYTES", 16 * 2**20, "bytes in one row", "a CSV file")
 COLUMNS = Budget("COLUMNS", 5_000, "columns", "a table")
 CELLS = Budget("CELLS", 1_000_000_000, "cells", "a table: rows times columns")
+IMPORT_FILES = Budget("IMPORT_FILES", 10_000, "files", "one import: in folders and zip files")
 # Cities
 DEVICES = Budget("DEVICES", 100_000, "devices", "a scene, or a table of devices")
 UAVS = Budget("UAVS", 10_000, "UAVs", "a scene")

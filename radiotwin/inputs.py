@@ -237,15 +237,33 @@ def open_gzip(path: Path | str, what: str = "file",
         if Path(path).suffix != ".gz":
             yield file
             return
-        with gzip.GzipFile(fileobj=file) as content, \
-                io.BufferedReader(_Bounded(content, path, budget), _BLOCK_BYTES) as buffered:
-            yield buffered
+        with bounded(file, path, True, budget) as content:
+            yield content
+
+
+@contextmanager
+def bounded(file: IO[bytes], source: object, is_gzip: bool,
+            budget: Budget = FILE_BYTES) -> Iterator[IO[bytes]]:
+    """Read from packed bytes up to a budget.
+
+    Args:
+        file: open, such as a file in a zip file.
+        source: of it, for messages.
+        is_gzip: whether it is compressed by gzip, too.
+        budget: of its bytes after decompression.
+
+    Yields:
+        buffered binary file; reading beyond the budget, or a damaged file, raises BadInput.
+    """
+    content = gzip.GzipFile(fileobj=file) if is_gzip else file
+    with io.BufferedReader(_Bounded(content, source, budget), _BLOCK_BYTES) as buffered:
+        yield buffered
 
 
 class _Bounded(io.RawIOBase):
     """Decompressed bytes up to a budget."""
 
-    def __init__(self, content: gzip.GzipFile, path: Path | str, budget: Budget) -> None:
+    def __init__(self, content: Any, path: object, budget: Budget) -> None:
         self._content, self._path, self._budget, self._left = content, path, budget, budget.limit
 
     def readable(self) -> bool:
@@ -261,7 +279,7 @@ class _Bounded(io.RawIOBase):
         return len(data)
 
 
-def _read(file: Any, path: Path | str, size: int) -> bytes:
+def _read(file: Any, path: object, size: int) -> bytes:
     try:
         return file.read(size)
     except (OSError, EOFError, zlib.error) as error:

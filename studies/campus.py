@@ -21,7 +21,7 @@ from scipy.stats import t as student
 from radiotwin import BadInput, Loop, Measurements, Scene, close_loop, make_report
 from radiotwin.alignment import in_scene_frame
 from radiotwin.footprints import MapOptions, build_scene_from_map
-from radiotwin.importing import import_file, read_settings
+from radiotwin.importing import import_files, read_settings
 from radiotwin.measurements import read_measurements
 from radiotwin.scene.build import BuildOptions
 from studies.closeloop import counted, summary
@@ -74,7 +74,7 @@ def campus(heights: bool = True) -> Iterator[tuple[Measurements, Scene]]:
             path.write_text(HEIGHT_TAG.sub("", path.read_text("utf-8")), "utf-8")
         with gzip.open(source / "raw.csv.gz") as raw, (folder / "raw.csv").open("wb") as target:
             shutil.copyfileobj(raw, target)
-        import_file(folder / "raw.csv", read_settings(folder / "import.toml", {}, folder),
+        import_files(folder / "raw.csv", read_settings(folder / "import.toml", {}, folder),
                     folder / "measured")
         build_scene_from_map(folder / "map.osm", folder / "scene",
                              MapOptions(BBOX_DEG, HEIGHT_DEFAULT_M),

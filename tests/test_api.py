@@ -21,7 +21,7 @@ COMMANDS = {
     "build-scene": ["build_scene"], "export-scene": ["export_scene"], "export": ["export_ns3", "read_points"],
     "trace": ["trace_map", "choose_quality"],
     "gains": ["trace_points", "read_points"], "paths": ["list_paths", "read_points"],
-    "survey": ["fly_survey", "read_truth"], "import": ["import_measurements → import_file"], "fit": ["fit_twin"],
+    "survey": ["fly_survey", "read_truth"], "import": ["import_measurements → import_files"], "fit": ["fit_twin"],
     "map": ["export_map"], "coverage": ["predict_coverage"], "compare": ["compare_held_out", "write_comparison_folder"],
     "close-loop": ["close_loop", "write_closeloop_folder", "write_corrected_scene"],
     "locate": ["locate_devices", "position_errors"], "report": ["read_run", "write_report"], "demo": ["run_demo"],

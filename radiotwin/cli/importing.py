@@ -9,6 +9,7 @@ import typer
 
 from radiotwin.cli.options import parse_origin
 from radiotwin.console import print_rows, say
+from radiotwin.errors import BadInput
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -17,11 +18,15 @@ def add_commands(app: typer.Typer) -> None:
 
 
 def import_(
-    file: Annotated[Path, typer.Argument(
-        metavar="FILE", help=".csv, .csv.gz, .parquet, or .geojson of points.")],
+    files: Annotated[list[Path], typer.Argument(
+        metavar="FILES", help="Logs, folders of logs, or zip files of them: texts with columns "
+                               "(.csv, .tsv, .txt, .log, also .gz), JSON lines, .geojson of "
+                               "points, .parquet, .xlsx.")],
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="Folder for measurements.csv, devices.csv, import.toml and "
                             "import.json.")],
+    format: Annotated[str | None, typer.Option(
+        "--format", help="Name of a known format [found by its columns].")] = None,
     columns: Annotated[str | None, typer.Option(
         metavar="FILE.toml|NAME=COLUMN,…",
         help="Column of each quantity: latitude=lat,longitude=lon,level=rsrp,device=cell; or a "
@@ -29,8 +34,26 @@ def import_(
     wide: Annotated[list[str] | None, typer.Option(
         metavar="NAME=COLUMN,…", help="Levels of many receivers or devices in one row: "
                                       "level=*_rss,receiver=*; may be repeated.")] = None,
+    only: Annotated[list[str] | None, typer.Option(
+        metavar="COLUMN=A|B", help="Keep the rows in which a column is one of these; may be "
+                                   "repeated.")] = None,
+    delimiter: Annotated[str | None, typer.Option(
+        help="Of a text: , ; | or tab [found].")] = None,
+    encoding: Annotated[str | None, typer.Option(
+        help="Of a text, such as cp1252 [found].")] = None,
+    decimal: Annotated[str | None, typer.Option(help="Decimal mark, . or , [found].")] = None,
+    sheet: Annotated[str | None, typer.Option(help="Name of the sheet of a workbook [the first]."
+                                              )] = None,
+    header: Annotated[str | None, typer.Option(
+        metavar="NAME,…", help="Names of the columns of a text without a header.")] = None,
+    lines_before_header: Annotated[int | None, typer.Option(help="Of a text [found].")] = None,
+    lines_after_table: Annotated[int | None, typer.Option(help="Of a text [found].")] = None,
     level_unit: Annotated[str | None, typer.Option(
         help="dBm, mW, W (received power), or dB (gain).")] = None,
+    level_offset_db: Annotated[float | None, typer.Option(
+        help="Added to each level, such as a cable's loss.")] = None,
+    band_hz: Annotated[str | None, typer.Option(
+        metavar="LOW,HIGH", help="Band whose power counts, of a spectrum scan.")] = None,
     length_unit: Annotated[str | None, typer.Option(help="m or ft.")] = None,
     time_format: Annotated[str | None, typer.Option(
         help="epoch s, epoch ms, ISO 8601, or a strftime format.")] = None,
@@ -46,6 +69,12 @@ def import_(
         help="Leave weaker levels out [dBm, or dB for gains].")] = None,
     max_level: Annotated[float | None, typer.Option(
         help="Leave stronger levels out [dBm, or dB for gains].")] = None,
+    thin_m: Annotated[float | None, typer.Option(
+        help="Of a receiver that stays within this distance, as in a hover, keep one reading: "
+             "that of the median level.")] = None,
+    place_m: Annotated[float | None, typer.Option(
+        help="Positions of a device that are farther apart are different places, each a device "
+             "NAME@1, NAME@2, ….")] = None,
     min_distance_m: Annotated[float | None, typer.Option(help="Leave shorter links out.")] = None,
     max_distance_m: Annotated[float | None, typer.Option(help="Leave longer links out.")] = None,
     average_m: Annotated[float | None, typer.Option(
@@ -60,38 +89,54 @@ def import_(
         help="Table: device, latitude, longitude, height, or x, y, z.")] = None,
     receivers: Annotated[str | None, typer.Option(
         help="Table of fixed receivers, in the same form.")] = None,
+    track: Annotated[list[str] | None, typer.Option(
+        metavar="[RECEIVER=]FILE", help="Positions over time, where the log has none: .gpx, .nmea, "
+                                        "PX4 .ulg, or a table with time, latitude, longitude, "
+                                        "altitude; may be repeated.")] = None,
+    track_max_gap_s: Annotated[float | None, typer.Option(
+        help="Largest time between two positions of a track that are interpolated [5].")] = None,
     gzip: Annotated[bool, typer.Option("--gzip", help="Write measurements.csv.gz.")] = False,
 ) -> None:
-    """Import measurements from a table of any layout.
+    """Import measurements from logs and tables of any layout.
 
-    The other commands read the result. A report counts what was left out.
+    Known formats are recognised; of others the columns are declared. Several files become one
+    table with one origin, each of them a flight. The other commands read the result. A report
+    counts what was left out.
     """
-    from radiotwin.importing import import_file, parse_columns, read_settings
+    from radiotwin.importing import import_files, parse_columns, read_settings
     from radiotwin.progress import progress
 
     given: dict[str, Any] = {
+        "format": format, "only": _choices(only), "sheet": sheet,
+        "encoding": encoding, "decimal": decimal,
+        "delimiter": "\t" if delimiter in ("tab", "\\t") else delimiter,
+        "lines_before_header": lines_before_header, "lines_after_table": lines_after_table,
+        "header": header.split(",") if header else None,
+        "level_offset_db": level_offset_db,
+        "band_hz": _values(band_hz),
         "level_unit": level_unit, "length_unit": length_unit,
         "time_format": time_format, "time_zone": time_zone,
         "not_detected": _values(not_detected), "not_measured": _values(not_measured),
         "not_detected_at_or_below": not_detected_at_or_below,
         "min_level": min_level, "max_level": max_level,
         "min_distance_m": min_distance_m, "max_distance_m": max_distance_m,
-        "average_m": average_m, "average": average,
+        "thin_m": thin_m, "place_m": place_m, "average_m": average_m, "average": average,
         "origin": parse_origin(origin), "crs": crs, "devices": devices, "receivers": receivers,
+        "track": _tracks(track), "track_max_gap_s": track_max_gap_s,
         "wide": [parse_columns(text) for text in wide] if wide else None}
     mapping = columns
     if columns is not None and "=" in columns and not columns.endswith(".toml"):
         given["columns"] = parse_columns(columns)
         mapping = None
     given = {name: value for name, value in given.items() if value is not None}
-    settings = read_settings(mapping, given, file.parent)
+    settings = read_settings(mapping, given, files[0].parent)
     with progress("importing", total=None) as advance:
-        report = import_file(file, settings, out, gzip, lambda step: advance(1, step))
+        report = import_files(files, settings, out, gzip, lambda step: advance(1, step))
     _print(report)
     say(f"wrote {out}: {report['written']} links, {report['not_detected']} not detected; "
         f"{report['devices']} devices ({report['anchors']} anchors), {report['receivers']} "
         f"receivers, {report['flights']} flights")
-    again = ["radiotwin", "import", file, "--columns", out / "import.toml", "-o", out]
+    again = ["radiotwin", "import", *files, "--columns", out / "import.toml", "-o", out]
     say(f"again: {shlex.join(map(str, [*again, *['--gzip'] * gzip]))}")
 
 
@@ -102,7 +147,13 @@ def _print(report: dict[str, Any]) -> None:
     rows += [["kept", "", report["kept"], ""]]
     if report["written"] != report["kept"]:
         rows += [["local means", "", report["written"], ""]]
-    print_rows(f"Readings of {report['file']}",
+    files = report["files"]
+    if len(files) > 1:
+        print_rows("Files", {"file": "left", "rows": "right", "readings": "right",
+                             "format": "left"},
+                   [[each["file"], each["rows"], each["readings"], each["format"] or "declared"]
+                    for each in files])
+    print_rows(f"Readings of {files[0]['file'] if len(files) == 1 else f'{len(files)} files'}",
                {"": "left", "column": "left", "readings": "right", "first": "left"}, rows)
     print_rows("Ranges", {"column": "left", "min": "right", "median": "right", "max": "right",
                           "unit": "left", "empty": "right"},
@@ -117,6 +168,28 @@ def _print(report: dict[str, Any]) -> None:
         say(f"note: {text}")
 
 
+def _tracks(texts: list[str] | None) -> list[dict[str, str]] | None:
+    """Parse `FILE` or `RECEIVER=FILE`."""
+    if texts is None:
+        return None
+    pairs = [(text.rpartition("=")[2], text.rpartition("=")[0]) for text in texts]
+    return [{"file": file, **({"receiver": receiver} if receiver else {})}
+            for file, receiver in pairs]
+
+
+def _choices(texts: list[str] | None) -> dict[str, list[str]] | None:
+    """Parse `COLUMN=A|B`."""
+    if texts is None:
+        return None
+    chosen = {}
+    for text in texts:
+        column, equals, values = text.partition("=")
+        if not (column.strip() and equals):
+            raise BadInput(f"--only {text!r} is not COLUMN=A|B; for example Type=LTE")
+        chosen[column.strip()] = [value.strip() for value in values.split("|")]
+    return chosen
+
+
 def _number(value: float | None, name: str) -> str:
     """Format a number; degrees of a position with five decimals (1e-5 degrees is a metre)."""
     if value is None:
@@ -125,7 +198,7 @@ def _number(value: float | None, name: str) -> str:
 
 
 def _values(text: str | None) -> list[float | str] | None:
-    """Parse a list of levels; what is not a finite number is a text."""
+    """Parse a list of numbers; what is not a finite number is a text."""
     if text is None:
         return None
     values: list[float | str] = []

@@ -1,7 +1,7 @@
-"""Import of measurements from tables of any layout, with a report of what was kept and left out."""
+"""Import of measurements from logs and tables of any layout, with a report of what was kept."""
 
-from radiotwin.importing.run import import_file, import_measurements
+from radiotwin.importing.run import import_files, import_measurements
 from radiotwin.importing.settings import Settings
 from radiotwin.importing.settings_file import parse_columns, read_settings
 
-__all__ = ["Settings", "import_file", "import_measurements", "parse_columns", "read_settings"]
+__all__ = ["Settings", "import_files", "import_measurements", "parse_columns", "read_settings"]

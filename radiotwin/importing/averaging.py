@@ -35,7 +35,7 @@ def average(links: pd.DataFrame, length_m: float,
     """
     links = links.reset_index(drop=True)
     track = links.groupby(["receiver", "device", "flight"], sort=False).ngroup().to_numpy()
-    links, track = _ordered(links, track)
+    links, track = in_track_order(links, track)
     bin_index, first = _bins(links, track, length_m)
     count = np.bincount(bin_index)
     means = {name: _mean(links[name].to_numpy(dtype=float), bin_index, len(count))
@@ -61,8 +61,16 @@ def in_wavelengths(length_m: float, frequency_hz: float) -> float:
     return length_m * frequency_hz / speed_of_light
 
 
-def _ordered(links: pd.DataFrame, track: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
-    """Sort links by track, and within a track by time where all of its times are known."""
+def in_track_order(links: pd.DataFrame, track: np.ndarray) -> tuple[pd.DataFrame, np.ndarray]:
+    """Sort links by track, and within a track by time where all of its times are known.
+
+    Args:
+        links: n rows.
+        track: number of each link's track, (n,).
+
+    Returns:
+        links with a new index, and their tracks.
+    """
     time_s = np.zeros(len(links))
     if "time_s" in links:
         time_s = links["time_s"].to_numpy(dtype=float)

@@ -33,13 +33,15 @@ class Levels:
     impossible: np.ndarray
 
 
-def read_levels(source: Source, spec: str, settings: Settings) -> Levels:
+def read_levels(source: Source, spec: str, settings: Settings,
+                offset_db: float | np.ndarray = 0.0) -> Levels:
     """Read the levels of one column.
 
     Args:
         source: the file.
         spec: the column.
         settings: unit, and the values that mean not detected or not measured.
+        offset_db: added to each level, or (n,) to each its own.
 
     Raises:
         BadInput: the unit is not declared, a cell is not a number, or empty cells have no declared
@@ -62,6 +64,7 @@ def read_levels(source: Source, spec: str, settings: Settings) -> Levels:
     factor = MILLIWATTS.get(str(settings.level_unit))
     with np.errstate(divide="ignore", invalid="ignore"):  # power <= 0 is found to be impossible
         db = numbers if factor is None else 10 * np.log10(numbers * factor)
+    db = db + offset_db
     low, high = POSSIBLE_DB
     impossible = ~not_measured & ~not_detected & ~((db > low) & (db < high))
     db = np.where(not_measured | not_detected | impossible, np.nan, db)

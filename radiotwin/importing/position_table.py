@@ -10,14 +10,20 @@ from radiotwin.errors import BadInput
 from radiotwin.importing.frame import to_geographic
 from radiotwin.importing.lengths import METRES, in_metres
 from radiotwin.importing.links import LIMITS_DEG
+from radiotwin.importing.places import SINCE, UNTIL, numbered
+from radiotwin.importing.read_source import read_source
 from radiotwin.importing.settings import POSITION, Settings, check_position
-from radiotwin.importing.source import Source, read_source
+from radiotwin.importing.source import Source
+from radiotwin.importing.times import ISO, seconds
 from radiotwin.measurement_columns import refuse_limits
 from radiotwin.measurements import DEVICE_OPTIONAL
 
 
 def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
     """Read a table of positions.
+
+    Several rows of one device are its places over time: column `since`, and `until` where it was
+    nowhere in between, in ISO 8601. They become devices `NAME@1`, `NAME@2`, ….
 
     The position is `latitude, longitude` and `altitude` or `height`, or `x, y, z`. A column's name
     may end in its unit (`latitude_deg`, `height_m`, `z_ft`); lengths without one are in
@@ -39,6 +45,10 @@ def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
     DEVICES.check(len(source), path)
     names = pd.Series(source.names(key, f"the {key}s' names"), index=source.table.index)
     source.refuse(key, names, names == "", f"is empty; every {key} needs a name")
+    period: dict[str, np.ndarray] = {}
+    if key == "device" and "since" in source.table:
+        period = _period(source, settings)
+        names = numbered(names, period[SINCE])
     source.refuse(key, names, names.duplicated(), f"occurs twice; every {key} has one row")
     columns = {name: (spec, unit) for spec in map(str, source.table)
                for name, unit in [_quantity_and_unit(spec)] if name}
@@ -58,7 +68,18 @@ def read_positions(path: str, key: str, settings: Settings) -> pd.DataFrame:
             source.refuse(name, source.table[name], bad, reason)
 
         refuse_limits(refuse, name, numbers)
-    return to_geographic(positions, settings.crs).assign(**others)
+    return to_geographic(positions, settings.crs).assign(**others, **period)
+
+
+def _period(source: Source, settings: Settings) -> dict[str, np.ndarray]:
+    """Return since when, and until when, a device was at a place [s]; NaN where not given."""
+    since_s = seconds(source, "since", ISO, settings.time_zone)
+    until_s = np.full(len(source), np.nan)
+    if "until" in source.table:
+        until_s = seconds(source, "until", ISO, settings.time_zone)
+    source.refuse("until", source.cells("since", "since"), until_s <= since_s,
+                  "is not before the time until which the device was there")
+    return {SINCE: since_s, UNTIL: until_s}
 
 
 def _quantity_and_unit(spec: str) -> tuple[str | None, str | None]:

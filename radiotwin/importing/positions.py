@@ -7,6 +7,7 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.importing.frame import Frame, find_frame, to_geographic
+from radiotwin.importing.places import at_times, place_names
 from radiotwin.importing.position_table import read_positions
 from radiotwin.importing.settings import POSITION, Settings
 from radiotwin.importing.source import Source
@@ -33,6 +34,25 @@ class PositionedLinks:
     device_m: np.ndarray
     frame: Frame
 
+    def select(self, keep: np.ndarray, source: Source | None = None, tally: Tally | None = None,
+               reason: str = "") -> "PositionedLinks":
+        """Return some links with their devices.
+
+        Args:
+            keep: (n,) bool.
+            source: the file, for the place of the first link that is left out.
+            tally: counts the others, if there is one.
+            reason: why they are left out.
+        """
+        links = self.links
+        if tally is not None and source is not None:
+            links = tally.drop(links, ~keep, reason, "", source.where)
+        else:
+            links = links[keep]
+        devices = self.devices[self.devices["device"].isin(links["device"])]
+        return PositionedLinks(links, devices.reset_index(drop=True), self.device_m[keep],
+                               self.frame)
+
 
 def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
                   tally: Tally) -> PositionedLinks:
@@ -49,11 +69,14 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     """
     tables = {name: None if path is None else read_positions(path, name, settings)
               for name, path in (("receiver", settings.receivers), ("device", settings.devices))}
+    links = at_times(source, links, tables["device"])
     receivers = _positions(links, "", tables["receiver"], links["receiver"], settings.crs)
     devices = _positions(links, "device_", tables["device"], links["device"], settings.crs)
     frame = find_frame(settings.origin, receivers, devices)
     receiver_m, device_m = frame.local_m(receivers), frame.local_m(devices)
     del receivers, devices  # as much memory as the links themselves
+    if settings.place_m:
+        links = links.assign(device=place_names(source, links, device_m, settings.place_m))
     _check_near(source, links, receiver_m, "receiver")
     _check_near(source, links, device_m, "device")
     links = links.assign(**{f"receiver_{axis}_m": receiver_m[:, i] for i, axis in enumerate("xyz")})
@@ -63,7 +86,8 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
         tally.count(f"no position of receiver {name}", "", len(rows), source.where(rows.index[0]))
     if unknown.any():
         links, device_m = links[~unknown], device_m[~unknown]
-    table = _device_table(source, links, device_m, tables["device"])
+    table = _device_table(source, links, device_m, tables["device"],
+                          max(MOVING_M, 2 * (settings.place_m or 0.0)))
     return PositionedLinks(links, table, device_m, frame)
 
 
@@ -101,17 +125,18 @@ def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, nam
 
 
 def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
-                  table: pd.DataFrame | None) -> pd.DataFrame:
+                  table: pd.DataFrame | None, moving_m: float) -> pd.DataFrame:
     """Return the devices of the links as in `devices.csv`."""
     by_device = pd.DataFrame(device_m, columns=["x_m", "y_m", "z_m"], index=links.index).groupby(
         links["device"].to_numpy(), sort=False)
     range_m = by_device.max() - by_device.min()
-    moving = range_m.index[(range_m > MOVING_M).any(axis=1)]
+    moving = range_m.index[(range_m > moving_m).any(axis=1)]
     if len(moving):
         raise BadInput(f"{source.path}: device {moving[0]!r} has positions "
                        f"{range_m.loc[moving[0]].max():.0f} m apart ({len(moving)} such devices); "
-                       "a device has one position: name it device = \"by position\", or leave its "
-                       "position out to have it found")
+                       "a device has one position: --place-m 5 makes one of each place that is 5 m "
+                       "from the others, device = \"by position\" one of each position; or leave "
+                       "its position out to have it found")
     devices = by_device.median()
     devices["role"] = np.where(devices[["x_m", "y_m"]].notna().all(axis=1), "anchor", "unknown")
     devices.loc[devices["role"] == "unknown", ["x_m", "y_m"]] = np.nan

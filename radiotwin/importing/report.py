@@ -9,12 +9,12 @@ import pandas as pd
 
 from radiotwin.importing.averaging import WAVELENGTHS, in_wavelengths
 from radiotwin.importing.positions import PositionedLinks
+from radiotwin.importing.reading import Logs
 from radiotwin.importing.settings import Settings
-from radiotwin.importing.source import Source
 from radiotwin.importing.tally import Tally
 from radiotwin.measurements import Measurements
 
-SCHEMA = "radiotwin.import/1"
+SCHEMA = "radiotwin.import/2"
 UNITS = {"_m": "m", "_deg": "°", "_s": "s", "_dbm": "dBm", "_db": "dB"}
 """End of a column's name -> unit."""
 # Limits beyond which a value is legal but worth a warning; chosen by the project.
@@ -27,15 +27,15 @@ MIN_SAMPLE = 20  # values from which a share or a range says something
 YEARS = (1990, 2100)
 
 
-def make_report(source: Source, rows: int, readings: int, kept: int, tally: Tally,
+def make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Tally,
                 positioned: PositionedLinks, measurements: Measurements,
                 settings: Settings) -> dict[str, Any]:
     """Make the content of `import.json`.
 
     Args:
-        source: the file.
-        rows: of the file.
-        readings: in these rows.
+        logs: what was read.
+        notes: on how it was read.
+        others: number of files that have a format that is not read.
         kept: readings that were not left out.
         tally: readings that were left out; with `kept` they add up to `readings`.
         positioned: the links that were kept.
@@ -46,8 +46,8 @@ def make_report(source: Source, rows: int, readings: int, kept: int, tally: Tall
     origin = positioned.frame.origin
     time_s = table["time_s"].dropna() if "time_s" in table else pd.Series(dtype=float)
     return {
-        "schema": SCHEMA, "file": source.path.name,
-        "rows": rows, "readings": readings, "kept": kept,
+        "schema": SCHEMA, "files": logs.files,
+        "rows": logs.rows, "readings": logs.readings, "kept": kept,
         "left_out": [{"reason": reason, "column": column, "readings": number,
                       "first": tally.first[reason, column]}
                      for (reason, column), number in tally.left_out.items()],
@@ -58,8 +58,9 @@ def make_report(source: Source, rows: int, readings: int, kept: int, tally: Tall
         if len(time_s) else None,
         "origin": None if origin is None else origin.model_dump(),
         "ranges": _ranges(table, positioned.links),
-        "warnings": [*_position_warnings(measurements),
-                     *_level_warnings(positioned, measurements, tally, readings),
+        "warnings": [*notes, *_file_warnings(others),
+                     *_position_warnings(measurements),
+                     *_level_warnings(positioned, measurements, tally, logs.readings),
                      *_time_and_angle_warnings(table),
                      *_averaging_warnings(measurements, settings)],
     }
@@ -84,6 +85,12 @@ def _ranges(table: pd.DataFrame, links: pd.DataFrame) -> dict[str, dict[str, Any
         result[name] = {"min": low, "median": middle, "max": high, "unit": unit,
                         "empty": int(values.isna().sum())}
     return result
+
+
+def _file_warnings(others: int) -> Iterator[str]:
+    if others:
+        yield (f"{others} files of other formats are left out" if others > 1
+               else "1 file of another format is left out")
 
 
 def _position_warnings(measurements: Measurements) -> Iterator[str]:

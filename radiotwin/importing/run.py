@@ -1,8 +1,8 @@
-"""The whole import: from a file to a folder."""
+"""The whole import: from files to a folder."""
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,33 +13,36 @@ from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder
 from radiotwin.frames import FRAME_FILE
 from radiotwin.importing.averaging import average
-from radiotwin.importing.levels import LEVEL_COLUMN
-from radiotwin.importing.links import build_links
+from radiotwin.importing.clocks import clock_notes
+from radiotwin.importing.log_files import list_files
 from radiotwin.importing.positions import PositionedLinks, add_positions
+from radiotwin.importing.reading import read_logs
 from radiotwin.importing.report import make_report
 from radiotwin.importing.settings import Settings
 from radiotwin.importing.settings_file import read_settings, write_settings
-from radiotwin.importing.source import Source, read_source
+from radiotwin.importing.source import Source
 from radiotwin.importing.tally import Tally
+from radiotwin.importing.thinning import stay_representatives
+from radiotwin.importing.tracks import add_tracks
 from radiotwin.measurements import OPTIONAL, REQUIRED, Measurements, read_measurements
 from radiotwin.tables import Origin
 
-HASHED_AT_ONCE = 500_000  # rows; bounds the memory of that
 FILES = {"measurements.csv", "measurements.csv.gz", "devices.csv", FRAME_FILE, "import.toml",
          "import.json"}
 DECIMALS = {"_m": 3, "_db": 4, "_dbm": 4, "_deg": 4, "_s": 6}
 """End of a column's name -> decimals that are written; all finer than any measurement."""
 
 
-def import_file(path: Path | str, settings: Settings, out: Path | str, compress: bool = False,
-                on_progress: Callable[[str], None] = lambda step: None) -> dict[str, Any]:
-    """Import a file of measurements into a folder.
+def import_files(paths: Path | str | Sequence[Path | str], settings: Settings, out: Path | str,
+                 compress: bool = False,
+                 on_progress: Callable[[str], None] = lambda step: None) -> dict[str, Any]:
+    """Import files of measurements into a folder.
 
     The folder gets `measurements.csv`, `devices.csv`, `frame.toml` where the frame's origin is
     known, `import.toml`, with which the import can be repeated, and `import.json`, the report.
 
     Args:
-        path: `.csv`, `.csv.gz`, `.parquet` or `.geojson`.
+        paths: files, folders of files, or zip files; several become one table with one origin.
         settings: mapping, units and filters.
         out: folder; an earlier import in it is replaced, other files are not.
         compress: write `measurements.csv.gz` instead of `measurements.csv`.
@@ -49,36 +52,40 @@ def import_file(path: Path | str, settings: Settings, out: Path | str, compress:
         the report, as in `import.json`.
 
     Raises:
-        BadInput: names file, row and column; nothing is written.
+        BadInput: all that is wrong, with file, row and column; nothing is written.
     """
     out = Path(out)
     _check_target(out)
-    on_progress("reading")
-    source, tally = read_source(path), Tally()
-    rows = len(source)
-    on_progress("repeated rows")
-    source, repeated = _without_repetition(source)
-    on_progress("links")
-    links, per_row = build_links(source, settings, tally)
-    readings = rows * per_row
-    tally.count("repeats an earlier row exactly", "", len(repeated) * per_row,
-                source.where(repeated[0]) if repeated else "")
-    source = source.without_cells()
+    paths = [paths] if isinstance(paths, (str, Path)) else paths
+    tables = [out, settings.devices, settings.receivers, *(track.file for track in settings.track)]
+    files, others = list_files(paths, filter(None, tables))
+    tally = Tally()
+    logs = read_logs(files, settings, tally, on_progress)
     on_progress("positions")
-    positioned = add_positions(source, links, settings, tally)
-    positioned = _filtered(source, positioned, settings, tally)
+    links, notes = add_tracks(logs.source, logs.links, settings, tally)
+    positioned = add_positions(logs.source, links, settings, tally)
+    positioned = _filtered(logs.source, positioned, settings, tally)
+    notes += clock_notes(positioned.links)
+    if settings.thin_m:
+        on_progress("thinning")
+        positioned = positioned.select(stay_representatives(positioned.links, settings.thin_m),
+                                       logs.source, tally, f"stay within {settings.thin_m:g} m")
     if positioned.links.empty:
         reasons = "; ".join(f"{number} {reason}" for (reason, _), number in tally.left_out.items())
-        raise BadInput(f"{path}: nothing is left of {readings} readings: {reasons}")
+        raise BadInput(f"{logs.source.path}: nothing is left of {logs.readings} readings: "
+                       f"{reasons}")
     kept = len(positioned.links)
     table = positioned.links
     if settings.average_m:
         on_progress("averaging")
         table = average(table, settings.average_m, settings.average)
-    measurements = _measurements(table, positioned.devices, settings, positioned.frame.origin)
-    report = make_report(source, rows, readings, kept, tally, positioned, measurements, settings)
+    measurements = _measurements(table, positioned.devices, logs.level_column,
+                                 positioned.frame.origin)
+    report = make_report(logs, [*logs.notes, *notes], others, kept, tally, positioned,
+                         measurements, settings)
     on_progress("writing")
-    used = settings.model_copy(update={"origin": positioned.frame.origin})
+    used = settings.model_copy(update={"origin": positioned.frame.origin,
+                                       "format": settings.format or logs.format})
     with atomic_folder(out) as folder:
         measurements.write(folder / ("measurements.csv.gz" if compress else "measurements.csv"))
         write_settings(used, folder / "import.toml", out)
@@ -87,16 +94,16 @@ def import_file(path: Path | str, settings: Settings, out: Path | str, compress:
     return report
 
 
-def import_measurements(path: Path | str, out: Path | str,
+def import_measurements(paths: Path | str | Sequence[Path | str], out: Path | str,
                         columns: Mapping[str, str] | Path | str | None = None, *,
                         compress: bool = False,
                         on_progress: Callable[[str], None] = lambda step: None,
                         **settings: Any) -> Measurements:
-    """Import a file of measurements into a folder, and return them.
+    """Import files of measurements into a folder, and return them.
 
     Args:
-        path: `.csv`, `.csv.gz`, `.parquet` or `.geojson`.
-        out: folder, see `import_file`; its `import.json` counts what was left out.
+        paths: logs and tables, folders of them, or zip files, see `import_files`.
+        out: folder, see `import_files`; its `import.json` counts what was left out.
         columns: column of each quantity, such as `{"latitude": "lat", "level": "rsrp"}`; or a TOML
             file with these and all other settings.
         compress: write `measurements.csv.gz` instead of `measurements.csv`.
@@ -106,12 +113,13 @@ def import_measurements(path: Path | str, out: Path | str,
     Raises:
         BadInput: names file, row and column, or the setting; nothing is written.
     """
-    path, out = Path(path), Path(out)
+    paths, out = [paths] if isinstance(paths, (str, Path)) else paths, Path(out)
     mapping = None if isinstance(columns, Mapping) else columns
     given: dict[str, Any] = {"columns": columns} if isinstance(columns, Mapping) else {}
     given |= {name: str(value) if isinstance(value, Path) else value
               for name, value in settings.items()}
-    import_file(path, read_settings(mapping, given, path.parent), out, compress, on_progress)
+    folder = Path(paths[0]).parent if paths else None
+    import_files(paths, read_settings(mapping, given, folder), out, compress, on_progress)
     return read_measurements(out / ("measurements.csv.gz" if compress else "measurements.csv"))
 
 
@@ -123,39 +131,6 @@ def _check_target(out: Path) -> None:
             detail = f" (it has {others[0]})" if others else ""
             raise BadInput(f"{out} is not empty and not an earlier import{detail}; choose another "
                            "output folder")
-
-
-def _without_repetition(source: Source) -> tuple[Source, list[int]]:
-    """Remove the rows that equal an earlier one in every column; return also their indices."""
-    table = source.table
-    rows = np.arange(len(table))  # that repeat, or are repeated, in the columns so far
-    key = np.zeros(len(table), dtype=np.uint64)
-    for name in table:
-        key = key * np.uint64(0x9E3779B97F4A7C15) + _hashes(table[name], rows)
-        again = pd.Series(key).duplicated(keep=False).to_numpy()
-        rows, key = rows[again], key[again]
-    if not len(rows):
-        return source, []
-    comparable = table.iloc[rows]  # equal hashes may be of different rows
-    if table.dtypes.eq(object).any():
-        comparable = comparable.astype(str)
-    repeats = np.zeros(len(table), dtype=bool)
-    repeats[rows] = comparable.duplicated()
-    unique = Source(source.path, table[~repeats], source.where)
-    return unique, list(table.index[repeats])
-
-
-def _hashes(cells: pd.Series, rows: np.ndarray) -> np.ndarray:
-    """Return hashes (n,) of the cells of some rows; equal cells have equal ones."""
-    parts = [np.empty(0, dtype=np.uint64)]
-    for start in range(0, len(rows), HASHED_AT_ONCE):
-        part = cells.iloc[rows[start:start + HASHED_AT_ONCE]]
-        if part.dtype.kind == "O":
-            part = part.astype(str)
-        elif part.dtype.kind == "f":
-            part = part + 0.0  # of two zeros that are equal, one is negative
-        parts.append(pd.util.hash_pandas_object(part, index=False).to_numpy())
-    return np.concatenate(parts)
 
 
 def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,
@@ -182,18 +157,12 @@ def _filtered(source: Source, positioned: PositionedLinks, settings: Settings,
             where = source.where(links.index[int(np.argmax(bad))])
             tally.count(text.format(limit), "", bad.sum(), where)
             keep &= ~bad
-    if keep.all():
-        return positioned
-    links = links[keep]
-    devices = positioned.devices
-    devices = devices[devices["device"].isin(links["device"])].reset_index(drop=True)
-    return PositionedLinks(links, devices, positioned.device_m[keep], positioned.frame)
+    return positioned if keep.all() else positioned.select(keep)
 
 
-def _measurements(table: pd.DataFrame, devices: pd.DataFrame, settings: Settings,
+def _measurements(table: pd.DataFrame, devices: pd.DataFrame, level: str,
                   origin: Origin | None) -> Measurements:
     """Return the two tables with the columns in order and rounded."""
-    level = LEVEL_COLUMN[str(settings.level_unit)]
     table = table.rename(columns={"level_db": level})
     order = ["time_s", *REQUIRED, level, *(name for name in OPTIONAL if name != "time_s")]
     table = table[[name for name in order if name in table]].reset_index(drop=True)

@@ -1,14 +1,20 @@
 """Settings of an import: the same in its TOML file and in the options of the command line."""
 
+import codecs
+from collections.abc import Iterable
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from radiotwin.cells import listed
+from radiotwin.errors import BadInput
 from radiotwin.tables import Number, Origin, Table
 
 Spec = Annotated[str, Field(min_length=1)]
 """Name of a column of the file, or `always VALUE` for a constant."""
 Positive = Annotated[Number, Field(gt=0)]
+DELIMITERS = (",", ";", "\t", "|")
+BY_DAY, BY_FILE, BY_POSITION = "by day", "by file", "by position"
 POSITION = ("latitude", "longitude", "altitude", "height", "x", "y", "z")
 
 
@@ -54,7 +60,7 @@ class Columns(Position):
     level: Spec | None = None
     device: Spec | None = None
     receiver: Spec = "always receiver"
-    flight: Spec = "always flight"
+    flight: Spec | None = None
     time: Spec | None = None
     device_latitude: Spec | None = None
     device_longitude: Spec | None = None
@@ -68,6 +74,7 @@ class Columns(Position):
     pitch: Spec | None = None
     roll: Spec | None = None
     quality: Spec | None = None
+    snr: Spec | None = None
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -91,6 +98,7 @@ class Wide(Position):
     level: Spec | list[Spec]
     receiver: Spec | None = None
     device: Spec | None = None
+    level_offset_db: Number = 0.0
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -101,10 +109,35 @@ class Wide(Position):
         return self
 
 
-class Settings(Table):
-    """Settings of an import."""
+class TrackFile(Table):
+    """Positions of a receiver over time."""
 
+    file: Spec
+    receiver: Spec | None = None
+    time_offset_s: Number = 0.0
+
+
+class Settings(Table):
+    """Settings of an import.
+
+    The lines and marks of a text are found in each file where they are not declared.
+    """
+
+    format: str | None = Field(None, max_length=50, description="name of a known format")
+    encoding: str | None = Field(None, max_length=50)
+    delimiter: Literal[",", ";", "\t", "|"] | None = None
+    decimal: Literal[".", ","] | None = None
+    sheet: str | None = Field(None, max_length=200, description="of a workbook; the first one")
+    header: list[Spec] = Field([], max_length=5000, description="names of the columns of a text "
+                                                                "without a header")
+    lines_before_header: int | None = Field(None, ge=0, le=100)
+    lines_after_table: int | None = Field(None, ge=0, le=10_000)
+    only: dict[Spec, list[Number | str]] = Field(
+        {}, description="column -> texts of the rows that are kept")
+    band_hz: Annotated[list[Positive], Field(min_length=2, max_length=2)] | None = Field(
+        None, description="edges of the band whose power counts, of a spectrum scan")
     level_unit: Literal["dBm", "dB", "mW", "W"] | None = None
+    level_offset_db: Number = Field(0.0, description="added to each level")
     length_unit: Literal["m", "ft"] | None = None
     time_format: str | None = Field(
         None, max_length=200,
@@ -119,6 +152,8 @@ class Settings(Table):
     max_level: Number | None = Field(None, description="[dBm, or dB for gains]")
     min_distance_m: Number | None = Field(None, ge=0)
     max_distance_m: Positive | None = None
+    thin_m: Positive | None = Field(None, description="of a stay within it one reading is kept")
+    place_m: Positive | None = Field(None, description="between the places of a device")
     average_m: Positive | None = Field(None, description="length of the bins of the local mean")
     average: Literal["power", "median"] = "power"
     crs: str | None = Field(
@@ -126,27 +161,58 @@ class Settings(Table):
         description="of x and y, such as EPSG:32612; without one they are local")
     devices: str | None = Field(None, description="table of the devices' positions")
     receivers: str | None = Field(None, description="table of the fixed receivers' positions")
+    track: list[TrackFile] = Field([], description="positions over time; of all receivers, or one")
+    track_max_gap_s: Positive = Field(
+        5.0, description="largest time between two positions of a track that are interpolated")
     origin: Origin | None = None
     columns: Columns = Columns()
     wide: list[Wide] = []
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
-        if not self.wide and not self.columns.level:
-            raise ValueError("columns.level is missing: which column holds the level? For example "
-                             'level = "rsrp"')
         if self.wide and self.columns.level:
             raise ValueError("columns.level and wide cannot both be given: the levels are in one "
                              "column or in many")
-        wide_devices = self.wide and all(block.device for block in self.wide)
-        if not self.columns.device and not wide_devices:
-            raise ValueError("columns.device is missing: which device was heard? A column, "
-                             '"always NAME", or "by position"')
         if self.average_m and self.columns.quality:
             raise ValueError("average_m writes the number of readings into quality; leave "
                              "columns.quality out")
+        if self.band_hz and self.band_hz[0] >= self.band_hz[1]:
+            raise ValueError("band_hz: give the lower edge first, such as [433.05e6, 434.79e6]")
         for low, high in (("min_level", "max_level"), ("min_distance_m", "max_distance_m")):
             both = getattr(self, low), getattr(self, high)
             if None not in both and both[0] >= both[1]:
                 raise ValueError(f"{low} = {both[0]:g} must be less than {high} = {both[1]:g}")
         return self
+
+    @field_validator("encoding")
+    @classmethod
+    def _known(cls, name: str | None) -> str | None:
+        try:
+            if name is not None:
+                codecs.getincrementaldecoder(name)
+                "a".encode(name)  # of some names are no texts
+        except (LookupError, ValueError):
+            raise ValueError("unknown; allowed are utf-8, utf-16, cp1252, latin-1 and other names "
+                             "that Python knows") from None
+        return name
+
+    def require_columns(self, source: str, header: Iterable[str]) -> None:
+        """Check that there are columns of levels and of devices.
+
+        Args:
+            source: the file, for the message.
+            header: its columns.
+
+        Raises:
+            BadInput: names all that is missing.
+        """
+        missing = []
+        if not self.wide and not self.columns.level:
+            missing += ["columns.level is missing: which column holds the level? For example "
+                        'level = "rsrp"']
+        wide_devices = self.wide and all(block.device for block in self.wide)
+        if not self.columns.device and not wide_devices:
+            missing += ["columns.device is missing: which device was heard? A column, "
+                        '"always NAME", or "by position"']
+        if missing:
+            raise BadInput(f"{source}: {'; '.join(missing)}. The file has {listed(header)}")

@@ -9,7 +9,7 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.settings import Columns, Settings, Wide
+from radiotwin.importing.settings import Columns, Settings, TrackFile, Wide
 from radiotwin.inputs import is_within, read_toml
 from radiotwin.tables import Origin
 
@@ -53,12 +53,41 @@ def read_settings(path: Path | str | None, given: Mapping[str, Any],
         for table in ("devices", "receivers"):
             if isinstance(data.get(table), str) and table not in given:
                 data[table] = str(_table_of(path, data[table], data_folder))
+        tracks = data.get("track")
+        for track in tracks if isinstance(tracks, list) and "track" not in given else []:
+            if isinstance(track, dict) and isinstance(track.get("file"), str):
+                track["file"] = str(_table_of(path, track["file"], data_folder))
     try:
         return Settings.model_validate(data | dict(given))
     except ValidationError as error:
         # Pydantic reports each type of a union that it tried; the first report of a key is kept.
         lines = {_key(problem): _message(problem, path) for problem in reversed(error.errors())}
         raise BadInput("\n".join(reversed(lines.values()))) from None
+
+
+def merged(settings: Settings, defaults: Mapping[str, Any]) -> Settings:
+    """Return settings with defaults for what they do not declare.
+
+    Args:
+        settings: of the import.
+        defaults: fields of `Settings`; a position counts only where none is declared.
+
+    Raises:
+        BadInput: both together are not allowed.
+    """
+    own = settings.model_dump(exclude_unset=True, exclude_none=True)
+    columns = dict(defaults.get("columns", {}))
+    declared = set(own.get("columns", {}))
+    for prefix in ("", "device_"):
+        for group in (("latitude", "longitude", "x", "y"), ("altitude", "height", "z")):
+            names = {prefix + name for name in group}
+            if declared & names:
+                columns = {name: spec for name, spec in columns.items() if name not in names}
+    data = {**defaults, **own, "columns": columns | own.get("columns", {})}
+    try:
+        return Settings.model_validate(data)
+    except ValidationError as error:
+        raise BadInput("\n".join(_message(problem, None) for problem in error.errors())) from None
 
 
 def _table_of(settings: Path, name: str, data_folder: Path | None) -> Path:
@@ -73,7 +102,7 @@ def _table_of(settings: Path, name: str, data_folder: Path | None) -> Path:
 def _key(problem: Mapping[str, Any]) -> str:
     """Return the key of a problem, such as `wide.0.level`, without the types that were tried."""
     names = {*Settings.model_fields, *Columns.model_fields, *Wide.model_fields,
-             *Origin.model_fields}
+             *Origin.model_fields, *TrackFile.model_fields}
     extra = problem["type"] == "extra_forbidden"
     return ".".join(str(part) for part in problem["loc"]
                     if isinstance(part, int) or part in names or extra)
@@ -84,7 +113,8 @@ def _message(problem: Mapping[str, Any], path: Path | None) -> str:
     reason = problem["msg"].removeprefix("Value error, ")
     table = problem["loc"][0] if problem["loc"] else ""
     if problem["type"] == "extra_forbidden":
-        models: dict[Any, type[BaseModel]] = {"columns": Columns, "wide": Wide}
+        models: dict[Any, type[BaseModel]] = {"columns": Columns, "wide": Wide,
+                                                  "track": TrackFile}
         allowed = models.get(table, Settings).model_fields
         reason = f"unknown; allowed are {', '.join(allowed)}"
     elif problem["type"] == "string_type" and table in ("columns", "wide"):
@@ -107,5 +137,7 @@ def write_settings(settings: Settings, path: Path, folder: Path) -> None:
     for table in ("devices", "receivers"):
         if table in data:
             data[table] = os.path.relpath(data[table], folder)
+    for track in data.get("track", []):
+        track["file"] = os.path.relpath(track["file"], folder)
     with path.open("wb") as file:
         tomli_w.dump(data, file)

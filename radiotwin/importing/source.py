@@ -1,6 +1,7 @@
 """A file of measurements as a table whose cells can be named in a message."""
 
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,10 +9,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from radiotwin.budgets import CELLS, COLUMNS, ROWS
-from radiotwin.cells import as_numbers, listed, read_cells, shown
+from radiotwin.cells import as_numbers, listed, shown
 from radiotwin.errors import BadInput
-from radiotwin.inputs import read_json
 from radiotwin.tables import name_fault
 
 EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
@@ -19,7 +18,7 @@ EMPTY = ("", "nan", "na", "n/a", "<na>", "nat", "null", "none")
 ALWAYS = "always "
 """Prefix of a constant in place of a column's name."""
 _ROWS_AT_ONCE = 1_000_000  # of which stripped texts are made
-FORMATS = (".csv", ".parquet", ".geojson", ".json")
+_TEMPLATE = re.compile(r"\{([^{}]+)\}")
 
 
 @dataclass(frozen=True)
@@ -27,34 +26,61 @@ class Source:
     """A table whose index is the position of each row in the file.
 
     Attributes:
-        path: of the file.
+        path: of the file, or a name of several, for messages.
         table: cells as in the file.
         where: index -> `row 7`, as the file's user counts.
+        notes: on how the file was read.
     """
 
-    path: Path
+    path: Path | str
     table: pd.DataFrame
     where: Callable[[int], str]
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.table)
 
     def cells(self, spec: str, purpose: str) -> pd.Series:
-        """Return the cells of a column, or a constant.
+        """Return the cells of a column, a constant, or texts made of several columns.
 
         Args:
-            spec: name of a column, or `always VALUE`.
+            spec: name of a column, `always VALUE`, or a text with names in braces, such as
+                `{Date} {Time}`, which is empty where one of these cells is.
             purpose: what they are needed for, for the message.
 
         Raises:
             BadInput: no such column.
         """
+        if spec in self.table:
+            return self.table[spec]
         if spec.startswith(ALWAYS):
             return pd.Series(spec.removeprefix(ALWAYS), index=self.table.index)
-        if spec not in self.table:
-            raise BadInput(f"{self.path}: column {spec!r} ({purpose}) is missing; the file has "
+        self.require({purpose: spec})
+        pieces = _TEMPLATE.split(spec)  # constant, name, constant, name, …
+        columns = {name: as_text(self.table[name]) for name in pieces[1::2]}
+        text = pd.Series(pieces[0], index=self.table.index, dtype=str)
+        for name, constant in zip(pieces[1::2], pieces[2::2]):
+            text = text + columns[name] + constant
+        for cells in columns.values():
+            text = text.mask(cells == "", "")
+        return text
+
+    def require(self, specs: Mapping[str, str]) -> None:
+        """Check that the file has all columns of a mapping.
+
+        Args:
+            specs: what they are needed for -> as in `cells`.
+
+        Raises:
+            BadInput: names all that are missing.
+        """
+        missing = [f"{name!r} ({purpose})" for purpose, spec in specs.items()
+                   for name in columns_of(spec, self.table) if name not in self.table]
+        if missing:
+            several = len(missing) > 1
+            raise BadInput(f"{self.path}: column{'s' * several} {', '.join(missing)} "
+                           f"{'are' if several else 'is'} missing; the file has "
                            f"{listed(self.table.columns)}. Correct the mapping")
-        return self.table[spec]
 
     def text(self, spec: str, purpose: str) -> pd.Series:
         """Return the cells as stripped texts, `""` where empty.
@@ -87,10 +113,6 @@ class Source:
             if name and (fault := name_fault(name)):
                 self.refuse(spec, pd.Series(name, index=self.table.index), number == i, fault)
         return names.to_numpy(dtype=object)[number]
-
-    def without_cells(self) -> "Source":
-        """Return the same file for messages only, without the memory of its cells."""
-        return Source(self.path, self.table.iloc[:0], self.where)
 
     def numbers(self, spec: str, purpose: str) -> np.ndarray:
         """Return the cells as numbers, (n,); NaN where empty.
@@ -154,56 +176,13 @@ def as_text(cells: pd.Series) -> pd.Series:
     return text.mask(cells.isna() | text.str.lower().isin(EMPTY), "")
 
 
-def read_source(path: Path | str) -> Source:
-    """Open a file of measurements.
+def columns_of(spec: str, header: Iterable[object]) -> list[str]:
+    """Return the names of columns in an entry of a mapping.
 
     Args:
-        path: `.csv`, `.csv.gz`, `.parquet`, or `.geojson` of points.
-
-    Raises:
-        BadInput: another format, unreadable, or without rows.
+        spec: as in `Source.cells`.
+        header: names of the file's columns; a name may have braces itself.
     """
-    path = Path(path)
-    if path.suffix not in FORMATS and path.suffixes[-2:] != [".csv", ".gz"]:
-        raise BadInput(f"{path}: unknown format; allowed are .csv.gz, {', '.join(FORMATS)}")
-    if path.suffix in (".geojson", ".json"):
-        source = Source(path, _read_geojson(path), lambda index: f"feature {index + 1}")
-    else:
-        first = 1 if path.suffix == ".parquet" else 2
-        source = Source(path, read_cells(path), lambda index: f"row {index + first}")
-    if not len(source):
-        raise BadInput(f"{path}: has no rows; it needs at least one measurement")
-    return source
-
-
-def _read_geojson(path: Path) -> pd.DataFrame:
-    """Return one row per point: longitude, latitude, altitude (RFC 7946, 3.1.1) and properties."""
-    data = read_json(path, "GeoJSON file")
-    features = data.get("features") if isinstance(data, dict) else None
-    if not isinstance(features, list):
-        raise BadInput(f"{path} is not a GeoJSON FeatureCollection; allowed is one of points")
-    crs = str(data.get("crs") or "CRS84")
-    if not ("CRS84" in crs or "4326" in crs):
-        raise BadInput(f"{path}: its crs is {crs}; allowed is WGS84, the only one of GeoJSON since "
-                       "RFC 7946")
-    ROWS.check(len(features), path)
-    points = [_point(path, number, feature) for number, feature in enumerate(features, start=1)]
-    columns = set().union(*points)
-    COLUMNS.check(len(columns), path)
-    CELLS.check(len(columns) * len(points), path)
-    return pd.DataFrame(points)
-
-
-def _point(path: Path, number: int, feature: object) -> dict[str, object]:
-    """Return the properties and coordinates of a GeoJSON feature."""
-    geometry = feature.get("geometry") if isinstance(feature, dict) else None
-    kind = geometry.get("type") if isinstance(geometry, dict) else None
-    coordinates = geometry.get("coordinates") if geometry and kind == "Point" else None
-    if (not isinstance(coordinates, list) or len(coordinates) not in (2, 3)
-            or not all(type(value) in (int, float) for value in coordinates)):
-        what = str(kind or "without a geometry")[:80]
-        raise BadInput(f"{path}: feature {number} is {what}; allowed are points with two or three "
-                       "coordinates: leave the others out")
-    properties = feature.get("properties") if isinstance(feature, dict) else None
-    return ((properties if isinstance(properties, dict) else {})
-            | dict(zip(("longitude", "latitude", "altitude"), coordinates)))
+    if spec.startswith(ALWAYS) and spec not in header:
+        return []
+    return _TEMPLATE.findall(spec) if _TEMPLATE.search(spec) and spec not in header else [spec]

@@ -112,6 +112,10 @@ def _parse(source: Source, spec: str, text: pd.Series, time_format: str) -> pd.S
         parsed = pd.to_datetime(text.where(text != ""), errors="coerce",
                                 format="ISO8601" if iso else time_format,
                                 utc=bool(with_offset.any()))
+        if parsed.isna().any() and time_format.endswith("%S"):  # some seconds have decimals
+            fine = pd.to_datetime(text.where(text != ""), errors="coerce",
+                                  format=f"{time_format}.%f", utc=bool(with_offset.any()))
+            parsed = parsed.fillna(fine)
     except ValueError as error:
         raise BadInput(f"time_format {time_format!r} is not a strftime format: {error}; {ALLOWED}"
                        ) from None

@@ -3,6 +3,7 @@
 import json
 import os
 import shlex
+import zipfile
 from collections import Counter
 from pathlib import Path
 
@@ -217,3 +218,56 @@ def test_points_with_a_property_of_their_own_each(run, tmp_path, monkeypatch):
     (tmp_path / "t.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": points}))
     result = run(f"import t.geojson {LOCAL}", tmp_path)
     assert result.returncode == 2 and "RADIOTWIN_MAX_COLUMNS" in " ".join(result.stderr.split())
+
+
+def test_a_folder_a_zip_file_and_files_are_one_import(run, tmp_path):
+    """Texts in another dialect, positions of a track, and again with what was saved."""
+    (tmp_path / "day").mkdir()
+    for i, name in enumerate(("one", "two")):
+        (tmp_path / "day" / f"{name}.txt").write_bytes(
+            f"Meßfahrt {name}\nZeit;Zelle;Pegel\n01.03.2024 10:00:0{i};a;-80,{i}\n01.03.2024 10:00:0{i + 1};a;-9{i},0\nSumme;2\n".encode("cp1252"))
+    with zipfile.ZipFile(tmp_path / "day.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in ("one", "two"):
+            archive.write(tmp_path / "day" / f"{name}.txt", f"{name}.txt")
+    (tmp_path / "flight.gpx").write_text("<gpx><trk><trkseg>" + "".join(
+        f'<trkpt lat="48.{i}" lon="11.5"><ele>5</ele><time>2024-03-01T09:00:0{i}Z</time></trkpt>' for i in range(4)) + "</trkseg></trk></gpx>")
+    words = ("--columns time=Zeit,level=Pegel,device=Zelle --level-unit dBm --time-format '%d.%m.%Y %H:%M:%S' --time-zone Europe/Berlin "
+             "--track flight.gpx")
+    written = set()
+    for files in ("day", "day.zip", "day/one.txt day/two.txt"):
+        done = run(f"import {files} {words} -o out", tmp_path)
+        assert done.returncode == 0, done.stderr
+        again = run(f"import {files} --columns out/import.toml -o again", tmp_path)
+        assert again.returncode == 0, again.stderr
+        for name in FILES:
+            assert (tmp_path / "out" / name).read_bytes() == (tmp_path / "again" / name).read_bytes(), name
+        written.add((tmp_path / "out" / "measurements.csv").read_bytes())
+    assert len(written) == 1 and "Readings of 2 files" in done.stdout and "separated by semicolons, decimal commas, encoding cp1252" in " ".join(done.stdout.split())
+    table = read_measurements(tmp_path / "out" / "measurements.csv").table
+    assert list(table["flight"]) == ["one", "one", "two", "two"] and list(table["rssi_dbm"]) == [-80, -90, -80.1, -91]
+    np.testing.assert_allclose(np.diff(table["receiver_y_m"]) / 111_200, [0.1, 0, 0.1], atol=1e-3)
+
+
+def test_a_known_format_needs_no_mapping(run, tmp_path):
+    (tmp_path / "w.csv").write_text(
+        "WigleWifi-1.6,appRelease=2\nMAC,SSID,FirstSeen,RSSI,CurrentLatitude,CurrentLongitude,AltitudeMeters,Type\n"
+        "aa,b,2024-03-01 10:00:00,-60,48.1,11.5,500,WIFI\ncc,d,2024-03-01 10:00:01,-90,48.1,11.5,500,LTE\n")
+    done = run("import w.csv --only 'Type=WIFI|BLE' --level-offset-db -2 -o out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    table = read_measurements(tmp_path / "out" / "measurements.csv").table
+    assert list(table["device"]) == ["aa"] and list(table["rssi_dbm"]) == [-62]
+    assert 'format = "wigle"' in (tmp_path / "out" / "import.toml").read_text()
+    assert run("import w.csv --columns out/import.toml -o again", tmp_path).returncode == 0
+    assert (tmp_path / "again" / "measurements.csv").read_bytes() == (tmp_path / "out" / "measurements.csv").read_bytes()
+
+
+def test_a_spectrum_scan_in_a_band(run, tmp_path):
+    (tmp_path / "s.csv").write_text("2024-03-01, 10:00:00, 1000000, 1200000, 100000.00, 7, -30.0, -30.0, -30.0\n")
+    words = "import s.csv --time-zone UTC --columns x='always 1',y='always 2' --length-unit m -o out"
+    assert run(f"{words} --band-hz 1e6,1.2e6", tmp_path).returncode == 0
+    assert read_measurements(tmp_path / "out" / "measurements.csv").table["rssi_dbm"].tolist() == pytest.approx([-26.9897], abs=1e-3)
+    for change, part in (("--band-hz 2e6,1e6", "give the lower edge first"), ("--band-hz low,high", "band_hz"), ("--band-hz 5", "band_hz"),
+                         ("--only Type", "is not COLUMN=A|B"), ("--delimiter x", "delimiter"), ("--format none", "format 'none' is unknown"),
+                         ("--track no.gpx", "no.gpx does not exist"), ("--header a,,b", "header")):
+        done = run(f"{words} {change}", tmp_path)
+        assert done.returncode == 2 and part in done.stderr and "Traceback" not in done.stderr, (change, done.stderr)

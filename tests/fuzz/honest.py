@@ -9,9 +9,12 @@ import re
 import runpy
 import shutil
 import signal
+import struct
 import sys
 import warnings
+import zipfile
 from collections.abc import Callable
+from datetime import UTC, datetime
 from pathlib import Path
 from unittest import mock
 
@@ -68,6 +71,7 @@ def make_honest(folder: Path) -> None:
     _write_maps(folder)
     _write_log(folder)
     _write_other_logs(folder)
+    _write_foreign_logs(folder)
     (folder / "points.csv").write_text("x_m,y_m,z_m\n10,20,30\n150,160,40\n")
     (folder / "pattern.csv").write_text("azimuth_deg,elevation_deg,gain_dbi\n" + "".join(
         f"{azimuth},{elevation},{-abs(elevation) / 10}\n" for azimuth in range(0, 360, 30)
@@ -223,6 +227,46 @@ def _write_other_logs(folder: Path) -> None:
         'devices = "sites.csv"\nlength_unit = "m"\nreceivers = "masts.csv"\ntime_format = "epoch s"\nlevel_unit = "dBm"\n'
         'not_detected = [-150, "no"]\naverage_m = 20.0\n[origin]\nlatitude_deg = 50.0\nlongitude_deg = 8.0\n'
         'altitude_m = 0.0\n[columns]\ntime = "when"\nreceiver = "mast"\ndevice = "cell"\nlevel = "rsrp"\n')
+
+
+def _write_foreign_logs(folder: Path) -> None:
+    """Write logs as programs of others write them, and positions to join them with."""
+    table = pd.read_csv(folder / "log.csv").head(20)
+    text = "Messfahrt Süd\n\n" + table.to_csv(index=False, sep=";", decimal=",") + "Summe;20\n"
+    (folder / "german.csv").write_bytes(text.encode("latin-1"))
+    with zipfile.ZipFile(folder / "logs.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("one.csv", table.head(9).to_csv(index=False))
+        archive.writestr("day 2/two.csv.gz", gzip.compress(table.tail(9).to_csv(index=False).encode()))
+    table.to_excel(folder / "log.xlsx", index=False)
+    (folder / "levels.csv").write_text("when,cell,rsrp\n" + "".join(f"{1.7e9 + i},c{i % 2},{-70 - i}\n" for i in range(9)))
+    (folder / "levels.toml").write_text(
+        'time_format = "epoch s"\nlevel_unit = "dBm"\n[columns]\ntime = "when"\ndevice = "cell"\nlevel = "rsrp"\n')
+    times = [datetime.fromtimestamp(1.7e9 + i, UTC) for i in range(10)]
+    (folder / "flight.gpx").write_text("<gpx><trk><trkseg>\n" + "".join(
+        f'<trkpt lat="{50 + i / 1e4}" lon="8"><ele>{i}</ele><time>{time.isoformat()}</time></trkpt>\n'
+        for i, time in enumerate(times)) + "</trkseg></trk></gpx>\n")
+    (folder / "flight.nmea").write_text("".join(
+        f"$GPRMC,{time:%H%M%S}.00,A,50{i / 100:07.4f},N,00800.0000,E,1,2,{time:%d%m%y},,\n" for i, time in enumerate(times)))
+    (folder / "flight.ulg").write_bytes(_ulog(times))
+    (folder / "uplinks.jsonl").write_text("".join(json.dumps({
+        "time": time.isoformat(), "deviceInfo": {"devEui": "n1"}, "object": {"latitude": 50 + i / 1e4, "longitude": 8.0},
+        "rxInfo": [{"gatewayId": f"g{j}", "rssi": -90 - i, "snr": 5 - 3 * i, "location": {"latitude": 50.0, "longitude": 8.0 + j}}
+                   for j in range(2)]}) + "\n" for i, time in enumerate(times)))
+    (folder / "scan.csv").write_text("".join(
+        f"{time:%Y-%m-%d, %H:%M:%S}, {low}, {low + 300}, 100.00, 5, -30, -31, -32, -32\n" for time in times for low in (1000, 1300)))
+    (folder / "wigle.csv").write_text(
+        "WigleWifi-1.6,appRelease=2,model=X\nMAC,SSID,AuthMode,FirstSeen,Channel,RSSI,CurrentLatitude,CurrentLongitude,Type\n"
+        + "".join(f"aa,b,[ESS],{time:%Y-%m-%d %H:%M:%S},6,{-60 - i},{50 + i / 1e4},8,WIFI\n" for i, time in enumerate(times)))
+
+
+def _ulog(times: list[datetime]) -> bytes:
+    def message(kind: bytes, body: bytes) -> bytes:
+        return struct.pack("<H", len(body)) + kind + body
+
+    fields = b"vehicle_gps_position:uint64_t timestamp;uint64_t time_utc_usec;int32_t lat;int32_t lon;int32_t alt;"
+    return (b"ULog\x01\x12\x35\x01" + bytes(8) + message(b"F", fields) + message(b"A", bytes(3) + b"vehicle_gps_position")
+            + b"".join(message(b"D", struct.pack("<HQQiii", 0, i * 1_000_000, int(time.timestamp() * 1e6), 500_000_000 + i, 80_000_000, i))
+                       for i, time in enumerate(times)))
 
 
 def _declare_antennas(scene: Path) -> None:

@@ -98,6 +98,12 @@ TARGETS = (
         ("log.csv.gz", "import.toml"), ("log.parquet", "import.toml"), ("log.geojson", "points.toml"),
         ("fixed.csv", "fixed.toml"))),
     *(Target("log to import", file, _IMPORT.format("fixed.csv", "fixed.toml")) for file in ("masts.csv", "fixed.toml")),
+    *(Target("log to import", file, _IMPORT.format(file, "import.toml"))
+      for file in ("german.csv", "logs.zip", "log.xlsx")),
+    *(Target("log to import", file, f"radiotwin import {file} -o out") for file in ("uplinks.jsonl", "wigle.csv")),
+    Target("log to import", "scan.csv", "radiotwin import scan.csv --time-zone UTC --band-hz 1000,1600 --track flight.gpx -o out"),
+    *(Target("track", file, f"radiotwin import levels.csv --columns levels.toml --track {file} -o out")
+      for file in ("flight.gpx", "flight.nmea", "flight.ulg")),
     Target("points", "points.csv", "radiotwin gains scene --points points.csv --quality fast -o out.csv"),
     *(Target("twin", f"{folder}/{file}", command.format(folder), slow="raytrace" in folder)
       for folder, command in (

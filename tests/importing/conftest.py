@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from radiotwin.importing import import_file, read_settings
+from radiotwin.importing import import_files, read_settings
 from radiotwin.measurements import read_measurements
 
 SAMPLES = Path(__file__).parent / "samples"
@@ -18,7 +18,7 @@ def bring_in(tmp_path):
         path = tmp_path / name
         path.write_text(text) if isinstance(text, str) else path.write_bytes(text)
         settings = read_settings(None, {"level_unit": "dBm"} | given)
-        report = import_file(path, settings, tmp_path / "out")
+        report = import_files(path, settings, tmp_path / "out")
         measurements = read_measurements(tmp_path / "out" / "measurements.csv")
         return SimpleNamespace(report=report, table=measurements.table, devices=measurements.devices,
                                measurements=measurements)

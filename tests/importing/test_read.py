@@ -8,8 +8,8 @@ import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
+from radiotwin.importing.read_source import read_source
 from radiotwin.importing.settings_file import read_settings
-from radiotwin.importing.source import read_source
 
 TEXT = "device,x,y,level\na,0,0,-80\nb,3,4,-90\n"
 
@@ -77,8 +77,8 @@ def test_geojson_that_is_not_points(points, tmp_path, change, message):
 @pytest.mark.parametrize(("name", "content", "message"), [
     ("data.geojson", b"{", "is not readable JSON"), ("data.csv", b"", "is empty"), ("data.csv", b"a,b\n", "has no rows"),
     ("data.csv", b"a,b\n1\n", "row 2 has 1 fields"), ("data.csv.gz", b"no", "cannot be read"),
-    ("data.parquet", b"no", "cannot be read"), ("data.xlsx", b"no", "unknown format; allowed.*geojson"),
-    ("data.csv", "a,b\nü,1\n".encode("utf-16"), "UTF-8")])
+    ("data.parquet", b"no", "cannot be read"), ("data.kml", b"no", "unknown format; allowed.*geojson"),
+    ("data.csv", "a,b\nü,1\n".encode("utf-16-le"), "is not text .it has null characters")])
 def test_files_that_are_not_tables(tmp_path, name, content, message):
     (tmp_path / name).write_bytes(content)
     with pytest.raises(BadInput, match=message):

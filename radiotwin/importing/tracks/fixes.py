@@ -1,0 +1,88 @@
+"""Positions over time, in the order of time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from radiotwin.errors import BadInput
+
+ANGLES = ("heading_deg", "pitch_deg", "roll_deg")
+COLUMNS = ("latitude", "longitude", "altitude", *ANGLES)
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """Positions of one receiver.
+
+    Attributes:
+        time_s: seconds since 1970 UTC, (n,), ascending.
+        values: column of `COLUMNS` -> (n,) [degrees, m]; NaN where unknown.
+        notes: on how they were read.
+    """
+
+    time_s: np.ndarray
+    values: dict[str, np.ndarray]
+    notes: tuple[str, ...] = ()
+
+    def at(self, time_s: np.ndarray, max_gap_s: float) -> dict[str, np.ndarray]:
+        """Interpolate between neighbouring positions.
+
+        Args:
+            time_s: seconds since 1970 UTC, (m,).
+            max_gap_s: largest time between two positions, between which is interpolated.
+
+        Returns:
+            column -> (m,); NaN where there are no two neighbours so close in time.
+        """
+        after = np.searchsorted(self.time_s, time_s).clip(1, max(len(self.time_s) - 1, 1))
+        before = after - 1
+        after = np.minimum(after, len(self.time_s) - 1)
+        before = np.where(time_s == self.time_s[after], after, before)
+        gap_s = np.where(time_s == self.time_s[before], 0.0,
+                         self.time_s[after] - self.time_s[before])
+        inside = (time_s >= self.time_s[before]) & (time_s <= self.time_s[after])
+        inside &= gap_s <= max_gap_s
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.where(gap_s > 0, (time_s - self.time_s[before]) / gap_s, 0.0)
+        result = {}
+        for name, values in self.values.items():
+            step = values[after] - values[before]
+            if name in ("longitude", "heading_deg", "roll_deg"):  # across the date line, or north
+                step = (step + 180) % 360 - 180
+            step = np.where(share > 0, step, 0.0)  # at a position itself the next may be unknown
+            result[name] = np.where(inside, values[before] + share * step, np.nan)
+        if "longitude" in result:
+            result["longitude"] = (result["longitude"] + 180) % 360 - 180
+        if "heading_deg" in result:
+            result["heading_deg"] %= 360
+        return result
+
+
+def make_fixes(source: object, time_s: np.ndarray, values: dict[str, np.ndarray],
+               notes: tuple[str, ...] = ()) -> Fixes:
+    """Sort positions by time; of several at one time the last one counts.
+
+    Args:
+        source: the file, for messages.
+        time_s: seconds since 1970 UTC, (n,); NaN where unknown.
+        values: column -> (n,).
+        notes: on how they were read.
+
+    Raises:
+        BadInput: fewer than two have a time and a position, or one is off the Earth.
+    """
+    known = np.isfinite(time_s) & np.isfinite(values["latitude"]) & np.isfinite(values["longitude"])
+    known &= (values["latitude"] != 0) | (values["longitude"] != 0)
+    for name, limit in (("latitude", 90.0), ("longitude", 360.0)):
+        wrong = np.abs(values[name][known]) > limit
+        if wrong.any():
+            raise BadInput(f"{source}: {values[name][known][wrong][0]:g} is no {name}; allowed are "
+                           f"-{limit:g} to {limit:g} degrees")
+    time_s = time_s[known]
+    last_first = np.arange(len(time_s))[::-1]
+    unique_s, first = np.unique(time_s[last_first], return_index=True)
+    if len(unique_s) < 2:
+        raise BadInput(f"{source} has {len(unique_s)} positions with a time; at least two are "
+                       "needed")
+    order = last_first[first]
+    return Fixes(unique_s, {name: column[known][order] for name, column in values.items()}, notes)

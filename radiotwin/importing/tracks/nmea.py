@@ -1,0 +1,117 @@
+"""Positions of NMEA 0183: GGA has the height and no date, RMC and ZDA have the date."""
+
+import io
+from datetime import UTC, datetime, timedelta
+from functools import reduce
+from pathlib import Path
+
+import numpy as np
+
+from radiotwin.budgets import ROWS
+from radiotwin.errors import BadInput
+from radiotwin.importing.lines import Lines
+from radiotwin.importing.tracks.fixes import Fixes, make_fixes
+from radiotwin.inputs import open_gzip
+
+_DAY_S = 86_400.0
+_CENTURY = 80  # years below it are of this century
+
+
+def read_nmea(path: Path) -> Fixes:
+    """Read the positions of NMEA 0183 sentences of any talker.
+
+    Sentences whose check sum is wrong are left out.
+
+    Args:
+        path: of the file.
+
+    Raises:
+        BadInput: no date, or fewer than two positions.
+    """
+    rows: list[list[float]] = []  # seconds of the day, day, latitude, longitude, height
+    day = np.nan
+    damaged = 0
+    with open_gzip(path, "NMEA file") as content, \
+            io.TextIOWrapper(content, "ascii", "replace", newline="") as text:
+        for line in Lines(text, path):
+            fields, is_damaged = _sentence(line)
+            damaged += is_damaged
+            kind = fields[0][-3:]
+            try:
+                if kind == "ZDA":
+                    day = _day(int(fields[4]), int(fields[3]), int(fields[2]))
+                elif kind == "RMC" and fields[2] == "A":
+                    day = _day(_year(int(fields[9][4:6])), int(fields[9][2:4]), int(fields[9][:2]))
+                    _add(rows, _seconds(fields[1]), day, fields[3:7], np.nan)
+                elif kind == "GGA" and fields[6] not in ("", "0"):
+                    height_m = float(fields[9]) if fields[9] else np.nan
+                    _add(rows, _seconds(fields[1]), day, fields[2:6], height_m)
+            except (ValueError, IndexError, OverflowError):
+                damaged += 1
+            ROWS.check(len(rows), path)
+    columns = np.array(rows, dtype=float).reshape(-1, 5).T
+    if len(rows) and np.isnan(columns[1]).all():
+        raise BadInput(f"{path} has no date: it needs sentences RMC or ZDA beside GGA")
+    time_s = _days(columns[0], columns[1]) * _DAY_S + columns[0]
+    notes = (f"{path.name}: {damaged} damaged sentences are left out",) if damaged else ()
+    return make_fixes(path, time_s, dict(zip(("latitude", "longitude", "altitude"), columns[2:])),
+                      notes)
+
+
+def _sentence(line: str) -> tuple[list[str], bool]:
+    """Return the fields of a sentence, and whether its check sum is wrong."""
+    body, star, check = line.strip().partition("*")
+    if not body.startswith("$"):
+        return [""], False
+    if star:
+        total = reduce(lambda value, character: value ^ ord(character), body[1:], 0)
+        if check[:2].upper() != f"{total:02X}":
+            return [""], True
+    return body[1:].split(","), False
+
+
+def _add(rows: list[list[float]], seconds: float, day: float, place: list[str],
+         height_m: float) -> None:
+    """Add a position; RMC and GGA of one time are one."""
+    latitude, longitude = _degrees(place[0], place[1]), _degrees(place[2], place[3])
+    if rows and rows[-1][0] == seconds:
+        row = rows[-1]
+        row[1] = day if np.isnan(row[1]) else row[1]
+        if np.isnan(row[4]):
+            row[2:] = [latitude, longitude, height_m]
+        return
+    rows.append([seconds, day, latitude, longitude, height_m])
+
+
+def _days(seconds: np.ndarray, day: np.ndarray) -> np.ndarray:
+    """Return the day of each position: the last date, one later after each midnight since."""
+    result = np.array(day)
+    first = int(np.argmax(np.isfinite(day))) if len(day) else 0
+    if len(day):
+        result[:first] = day[first]
+        midnights = np.diff(seconds[:first + 1]) < -_DAY_S / 2
+        result[:first] -= np.cumsum(midnights[::-1])[::-1]
+    for i in range(first + 1, len(day)):
+        late = seconds[i] - seconds[i - 1] < -_DAY_S / 2
+        if day[i] == day[i - 1]:  # no date has come since
+            result[i] = result[i - 1] + late
+    return result
+
+
+def _seconds(text: str) -> float:
+    return int(text[:2]) * 3600 + int(text[2:4]) * 60 + float(text[4:])
+
+
+def _degrees(text: str, side: str) -> float:
+    point = text.index(".")
+    value = int(text[:point - 2]) + float(text[point - 2:]) / 60
+    return -value if side in ("S", "W") else value
+
+
+def _year(two_digits: int) -> int:
+    return two_digits + (2000 if two_digits < _CENTURY else 1900)
+
+
+def _day(year: int, month: int, day: int) -> float:
+    return (datetime(year, month, day, tzinfo=UTC)
+            - datetime(1970, 1, 1, tzinfo=UTC)) / timedelta(days=1)

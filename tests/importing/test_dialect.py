@@ -1,0 +1,141 @@
+"""How texts hold tables: found, declared, and refused where it is ambiguous."""
+
+import pytest
+
+from radiotwin.errors import BadInput
+from radiotwin.importing.log_files import LogFile
+from radiotwin.importing.read_source import Expected, read_source
+from radiotwin.importing.settings import Settings
+
+ROWS = [["Zeit", "Breite", "Länge", "Zelle", "RSRP"], ["1", "48.1", "11.5", "A", "-81.5"], ["2", "48.2", "11.6", "B", "-90.25"],
+        ["3", "48.3", "11.7", "B", "-91.0"]]
+
+
+def text_of(delimiter=",", decimal=".", before="", after=""):
+    rows = [[cell.replace(".", decimal) for cell in row] for row in ROWS]
+    return before + "".join(delimiter.join(row) + "\n" for row in rows) + after
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read(content, name="data.csv", expected=(), **declared):
+        path = tmp_path / name
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+        source = read_source(path, Settings(**declared), Expected((frozenset(expected),)))
+        return source, [list(source.table), *source.table.to_numpy().tolist()]
+    return read
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t", "|"])
+@pytest.mark.parametrize("decimal", [".", ","])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize(("before", "after"), [("", ""), ("Messfahrt Süd\nGerät: 3\n\n", "Summe" + "\n" + "Ende, gut\n")])
+def test_tables_are_the_same_however_they_are_written(read, delimiter, decimal, encoding, before, after):
+    if delimiter == decimal == ",":
+        pytest.skip("is no table")
+    source, table = read(text_of(delimiter, decimal, before, after).encode(encoding))
+    assert table == ROWS
+    plain = delimiter == "," and not before and encoding in ("utf-8", "utf-8-sig")
+    assert source.where(1) == ("row 3" if plain else f"line {6 if before else 3}") and bool(source.notes) != plain
+
+
+def test_what_was_found_is_told(read):
+    source, _ = read(text_of(";", ",", "Messfahrt Süd\n\n", "Ende\n").encode("cp1252"))
+    assert source.notes == ("data.csv: separated by semicolons, decimal commas, encoding cp1252, 2 lines before the header, "
+                            "1 line after the table",)
+
+
+def test_a_preamble_of_pairs_is_no_table(read):
+    """Twelve lines of two fields, three of five: the mapping decides."""
+    pairs = "".join(f"Parameter {i};Wert {i}\n" for i in range(12))
+    _, table = read(text_of(";", ",", pairs), expected={"rsrp", "breite"})
+    assert table == ROWS
+
+
+def test_declared_lines_are_not_looked_for(read):
+    text = "a;b\n" + text_of(";") + "Summe;1;2;3;4\n"
+    _, table = read(text, lines_before_header=1, lines_after_table=1, delimiter=";", decimal=".")
+    assert table == ROWS
+    with pytest.raises(BadInput, match="line 2 has 5 fields, the header has 2"):
+        read(text, lines_before_header=0, delimiter=";")
+
+
+def test_texts_without_a_header(read):
+    _, table = read("\n".join(text_of(";").splitlines()[1:]), header=ROWS[0])
+    assert table == ROWS
+
+
+def test_rows_that_end_with_a_separator(read):
+    _, table = read("Zeit;Zelle;\n1;A;\n2;B;\n")
+    assert table == [["Zeit", "Zelle"], ["1", "A"], ["2", "B"]]
+    _, table = read("Zeit;Zelle\n1;A;\n2;B;\n")
+    assert table == [["Zeit", "Zelle"], ["1", "A"], ["2", "B"]]
+
+
+def test_a_line_that_was_cut_off_is_told(read):
+    source, table = read(text_of(";") + "4;48.4;11.8")
+    assert table == ROWS and "1 line after the table" in source.notes[0]
+
+
+def test_a_damaged_row_within_the_table_is_refused(read):
+    with pytest.raises(BadInput, match="line 3 has 2 fields, the header has 5; every row needs as many"):
+        read(text_of(";").replace("2;48.2;11.6;B;-90.25", "2;48.2"))
+
+
+def test_many_lines_after_the_table_are_a_damaged_table(read):
+    with pytest.raises(BadInput, match="line 5 has 1 fields"):
+        read(text_of(";") + "".join(f"Ende {i}\n" for i in range(30)))
+
+
+def test_quoted_fields_may_hold_separators_and_line_breaks(read):
+    source, table = read('Zeit;Zelle\n1;"A; links"\n2;"B\nrechts"\n3;C\n')
+    assert [row[1] for row in table] == ["Zelle", "A; links", "B\nrechts", "C"] and source.where(2) == "line 5"
+    with pytest.raises(BadInput, match="is a quotation mark not closed|fields"):
+        read('Zeit;Zelle\n1;A\n2;"B\n' + "3;C\n" * 50)
+
+
+def test_repeated_names_are_numbered(read):
+    source, table = read("Zeit,RSRP,RSRP,RSRP\n1,-80,-81,-82\n")
+    assert table[0] == ["Zeit", "RSRP", "RSRP.2", "RSRP.3"]
+    assert "column 'RSRP' occurs more than once: the others are RSRP.2" in source.notes[0]
+
+
+def test_a_decimal_comma_is_not_a_separator_of_thousands(read):
+    with pytest.raises(BadInput, match="'1,234' may be a number with a decimal comma, or one with separated thousands"):
+        read("a;b\n1,234;x\n")
+    assert read("a;b\n1,234;x\n", decimal=",")[1][1] == ["1.234", "x"]
+    assert read("a;b\n1,234;x\n", decimal=".")[1][1] == ["1,234", "x"]
+
+
+def test_encodings_that_are_declared_and_wrong(read):
+    with pytest.raises(BadInput, match="is not text in utf-8; give another --encoding"):
+        read("ü".encode("latin-1") + b",a\n1,2\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="unknown; allowed are utf-8"):
+        Settings(encoding="hex")
+    _, table = read("a,b\nü,1\n".encode("utf-16-le"), encoding="utf-16-le")
+    assert table == [["a", "b"], ["ü", "1"]]
+
+
+def test_long_lines_are_refused_before_they_fill_the_memory(read, monkeypatch):
+    monkeypatch.setenv("RADIOTWIN_MAX_ROW_BYTES", "1000")
+    with pytest.raises(BadInput, match="line 2: a line of 1,000 characters and more"):
+        read("a;b\n" + "1" * 5000)
+
+
+def test_files_of_a_zip_are_read_where_they_are(tmp_path):
+    import zipfile
+
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("points.geojson", '{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": '
+                                           '{"a": 1}, "geometry": {"type": "Point", "coordinates": [1, 2]}}]}')
+    source = read_source(LogFile(tmp_path / "a.zip", "points.geojson", "points.geojson"))
+    assert source.table.to_dict("records") == [{"a": 1, "longitude": 1, "latitude": 2}]
+
+
+@pytest.mark.parametrize(("content", "message"), [
+    ('{"a": 1}\n[1]\n', "line 2 is no JSON object"), ('{"a": 1}\n{"a": }\n', "line 2 is not readable JSON"),
+    (b'{"a": "\xff"}\n', "is not text in UTF-8"), ('{"a": NaN}\n', "NaN is no JSON number"),
+    ('{"a": ' + "[" * 100_000 + "\n", "levels of nesting")])
+def test_json_lines_that_are_none(read, content, message):
+    with pytest.raises(BadInput, match=message):
+        read(content, "log.jsonl")

@@ -1,0 +1,221 @@
+"""Known formats, on files made up after their descriptions: which column is which, units and cautions."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.errors import BadInput
+from radiotwin.importing.formats import FORMATS, find_format
+
+WIGLE = ("WigleWifi-1.6,appRelease=2.78,model=X,release=11,device=d,display=1,board=b,brand=B,star=Sol,body=4,subBody=0\n"
+         "MAC,SSID,AuthMode,FirstSeen,Channel,Frequency,RSSI,CurrentLatitude,CurrentLongitude,AltitudeMeters,"
+         "AccuracyMeters,RCOIs,MfgrId,Type\n"
+         "aa:bb,\"cafe, west\",[ESS],2024-03-01 10:00:00,6,2437,-61,48.1,11.5,520,4,,,WIFI\n"
+         "310260_1_2,tower,LTE;us,2024-03-01 10:00:01,0,,-101,48.1001,11.5,520,4,,,LTE\n")
+TOWER = ("mcc,mnc,lac,cell_id,psc,asu,dbm,ta,lat,lon,accuracy,speed,bearing,altitude,measured_at,net_type,neighboring,device\r\n"
+         "262,1,100,777,12,40,-95,,48.1,11.5,5,0,0,520.5,\"2024-03-01T10:00:00.250Z\",LTE,false,\"Phone 1\"\r\n"
+         "262,1,100,778,13,,,,48.1,11.5,5,0,0,520.5,\"2024-03-01T10:00:00.250Z\",UMTS,true,\"Phone 1\"\r\n")
+CELLMAPPER = "48.100000,11.500000,520,262,1,100,777,-95,LTE,LTE-A,1300,12\n48.100100,11.500000,520,262,1,100,9,-70,GSM,EDGE,50,-1\n"
+GNETTRACK = ("Timestamp\tLongitude\tLatitude\tSpeed\tOperator\tCGI\tNode\tCellID\tLAC\tNetworkTech\tNetworkMode\tLevel\tQual\tSNR\t"
+             "Altitude\t\n"
+             "2024.03.01_10.00.00\t11.5\t48.1\t0\t26201\t262011007\t7\t1\t100\t4G\tLTE\t-95\t-10\t5\t520\t\n"
+             "2024.03.01_10.00.01.500\t11.5\t48.1001\t0\t26201\t262011007\t7\t1\t100\t4G\tLTE\t-96\t-10\t5\t520\t\n")
+NETMONITOR = ("report;sys_time;sim_state;net_type;tech;mcc;mnc;lac_tac;node_id;cid;psc_pci;rssi;rsrq;rssnr;gps;accuracy;lat;long;band;arfcn;\n"
+              "0;20240301100000;READY;LTE;LTE;262;1;100;7;1;12;-95;-9;100;1;3;48.1;11.5;1800;1300;\n"
+              "1;20240301100001;READY;LTE;LTE;262;1;100;7;1;12;0;0;2147483647;1;3;48.1001;11.5;1800;1300;\n")
+TEMS = ("Time\tMS\tAll-Latitude Decimal Degree (Text)\tAll-Longitude Decimal Degree (Text)\tServing Cell RSRP (dBm)[1]\t"
+        "Serving Cell DL EARFCN[1]\tServing Physical Cell ID[1]\n"
+        "10:00:00\tMS1\t48.1\t11.5\t-95\t1300\t12\n10:00:01\tMS1\t48.1001\t11.5\t\t1300\t12\n")
+QUALIPOC = ("Time,Data technology,DL EARFCN,RSSI,PCI,RSRP\u200b,----------,RSRP,PCI,----------,Latitude,Longitude,Altitude\n"
+            "2024-03-01 10:00:00.5,LTE,1300,-65,12,-95,,-95.2,12,,48.1,11.5,520\n")
+TTN_MAPPER = ("id,time,nodeaddr,appeui,gwaddr,modulation,datarate,snr,rssi,freq,lat,lon,alt,accuracy,hdop,sats,provider,user_id\n"
+              "1,2024-03-01 10:00:00,node1,app,GW1,LORA,SF7BW125,9.00,-84.00,868.1,48.1,11.5,0.0,null,null,null,gps,u\n"
+              "2,2024-03-01 10:01:00,node1,app,GW2,LORA,SF12BW125,-7.50,-119.00,868.1,48.11,11.5,0.0,null,null,null,gps,u\n")
+STACK = {"end_device_ids": {"device_id": "node1"}, "received_at": "2024-03-01T10:00:00.5Z", "uplink_message": {
+    "received_at": "2024-03-01T10:00:00.25Z", "rx_metadata": [
+        {"gateway_ids": {"gateway_id": "gw1"}, "rssi": -84, "snr": 9,
+         "location": {"latitude": 48.2, "longitude": 11.6, "altitude": 560}},
+        {"gateway_ids": {"gateway_id": "gw2"}, "rssi": -119, "snr": -7.5,
+         "location": {"latitude": 48.3, "longitude": 11.6, "altitude": 570}},
+        {"gateway_ids": {"gateway_id": "gw3"}, "rssi": -110, "location": {"latitude": 48.3, "longitude": 11.7}}]}}
+CHIRPSTACK = {"time": "2024-03-01T10:00:00.25+00:00", "deviceInfo": {"devEui": "node1", "tags": {}}, "rxInfo": [
+    {"gatewayId": "gw1", "rssi": -84, "snr": 9.0, "location": {"latitude": 48.2, "longitude": 11.6, "altitude": 560.0}},
+    {"gatewayId": "gw2", "rssi": -119, "snr": -7.5, "location": {"latitude": 48.3, "longitude": 11.6, "altitude": 570.0}},
+    {"gatewayId": "gw3", "rssi": -110, "snr": 0.0, "location": {"latitude": 48.3, "longitude": 11.7}}]}
+RXPK = {"rxpk": [{"tmst": 1, "time": "2024-03-01T10:00:00.25Z", "freq": 868.1, "datr": "SF7BW125", "rssi": -84, "lsnr": 9.0},
+                 {"tmst": 2, "time": "2024-03-01T10:00:01.25Z", "freq": 868.1, "datr": "SF12BW125", "rssi": -119, "lsnr": -7.5}]}
+HERE = {"latitude": 48.1, "longitude": 11.5, "altitude": 520}
+
+
+def with_position(message, *path):
+    """Return a copy of a message whose payload says where the node is."""
+    copy = json.loads(json.dumps(message))
+    at = copy
+    for key in path:
+        at = at.setdefault(key, {})
+    at.update(HERE)
+    return copy
+
+
+def imported(bring_in, text, name="data.csv", **given):
+    result = bring_in(text, name, **({"level_unit": None} | given))
+    return result, result.table, [each["format"] for each in result.report["files"]]
+
+
+def test_wigle(bring_in):
+    result, table, formats = imported(bring_in, WIGLE)
+    assert formats == ["wigle"] and list(table["device"]) == ["aa:bb", "310260_1_2"]
+    assert list(table["rssi_dbm"]) == [-61, -101] and list(table["receiver_z_m"]) == [520, 520]
+    assert table["time_s"].iloc[0] == pd.Timestamp("2024-03-01 10:00:00Z").timestamp()
+    notes = "\n".join(result.report["warnings"])
+    assert "1 line before the header" in notes and "--only Type=WIFI" in notes
+    only, table, _ = imported(bring_in, WIGLE, only={"Type": ["WIFI"]})
+    assert list(table["device"]) == ["aa:bb"]
+    assert only.report["left_out"] == [{"reason": "is not one of only", "column": "Type", "readings": 1, "first": "line 4"}]
+    with pytest.raises(BadInput, match=r"column Type never is NR \(only\); it is LTE, WIFI"):
+        imported(bring_in, WIGLE, only={"Type": ["NR"]})
+
+
+def test_tower_collector(bring_in):
+    result, table, formats = imported(bring_in, TOWER)
+    assert formats == ["tower-collector"] and list(table["device"]) == ["LTE 262-1-100-777"]
+    assert list(table["rssi_dbm"]) == [-95] and list(table["receiver"]) == ["Phone 1"]
+    assert table["time_s"].iloc[0] == pd.Timestamp("2024-03-01 10:00:00.25Z").timestamp()
+    assert result.report["left_out"][0]["reason"] == "not measured"
+
+
+def test_cellmapper_has_no_header(bring_in):
+    result, table, formats = imported(bring_in, CELLMAPPER)
+    assert formats == ["cellmapper"] and list(table["device"]) == ["LTE 262-1-100-777", "GSM 262-1-100-9"]
+    assert list(table["rssi_dbm"]) == [-95, -70] and "time_s" not in table
+    assert any("no header" in note for note in result.report["warnings"])
+
+
+def test_g_nettrack(bring_in):
+    with pytest.raises(BadInput, match="time_zone is not given"):
+        imported(bring_in, GNETTRACK, "log.txt")
+    result, table, formats = imported(bring_in, GNETTRACK, "log.txt", time_zone="Europe/Berlin")
+    assert formats == ["g-nettrack"] and set(table["device"]) == {"4G 262011007"}
+    start = pd.Timestamp("2024-03-01 09:00:00Z").timestamp()
+    assert list(table["time_s"] - start) == [0, 1.5] and list(table["rssi_dbm"]) == [-95, -96]
+    assert any("--only NetworkTech=4G" in note for note in result.report["warnings"])
+
+
+def test_netmonitor(bring_in):
+    result, table, formats = imported(bring_in, NETMONITOR, time_zone="UTC")
+    assert formats == ["netmonitor"] and list(table["rssi_dbm"]) == [-95] and list(table["device"]) == ["LTE 262-1-100-7-1"]
+    assert result.report["left_out"][0]["reason"] == "not measured"
+
+
+def test_tems(bring_in):
+    with pytest.raises(BadInput, match="time_format is not given"):
+        imported(bring_in, TEMS, "export.txt")
+    _, table, formats = imported(bring_in, TEMS.replace("10:00:0", "2024-03-01 10:00:0"), "export.txt",
+                                 time_format="ISO 8601", time_zone="UTC")
+    assert formats == ["tems"] and list(table["device"]) == ["1300 12"] and list(table["rssi_dbm"]) == [-95]
+
+
+def test_qualipoc_repeats_names(bring_in):
+    result, table, formats = imported(bring_in, QUALIPOC, time_zone="UTC")
+    assert formats == ["qualipoc"] and list(table["rssi_dbm"]) == [-95] and list(table["device"]) == ["1300 12"]
+    assert any("occurs more than once" in note for note in result.report["warnings"])
+
+
+def test_ttn_mapper_corrects_below_the_noise(bring_in):
+    result, table, formats = imported(bring_in, TTN_MAPPER)
+    assert formats == ["ttn-mapper"] and list(table["device"]) == ["GW1", "GW2"] and set(table["receiver"]) == {"node1"}
+    assert list(table["rssi_dbm"]) == [-84, -119 - 7.5]
+    assert any("5.5.5" in note for note in result.report["warnings"])
+
+
+@pytest.mark.parametrize(("messages", "name"), [
+    ([STACK], "things-stack"), ([{"result": STACK}], "things-stack-storage"), ([CHIRPSTACK], "chirpstack")])
+def test_gateways_are_the_receivers_of_a_node_without_a_position(bring_in, messages, name):
+    text = "".join(json.dumps(message) + "\n" for message in messages)
+    result, table, formats = imported(bring_in, text, "uplinks.jsonl")
+    assert formats == [name] and list(table["receiver"]) == ["gw1", "gw2", "gw3"] and set(table["device"]) == {"node1"}
+    assert list(table["rssi_dbm"]) == [-84, -126.5, -110]
+    np.testing.assert_array_equal(table["receiver_z_m"], [560, 570, np.nan])
+    assert table["time_s"].iloc[0] == pd.Timestamp("2024-03-01 10:00:00.25Z").timestamp()
+    assert list(result.devices["role"]) == ["unknown"]
+
+
+@pytest.mark.parametrize(("message", "name"), [
+    (with_position(STACK, "uplink_message", "decoded_payload"), "things-stack-mapper"),
+    ({"result": with_position(STACK, "uplink_message", "decoded_payload")}, "things-stack-storage-mapper"),
+    (with_position(CHIRPSTACK, "object"), "chirpstack-mapper")])
+def test_gateways_are_the_devices_of_a_node_with_a_position(bring_in, message, name):
+    result, table, formats = imported(bring_in, json.dumps(message) + "\n", "uplinks.json")
+    assert formats == [name] and list(table["device"]) == ["gw1", "gw2", "gw3"] and set(table["receiver"]) == {"node1"}
+    assert list(table["rssi_dbm"]) == [-84, -126.5, -110] and set(table["receiver_z_m"]) == {520}
+    assert list(result.devices["role"]) == ["anchor"] * 3 and list(result.devices["z_m"][:2]) == [560, 570]
+
+
+def test_packet_forwarder_needs_a_name_and_a_place(bring_in, tmp_path):
+    text = json.dumps(RXPK) + "\n"
+    with pytest.raises(BadInput, match="columns.device is missing"):
+        imported(bring_in, text, "rx.log")
+    (tmp_path / "gateways.csv").write_text("receiver,latitude,longitude\nreceiver,48.1,11.5\n")
+    _, table, formats = imported(bring_in, text, "rx.log", format="semtech-udp", columns={"device": "always node"},
+                                 receivers=str(tmp_path / "gateways.csv"))
+    assert formats == ["semtech-udp"] and list(table["rssi_dbm"]) == [-84, -126.5]
+
+
+def test_rtl_power_integrates_a_band(bring_in):
+    """Two tunings a sweep; bins of 100 kHz at 1 to 2 MHz; the last bin of each line is written twice."""
+    lines = []
+    for second, db in ((0, -30.0), (10, -40.0)):
+        for low in (1_000_000, 1_500_000):
+            values = [db + 10 * np.log10(i + 1) for i in range(5)]
+            lines.append(f"2024-03-01, 10:00:{second:02d}, {low}, {low + 500_000}, 100000.00, 7, "
+                         + ", ".join(f"{value:.4f}" for value in [*values, values[-1]]))
+    text = "\n".join(lines) + "\n"
+    given = {"time_zone": "UTC", "columns": {"x": "always 1", "y": "always 2"}, "length_unit": "m"}
+    _, table, formats = imported(bring_in, text, **given)
+    assert formats == ["rtl-power"] and list(table["device"]) == ["1-2 MHz"] * 2
+    np.testing.assert_allclose(table["rssi_dbm"], np.array([-30, -40]) + 10 * np.log10(30), atol=2e-4)
+    assert np.diff(table["time_s"]) == 10
+    _, table, _ = imported(bring_in, text, band_hz=[1.3e6, 1.7e6], level_offset_db=-5.0, **given)
+    np.testing.assert_allclose(table["rssi_dbm"], np.array([-35, -45]) + 10 * np.log10(4 + 5 + 1 + 2), atol=2e-4)
+    with pytest.raises(BadInput, match="no bin lies in the band 5-6 MHz .band_hz.; the file has 1 to 2 MHz"):
+        imported(bring_in, text, band_hz=[5e6, 6e6], **given)
+    with pytest.raises(BadInput, match="line 2 is none of rtl_power"):
+        imported(bring_in, lines[0] + "\n1,2,3\n", **given)
+
+
+def test_a_sweep_that_does_not_cover_the_band_is_not_measured(bring_in):
+    text = ("2024-03-01, 10:00:00, 1000000, 1200000, 100000.00, 7, -30, -30\n"
+            "2024-03-01, 10:00:10, 1000000, 1100000, 100000.00, 7, -30\n")
+    given = {"time_zone": "UTC", "columns": {"x": "always 1", "y": "always 2"}, "length_unit": "m"}
+    result, table, _ = imported(bring_in, text, band_hz=[1.0e6, 1.2e6], **given)
+    np.testing.assert_allclose(table["rssi_dbm"], [-30 + 10 * np.log10(2)], atol=1e-4)
+    assert result.report["left_out"][0]["reason"] == "not measured"
+
+
+def test_what_is_declared_overrules_the_format(bring_in):
+    _, table, formats = imported(bring_in, TTN_MAPPER, format="ttn-mapper", columns={"device": "nodeaddr", "snr": "always 0"})
+    assert formats == ["ttn-mapper"] and set(table["device"]) == {"node1"} and list(table["rssi_dbm"]) == [-84, -119]
+    with pytest.raises(BadInput, match=r"is not of format ttn-mapper, which has the columns .*; it has MAC"):
+        imported(bring_in, WIGLE, format="ttn-mapper")
+    with pytest.raises(BadInput, match="format 'gmon' is unknown; allowed are wigle, "):
+        imported(bring_in, WIGLE, format="gmon")
+
+
+@pytest.mark.parametrize("each", FORMATS, ids=lambda each: each.name)
+def test_no_format_takes_the_files_of_another(each):
+    """Those of a node with a position extend those without one."""
+    found = find_format(each.signature)
+    assert found is each or found.name.endswith("-mapper")
+
+
+def test_the_documented_table_is_that_of_the_code():
+    """Of nested fields it has the last part of the name."""
+    text = (Path(__file__).parents[2] / "docs" / "import.md").read_text(encoding="utf-8")
+    for each in FORMATS:
+        entries = [name for entry in each.columns.values() for name in ([entry] if isinstance(entry, str) else entry)]
+        fields = ", ".join(dict.fromkeys(name.rpartition(".")[2] for name in entries))
+        row = f"| `{each.name}` | {each.title} | {fields} | {each.level} | {each.source} | {each.tried_on} |"
+        assert row in text, row

@@ -1,0 +1,111 @@
+"""Transmitters at several places over time, stays of a receiver, and clocks that begin anew."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from radiotwin.errors import BadInput
+from radiotwin.importing.clocks import clock_notes
+from radiotwin.importing.thinning import stay_representatives
+
+COLUMNS = {"level": "level", "device": "device", "x": "x", "y": "y", "time": "t"}
+GIVEN = {"columns": COLUMNS, "length_unit": "m", "time_format": "ISO 8601", "time_zone": "UTC"}
+
+
+def log(*times):
+    return "t,device,x,y,level\n" + "".join(f"2024-03-01 {time},b,{i},0,-8{i}\n" for i, time in enumerate(times))
+
+
+def test_a_table_says_where_a_transmitter_was_and_when(bring_in, tmp_path):
+    (tmp_path / "sites.csv").write_text("device,x,y,z,since,until,frequency_hz\n"
+                                        "b,500,0,3,2024-03-01 12:00,,9e8\nb,100,0,2,2024-03-01 10:00,2024-03-01 11:00,8e8\n"
+                                        "c,1,1,1,,,\n")
+    result = bring_in(log("09:00", "10:00", "10:59", "11:30", "12:00", "18:00"), devices=str(tmp_path / "sites.csv"), **GIVEN)
+    assert list(result.table["device"]) == ["b", "b@1", "b@1", "b", "b@2", "b@2"]
+    devices = result.devices.set_index("device")
+    assert devices.loc["b@1", ["x_m", "z_m", "frequency_hz"]].tolist() == [100, 2, 8e8]
+    assert devices.loc["b@2", ["x_m", "z_m", "frequency_hz"]].tolist() == [500, 3, 9e8]
+    assert devices["role"].to_dict() == {"b": "unknown", "b@1": "anchor", "b@2": "anchor"}
+
+
+@pytest.mark.parametrize(("table", "message"), [
+    ("device,x,y,since,until\nb,1,2,2024-03-01 12:00,2024-03-01 11:00\n", "is not before the time until which"),
+    ("device,x,y,since\nb,1,2,noon\n", "'noon' is no time in the form ISO 8601"),
+    ("device,x,y\nb,1,2\nb,3,4\n", "'b' occurs twice")])
+def test_periods_that_cannot_be_used(bring_in, tmp_path, table, message):
+    (tmp_path / "sites.csv").write_text(table)
+    with pytest.raises(BadInput, match=message):
+        bring_in(log("10:00"), devices=str(tmp_path / "sites.csv"), **GIVEN)
+
+
+def test_places_over_time_need_times(bring_in, tmp_path):
+    (tmp_path / "sites.csv").write_text("device,x,y,since\nb,1,2,2024-03-01 12:00\nb,3,4,2024-03-01 13:00\n")
+    columns = {name: spec for name, spec in COLUMNS.items() if name != "time"}
+    with pytest.raises(BadInput, match="'b' is at several places over time, and some of its readings have no time"):
+        bring_in(log("10:00"), devices=str(tmp_path / "sites.csv"), columns=columns, length_unit="m", time_zone="UTC")
+
+
+def test_positions_of_the_log_make_places(bring_in):
+    """A beacon with its own GNSS: noise within a place, two places, and back to the first."""
+    places = [(100, 0.0), (100, 1.5), (900, 0.0), (900, 1.0), (100, 0.5), ("", "")]
+    text = "device,x,y,level,dx,dy\n" + "".join(f"b,{i},0,-8{i},{x},{y}\n" for i, (x, y) in enumerate(places))
+    columns = {"level": "level", "device": "device", "x": "x", "y": "y", "device_x": "dx", "device_y": "dy"}
+    result = bring_in(text, columns=columns, length_unit="m", place_m=5.0)
+    assert list(result.table["device"]) == ["b@1", "b@1", "b@2", "b@2", "b@1", "b"]
+    assert result.devices.set_index("device").loc["b@2", ["x_m", "y_m", "role"]].tolist() == [900, 0.5, "anchor"]
+    with pytest.raises(BadInput, match="positions 800 m apart.*--place-m 5 makes one of each place"):
+        bring_in(text, columns=columns, length_unit="m")
+
+
+def test_what_moves_all_the_time_has_no_places(bring_in):
+    text = "device,x,y,level,dx,dy\n" + "".join(f"b,{i},0,-80,{100 * i},0\n" for i in range(1100))
+    columns = {"level": "level", "device": "device", "x": "x", "y": "y", "device_x": "dx", "device_y": "dy"}
+    with pytest.raises(BadInput, match="more than 1000 places that are 5 m apart: it moves all the time"):
+        bring_in(text, columns=columns, length_unit="m", place_m=5.0)
+
+
+def links_of(x_m, level_db, **columns):
+    n = len(x_m)
+    return pd.DataFrame({"receiver": "r", "device": "d", "flight": "f", "receiver_x_m": np.asarray(x_m, dtype=float),
+                         "receiver_y_m": 0.0, "receiver_z_m": np.nan, "level_db": np.asarray(level_db, dtype=float),
+                         "time_s": np.arange(n, dtype=float)} | columns, index=np.arange(n) + 7)
+
+
+def test_of_a_stay_the_reading_of_the_median_level_is_kept():
+    links = links_of([0, 0.5, 0.2, 10, 20, 20.5, 20, 20.9], [-80, -85, -70, -90, np.nan, -95, np.nan, -99])
+    assert np.flatnonzero(stay_representatives(links, 1.0)).tolist() == [0, 3, 6]  # two of four were not detected
+    shuffled = links.sample(frac=1, random_state=1)
+    assert set(shuffled.index[stay_representatives(shuffled, 1.0)]) == {7, 10, 13}
+
+
+def test_stays_are_of_one_device_and_flight():
+    links = pd.concat([links_of([0, 0], [-80, -81]), links_of([0, 0], [-80, -81], device="e"),
+                       links_of([0, 0], [-80, -81], flight="g")])
+    assert stay_representatives(links, 5.0).sum() == 3
+
+
+def test_thinning_is_counted(bring_in):
+    result = bring_in(log("10:00:00", "10:00:01", "10:00:02"), thin_m=1.5, **GIVEN)
+    assert result.report["left_out"] == [{"reason": "stay within 1.5 m", "column": "", "readings": 1, "first": "row 2"}]
+    assert list(result.table["rssi_dbm"]) == [-81, -82]
+
+
+def test_a_clock_that_begins_anew_is_told():
+    """Two minutes along a line, then the clock restarts a kilometre away."""
+    x_m = np.r_[np.arange(120) * 5.0, 1000 + np.arange(60) * 5.0]
+    links = links_of(x_m, np.full(180, -80.0), time_s=np.r_[np.arange(120.0), np.arange(60.0)])
+    assert len(clock_notes(links)) == 1 and "first in flight 'f'): its clock began anew" in clock_notes(links)[0]
+    flights = links.assign(flight=np.r_[["f"] * 120, ["g"] * 60])
+    assert "the times of flights 'f' and 'g' overlap, and receiver 'r' would be at two places" in clock_notes(flights)[0]
+    two = flights.assign(receiver=np.r_[["r"] * 120, ["s"] * 60])
+    assert not clock_notes(two)
+
+
+def test_clocks_that_are_right_are_not_told():
+    x_m = np.arange(200) * 30.0  # 30 m/s
+    assert not clock_notes(links_of(x_m, np.full(200, -80.0)))
+    twice = pd.concat([links_of(x_m, np.full(200, -80.0)), links_of(x_m, np.full(200, -70.0), device="e", flight="g")])
+    assert not clock_notes(twice)  # two files of one drive
+    jump = links_of(np.r_[x_m, 1e5], np.full(201, -80.0))
+    assert not clock_notes(jump)  # one bad fix
+    assert not clock_notes(links_of([0, 1], [-80, -80]).drop(columns="time_s"))
