@@ -11,6 +11,7 @@ from radiotwin.console import console, result, say
 from radiotwin.errors import BadInput
 
 if TYPE_CHECKING:
+    from radiotwin.footprints.height_columns import HeightColumn
     from radiotwin.scene.report import BuildReport
 
 Bounds = tuple[float, float, float, float]
@@ -46,6 +47,12 @@ def build_scene(
                                 "[degrees].")] = None,
     height_default: Annotated[float | None, typer.Option(
         metavar="M", help="Height of buildings without one in a map [10].")] = None,
+    height_column: Annotated[str | None, typer.Option(
+        metavar="NAME[:UNIT]", help="Column of a map with the buildings' heights above ground; "
+                                    "UNIT is m [default], ft, cm or storeys.")] = None,
+    ground_column: Annotated[str | None, typer.Option(
+        metavar="NAME", help="Column with the elevation of the ground, where that of "
+                             "--height-column is an elevation, too.")] = None,
     material_table: Annotated[Path | None, typer.Option(
         metavar="FILE.toml", help="Materials of a map's tags, where they differ from the standard "
                                   "table.")] = None,
@@ -72,7 +79,8 @@ def build_scene(
     common = _given(frequency_hz=frequency_hz, devices=devices, uavs=uavs, seed=seed,
                     origin=parse_origin(origin))
     of_cities = _given(scale=scale, up=up)
-    of_maps = _given(height_default=height_default, material_table=material_table,
+    of_maps = _given(height_default=height_default, height_column=height_column,
+                     ground_column=ground_column, material_table=material_table,
                      overpass=overpass or None)
     pairs, bounds = _pairs(material or []), _bounds(bbox)
     if map_suffix(source):
@@ -139,8 +147,8 @@ def _build_from_map(source: str, out: Path | None, common: dict[str, Any], pairs
     table = STANDARD
     if "material_table" in of_maps:
         table = read_material_table(of_maps["material_table"])
-    height_m = of_maps.get("height_default", 10.0)
-    options = MapOptions(bbox_deg, height_m, with_pairs(table, pairs))
+    options = MapOptions(bbox_deg, of_maps.get("height_default"), with_pairs(table, pairs),
+                         _height_column(of_maps))
     options.check()
     if "overpass" in of_maps:
         if bbox_deg is None:
@@ -150,6 +158,17 @@ def _build_from_map(source: str, out: Path | None, common: dict[str, Any], pairs
         say(f"wrote {source} (© OpenStreetMap contributors, ODbL)")
     out = out or Path("scenes") / map_name(source)
     return build_scene_from_map(source, out, options, BuildOptions(**common), check)
+
+
+def _height_column(of_maps: dict[str, Any]) -> "HeightColumn | None":
+    from radiotwin.footprints.height_columns import declared_column
+
+    if "height_column" in of_maps:
+        return declared_column(of_maps["height_column"], of_maps.get("ground_column"))
+    if "ground_column" in of_maps:
+        raise BadInput("--ground-column is subtracted from the column of roofs; name that with "
+                       "--height-column, too")
+    return None
 
 
 def _given(**options: Any) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from shapely.geometry.base import BaseGeometry
 
 from radiotwin.budgets import OVERLAPS, PART_PAIRS, TOUCHING_CORNERS
 from radiotwin.footprints.features import Feature, problems_of
+from radiotwin.footprints.height_columns import KNOWN, HeightColumn
 from radiotwin.footprints.heights import Height, height_of
 from radiotwin.footprints.material_table import MaterialTable
 from radiotwin.geodesy import to_local
@@ -53,7 +54,8 @@ class Prism:
 
 
 def make_prisms(
-    features: Sequence[Feature], origin: Origin, table: MaterialTable, default_height_m: float
+    features: Sequence[Feature], origin: Origin, table: MaterialTable, default_height_m: float,
+    height_column: HeightColumn | None = None
 ) -> tuple[list[Prism], list[Problem]]:
     """Make prisms from buildings and their parts.
 
@@ -62,6 +64,7 @@ def make_prisms(
         origin: of the local frame.
         table: materials by tag.
         default_height_m: of a building whose tags give no height [m].
+        height_column: column that goes before all known ones.
 
     Returns:
         The prisms, parts first, and the defects that were found.
@@ -72,7 +75,7 @@ def make_prisms(
     parts = [(feature, area) for feature, area in areas if feature.is_part]
     prisms = []
     for feature, area in _resolve_parts(wholes, parts, defects):
-        height = height_of(feature.tags, default_height_m)
+        height = height_of(feature.tags, default_height_m, height_column)
         if height.unusable:
             defects.add("height", f"{feature.name}: {', '.join(height.unusable)}")
         if height.bottom_m >= height.top_m:
@@ -193,8 +196,10 @@ def _inherit(part: Feature, whole: Feature) -> Feature:
     """Return a part with the tags of its building that it lacks, except the bottom."""
     tags = {key: value for key, value in whole.tags.items()
             if key not in ("min_height", "building:min_level")}
-    if "building:levels" in part.tags and "height" not in part.tags:
-        tags.pop("height", None)  # which would take precedence over the part's own levels
+    known = [column.name for column in KNOWN]
+    own = next((row for row, name in enumerate(known) if name in part.tags), 0)
+    for name in known[:own]:  # which would take precedence over what the part itself has
+        tags.pop(name, None)
     return replace(part, tags=tags | dict(part.tags))
 
 
