@@ -10,6 +10,7 @@ import shapely
 from radiotwin.budgets import FEATURES, SHAPES
 from radiotwin.errors import BadInput
 from radiotwin.footprints.building_table import building_table, height_counts
+from radiotwin.footprints.cityjson import read_cityjson
 from radiotwin.footprints.extrude import make_blocks
 from radiotwin.footprints.features import (
     Feature,
@@ -27,6 +28,7 @@ from radiotwin.footprints.osm_pbf import read_osm_pbf
 from radiotwin.footprints.osm_xml import read_osm_xml
 from radiotwin.footprints.outlines import OutlineBudget
 from radiotwin.footprints.shapefiles import read_shapefile
+from radiotwin.footprints.shells import make_shell_prisms
 from radiotwin.footprints.solids import (
     Contacts,
     Prism,
@@ -55,7 +57,8 @@ READERS: dict[str, Callable[[Path], MapFile]] = {
     ".osm": lambda path: assemble(read_osm_xml(path)),
     ".osm.pbf": lambda path: assemble(read_osm_pbf(path)),
     ".geojson": read_geojson, ".gpkg": read_geopackage,
-    ".shp": read_shapefile, ".zip": read_shapefile}
+    ".shp": read_shapefile, ".zip": read_shapefile,
+    ".city.json": read_cityjson, ".cityjson": read_cityjson, ".city.jsonl": read_cityjson}
 GROUND_MARGIN_M = 100.0  # [m], of the ground plane beyond buildings and extent
 MAX_WIDTH_M = 50e3  # [m], chosen so that a plane and single precision are good enough
 ORIGIN_DECIMALS = 6  # of latitude and longitude [degrees]: a decimetre
@@ -153,8 +156,13 @@ def build_scene_from_map(
     _check_sizes(features, origin, path)
     if map_options.height_column is not None:
         check_declared(map_options.height_column, [one.tags for one in features], path)
-    prisms, problems = make_prisms(features, origin, map_options.materials, map_options.height_m,
+    flat, shells = ([one for one in features if (one.shell is not None) == has_shell]
+                    for has_shell in (False, True))
+    prisms, problems = make_prisms(flat, origin, map_options.materials, map_options.height_m,
                                    map_options.height_column)
+    bodies, found_in_bodies = make_shell_prisms(shells, origin, map_options.materials)
+    prisms += bodies
+    problems += found_in_bodies
     problems = (found.problems + left_out_problems(found.left_out, map_options.bbox_deg)
                 + problems + _without_height(prisms, features, map_options, path))
     if not prisms:

@@ -20,6 +20,7 @@ from radiotwin.progress import progress
 from radiotwin.scene.materials import Material
 from radiotwin.scene.meshes import clean, is_volume
 
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 SLOT_M = 0.02  # [m], more than the 1 cm below which the 3D map takes two surfaces for one
 # [m], how far a surface may move to remove a splinter; files hold single precision, 0.1 mm at 1 km
 SIMPLIFY_M = 1e-3
@@ -32,7 +33,7 @@ class Block:
     Attributes:
         members: indices of its prisms, the largest first.
         material: of all of them.
-        mesh: watertight, normals outwards [m].
+        mesh: watertight, normals outwards, unless it is that of an open body [m].
     """
 
     members: list[int]
@@ -52,7 +53,9 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
     """
     if not prisms:
         return []
+    is_open = np.array([prism.body is not None and prism.body.solid is None for prism in prisms])
     pairs = contacts.pairs[contacts.shared_m > GRID_M]
+    pairs = pairs[~is_open[pairs].any(axis=1)]
     same = np.array([prisms[a].material == prisms[b].material for a, b in pairs], dtype=bool)
     graph = coo_matrix((np.ones(same.sum()), pairs[same].T), shape=(len(prisms), len(prisms)))
     block_of = connected_components(graph, directed=False)[1]
@@ -68,13 +71,18 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
     with progress("extruding buildings", total=len(block_m3)) as advance:
         for block, part in enumerate(np.split(order, np.cumsum(np.bincount(block_of))[:-1])):
             members = sorted(part.tolist(), key=lambda i: -volume_m3[i])
+            advance(1)
+            body = prisms[members[0]].body
+            if body is not None and body.mesh is not None:
+                blocks.append(Block(members, prisms[members[0]].material,
+                                    trimesh.Trimesh(*body.mesh, process=False)))
+                continue
             solid = _union([_solid(prisms[i]) for i in members])
             if block in cut_by:
                 solid -= _union([_solid(prisms[i], SLOT_M) for i in sorted(cut_by[block])])
             solid = solid.simplify(SIMPLIFY_M)
             if not solid.is_empty():
                 blocks.append(Block(members, prisms[members[0]].material, _mesh(solid)))
-            advance(1)
     return blocks
 
 
@@ -84,6 +92,11 @@ def _union(solids: list[Manifold]) -> Manifold:
 
 def _solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
     """Return a prism, with all its faces moved outwards by `wider_m`."""
+    if prism.body is not None:
+        assert prism.body.solid is not None
+        return prism.body.solid if not wider_m else _union(
+            [prism.body.solid.translate(wider_m * corner) for corner in _CORNERS])
+    assert isinstance(prism.area, shapely.Polygon)
     area = prism.area.buffer(wider_m, join_style="mitre") if wider_m else prism.area
     rings = [shapely.get_coordinates(ring) for ring in (area.exterior, *area.interiors)]
     points, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings])

@@ -108,7 +108,8 @@ def left_out_problems(left_out: Sequence[LeftOut],
             if not (x0 <= east and x1 >= west and y0 <= north and y1 >= south):
                 continue
         by_reason.setdefault(one.reason, []).append(one.name)
-    return [problem for reason, names in by_reason.items() for problem in problems_of(names, reason)]
+    return [problem for reason, names in by_reason.items()
+            for problem in problems_of(names, reason)]
 
 
 def is_building(tags: Mapping[str, str]) -> bool:

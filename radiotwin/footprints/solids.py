@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import shapely
+from manifold3d import Manifold
 from shapely.geometry.base import BaseGeometry
 
 from radiotwin.budgets import OVERLAPS, PART_PAIRS, TOUCHING_CORNERS
@@ -30,22 +31,37 @@ Area = tuple[Feature, shapely.MultiPolygon]
 
 
 @dataclass(frozen=True, eq=False)
+class Body:
+    """Surfaces of a building that its file has in three dimensions, in the local frame [m].
+
+    Attributes:
+        solid: where they are closed, else None.
+        mesh: (v, 3) corners and (f, 3) faces where they are not, else None.
+    """
+
+    solid: Manifold | None
+    mesh: tuple[np.ndarray, np.ndarray] | None
+
+
+@dataclass(frozen=True, eq=False)
 class Prism:
-    """A solid with vertical walls and a flat roof.
+    """A solid with vertical walls and a flat roof, or with a body of its own.
 
     Attributes:
         name: of the feature; several prisms may share one.
-        area: one valid polygon in the local frame [m].
+        area: one valid polygon in the local frame, or of a body what it covers [m].
         height: bottom and top, and their source.
         material: of its surfaces.
         material_from: the tag that the material follows from, or `default`.
+        body: its surfaces; None: walls and a roof over its area.
     """
 
     name: str
-    area: shapely.Polygon
+    area: shapely.Polygon | shapely.MultiPolygon
     height: Height
     material: Material
     material_from: str
+    body: Body | None = None
 
     def overlaps_in_height(self, other: "Prism") -> bool:
         """Return whether both share some height."""
