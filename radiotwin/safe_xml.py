@@ -17,7 +17,8 @@ _BLOCK_BYTES = 2**20
 
 def parse_elements(path: Path, start: Callable[[str, dict[str, str], int], None],
                    end: Callable[[str], None] = lambda tag: None,
-                   budget: Budget = FILE_BYTES) -> int:
+                   budget: Budget = FILE_BYTES,
+                   text: Callable[[str], None] | None = None) -> int:
     """Call back for every element of a file, in the file's order.
 
     Args:
@@ -25,6 +26,7 @@ def parse_elements(path: Path, start: Callable[[str, dict[str, str], int], None]
         start: Called as `start(tag, attributes, line)` where an element begins.
         end: Called as `end(tag)` where it ends.
         budget: Of the file's bytes.
+        text: Called with each piece of text between tags; None: texts are not read.
 
     Returns:
         Bytes read.
@@ -43,6 +45,8 @@ def parse_elements(path: Path, start: Callable[[str, dict[str, str], int], None]
     parser.StartElementHandler = lambda tag, attributes: start(
         tag, attributes, parser.CurrentLineNumber)
     parser.EndElementHandler = end
+    if text is not None:
+        parser.CharacterDataHandler = text
     parser.EntityDeclHandler = refuse_entity
     parser.SetParamEntityParsing(expat.XML_PARAM_ENTITY_PARSING_NEVER)
     size = 0

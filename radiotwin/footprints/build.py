@@ -10,6 +10,7 @@ import shapely
 from radiotwin.budgets import FEATURES, SHAPES
 from radiotwin.errors import BadInput
 from radiotwin.footprints.building_table import building_table, height_counts
+from radiotwin.footprints.citygml import read_citygml
 from radiotwin.footprints.cityjson import read_cityjson
 from radiotwin.footprints.extrude import make_blocks
 from radiotwin.footprints.features import (
@@ -58,7 +59,9 @@ READERS: dict[str, Callable[[Path], MapFile]] = {
     ".osm.pbf": lambda path: assemble(read_osm_pbf(path)),
     ".geojson": read_geojson, ".gpkg": read_geopackage,
     ".shp": read_shapefile, ".zip": read_shapefile,
-    ".city.json": read_cityjson, ".cityjson": read_cityjson, ".city.jsonl": read_cityjson}
+    ".city.json": read_cityjson, ".city.json.gz": read_cityjson,
+    ".cityjson": read_cityjson, ".city.jsonl": read_cityjson, ".gml": read_citygml,
+    ".citygml": read_citygml}
 GROUND_MARGIN_M = 100.0  # [m], of the ground plane beyond buildings and extent
 MAX_WIDTH_M = 50e3  # [m], chosen so that a plane and single precision are good enough
 ORIGIN_DECIMALS = 6  # of latitude and longitude [degrees]: a decimetre

@@ -8,6 +8,7 @@ from its attributes.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
@@ -16,8 +17,16 @@ from radiotwin.budgets import SHAPES, VERTICES
 from radiotwin.errors import BadInput
 from radiotwin.footprints.features import Feature, LeftOut, MapFile, Shell
 from radiotwin.footprints.height_columns import column_name
-from radiotwin.footprints.systems import find_city_system, to_degrees, vertical_unit_m
+from radiotwin.footprints.systems import (
+    find_city_system,
+    plane_of,
+    to_degrees,
+    vertical_unit_m,
+)
 from radiotwin.scene.problems import Problem, listed, warning
+
+if TYPE_CHECKING:
+    from pyproj import CRS
 
 BUILT = ("Building", "BuildingPart", "BuildingInstallation", "BuildingConstructiveElement",
          "BuildingUnit", "Bridge", "BridgePart", "BridgeInstallation",
@@ -28,7 +37,7 @@ SURFACES = {"RoofSurface": "roof", "WallSurface": "wall", "GroundSurface": "grou
             "OuterCeilingSurface": "wall", "OuterFloorSurface": "roof"}
 _NOT_BUILT = "object(s) have no surfaces that can be used: left out"
 
-Polygon = list[list[tuple[float, float, float]]]
+Polygon = list[np.ndarray]
 
 
 @dataclass
@@ -37,7 +46,7 @@ class Geometry:
 
     Attributes:
         lod: level of detail, 0 to 4; 3D BAG has 1.2, 1.3 and 2.2.
-        polygons: rings of corners as the file gives them, the first not again at the end.
+        polygons: rings of (n, 3) corners as the file gives them.
         surfaces: what each polygon is, a value of `SURFACES` or "".
     """
 
@@ -65,16 +74,16 @@ class CityObject:
     geometries: list[Geometry] = field(default_factory=list)
 
 
-def city_features(path: Path, objects: Sequence[CityObject], system: str | None) -> MapFile:
+def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[str]) -> MapFile:
     """Return the buildings among the objects of a city model.
 
     Args:
         path: file, for messages.
         objects: in the file's order.
-        system: name of their coordinate reference system; None: the file names none.
+        systems: names of their coordinate reference system, all that the file has.
 
     Raises:
-        BadInput: no or an unknown system, or coordinates outside the area of it.
+        BadInput: no, several or an unknown system, or coordinates outside the area of it.
     """
     by_name = {one.name: one for one in objects}
     built = [one for one in objects if one.kind in BUILT]
@@ -93,11 +102,12 @@ def city_features(path: Path, objects: Sequence[CityObject], system: str | None)
     problems = _others(objects)
     if not chosen:
         return MapFile([], [LeftOut(one.name, _NOT_BUILT, None) for one in unusable], problems)
-    if not system:
+    if not systems:
         raise BadInput(f"{path} names no coordinate reference system (CityJSON: "
                        "metadata.referenceSystem, GML: srsName); write it in, for example "
                        "EPSG:25832")
-    points = _in_degrees(path, [geometry for _, _, found in chosen for geometry in found], system)
+    points = _in_degrees(path, [geometry for _, _, found in chosen for geometry in found],
+                         _one_system(path, systems))
     features = _features(chosen, points, by_name)
     return MapFile(features, [LeftOut(one.name, _NOT_BUILT, None) for one in unusable], problems)
 
@@ -114,7 +124,8 @@ def _root(one: CityObject, by_name: Mapping[str, CityObject]) -> str:
 def _choose(one: CityObject, least: int) -> list[Geometry]:
     """Return the geometries of the most detailed level below 3, else of the least above."""
     usable = [geometry for geometry in one.geometries
-              if geometry.polygons and (geometry.lod >= 1) == (least >= 1)]
+              if any(len(ring) for polygon in geometry.polygons for ring in polygon)
+              and (geometry.lod >= 1) == (least >= 1)]
     levels = sorted({geometry.lod for geometry in usable})
     if not levels:
         return []
@@ -134,11 +145,18 @@ def _others(objects: Sequence[CityObject]) -> list[Problem]:
                     f"left out ({listed(kinds)})")]
 
 
-def _in_degrees(path: Path, geometries: Sequence[Geometry], system_name: str) -> list[np.ndarray]:
+def _one_system(path: Path, names: Sequence[str]) -> "CRS":
+    systems = [find_city_system(path, name) for name in dict.fromkeys(names)]
+    for name, other in zip(dict.fromkeys(names), systems):
+        if plane_of(other) != plane_of(systems[0]):
+            raise BadInput(f"{path} names several coordinate reference systems ({names[0][:60]!r} "
+                           f"and {name[:60]!r}); export it in one")
+    return systems[0]
+
+
+def _in_degrees(path: Path, geometries: Sequence[Geometry], system: "CRS") -> list[np.ndarray]:
     """Return the corners of each geometry: longitude, latitude [degrees], elevation [m]."""
-    system = find_city_system(path, system_name)
-    corners = [np.array([corner for polygon in geometry.polygons for ring in polygon
-                         for corner in ring], dtype=float).reshape(-1, 3)
+    corners = [np.concatenate([ring for polygon in geometry.polygons for ring in polygon])
                for geometry in geometries]
     together = np.concatenate(corners)
     VERTICES.check(len(together), path)

@@ -17,7 +17,7 @@ from radiotwin.budgets import DOCUMENT_BYTES, FEATURES, VERTICES
 from radiotwin.errors import BadInput
 from radiotwin.footprints.city_objects import SURFACES, CityObject, Geometry, Polygon, city_features
 from radiotwin.footprints.features import MapFile
-from radiotwin.inputs import parse_json, read_text
+from radiotwin.inputs import decode_text, open_gzip, parse_json
 
 # Levels of lists around a surface (a list of rings) in `boundaries`
 _DEPTHS = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2,
@@ -28,7 +28,7 @@ def read_cityjson(path: Path) -> MapFile:
     """Read the buildings of a CityJSON file.
 
     Args:
-        path: `.city.json` or `.cityjson` file, or `.city.jsonl` with a feature in each line.
+        path: `.city.json`, `.city.json.gz` or `.cityjson` file, or `.city.jsonl` with a feature in each line.
 
     Returns:
         Their surfaces; of objects that have an outline only, that.
@@ -36,7 +36,8 @@ def read_cityjson(path: Path) -> MapFile:
     Raises:
         BadInput: no such file, not CityJSON, or an impossible value, with the object's name.
     """
-    text = read_text(path, "CityJSON file", DOCUMENT_BYTES)
+    with open_gzip(path, "CityJSON file", DOCUMENT_BYTES) as file:
+        text = decode_text(file.read(), path)
     if path.suffix.lower() == ".jsonl":
         lines = [line for line in text.split("\n") if line.strip()]
         FEATURES.check(len(lines), path)
@@ -54,7 +55,7 @@ def read_cityjson(path: Path) -> MapFile:
         objects += _objects(path, document, *transform)
     metadata = head.get("metadata")
     system = metadata.get("referenceSystem") if isinstance(metadata, dict) else None
-    return city_features(path, objects, system if isinstance(system, str) else None)
+    return city_features(path, objects, [system] if isinstance(system, str) else [])
 
 
 def _transform(path: Path, head: Mapping) -> tuple[np.ndarray, np.ndarray]:
@@ -84,7 +85,7 @@ def _objects(path: Path, document: Any, scale: np.ndarray,
         raise BadInput(f"{path}: vertices or CityObjects are missing, or no vertices of three "
                        "numbers; export the model again") from None
     VERTICES.check(len(vertices), path)
-    corners = [tuple(row) for row in (vertices * scale + offset).tolist()]
+    corners = vertices * scale + offset
     parents = {child: name for name, known in objects.items() if isinstance(known, dict)
                for child in _names(known.get("children"))}
     for name, known in objects.items():
@@ -114,7 +115,7 @@ def _attributes(known: Any) -> dict[str, str]:
             if isinstance(value, str | int | float) and not isinstance(value, bool)}
 
 
-def _geometries(geometry: Mapping, corners: list) -> Iterator[Geometry]:
+def _geometries(geometry: Mapping, corners: np.ndarray) -> Iterator[Geometry]:
     """Yield a set of surfaces as one, and each solid by itself; others are left out."""
     kind = geometry["type"]
     if kind not in _DEPTHS:
@@ -146,7 +147,8 @@ def _item(values: Any, number: int) -> Any:
     return values[number] if isinstance(values, list) and number < len(values) else None
 
 
-def _polygon(rings: list, corners: list) -> Polygon:
-    if any(index < 0 for ring in rings for index in ring):
+def _polygon(rings: list, corners: np.ndarray) -> Polygon:
+    indices = [np.array(ring, dtype=np.int64).reshape(-1) for ring in rings]
+    if any((ring < 0).any() for ring in indices):
         raise IndexError
-    return [[corners[index] for index in ring] for ring in rings]
+    return [corners[ring] for ring in indices]

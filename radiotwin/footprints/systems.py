@@ -103,7 +103,7 @@ def to_degrees(path: Path, system: "CRS", points: np.ndarray) -> np.ndarray:
     """
     from pyproj import Transformer
 
-    east_first = Transformer.from_crs(_plane(system), "EPSG:4326", always_xy=True)
+    east_first = Transformer.from_crs(plane_of(system), "EPSG:4326", always_xy=True)
     is_own_north_first = system.is_geographic and system.to_authority() != ("OGC", "CRS84")
     orders = [points[:, ::-1], points] if is_own_north_first else [points, points[:, ::-1]]
     area = system.area_of_use
@@ -123,7 +123,11 @@ def to_degrees(path: Path, system: "CRS", points: np.ndarray) -> np.ndarray:
                    "reference system that the file names, or the order of its coordinates")
 
 
-def _plane(system: "CRS") -> "CRS":
-    """Return the horizontal part of a system."""
+def plane_of(system: "CRS") -> "CRS":
+    """Return the horizontal part of a system.
+
+    Args:
+        system: of two or three dimensions, or of two systems.
+    """
     parts = system.sub_crs_list
     return parts[0] if parts else system.to_2d()
