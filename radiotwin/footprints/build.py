@@ -59,8 +59,8 @@ READERS: dict[str, Callable[[Path], MapFile]] = {
     ".osm.pbf": lambda path: assemble(read_osm_pbf(path)),
     ".geojson": read_geojson, ".gpkg": read_geopackage,
     ".shp": read_shapefile, ".zip": read_shapefile,
-    ".city.json": read_cityjson, ".city.json.gz": read_cityjson,
-    ".cityjson": read_cityjson, ".city.jsonl": read_cityjson, ".gml": read_citygml,
+    ".city.json": read_cityjson, ".city.json.gz": read_cityjson, ".json": read_cityjson,
+    ".cityjson": read_cityjson, ".jsonl": read_cityjson, ".gml": read_citygml,
     ".citygml": read_citygml}
 GROUND_MARGIN_M = 100.0  # [m], of the ground plane beyond buildings and extent
 MAX_WIDTH_M = 50e3  # [m], chosen so that a plane and single precision are good enough

@@ -28,7 +28,8 @@ def read_cityjson(path: Path) -> MapFile:
     """Read the buildings of a CityJSON file.
 
     Args:
-        path: `.city.json`, `.city.json.gz` or `.cityjson` file, or `.city.jsonl` with a feature in each line.
+        path: `.json`, `.city.json.gz` or `.cityjson` file, or `.jsonl` with a feature in each
+            line.
 
     Returns:
         Their surfaces; of objects that have an outline only, that.
