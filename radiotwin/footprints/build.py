@@ -29,7 +29,7 @@ from radiotwin.footprints.osm_pbf import read_osm_pbf
 from radiotwin.footprints.osm_xml import read_osm_xml
 from radiotwin.footprints.outlines import OutlineBudget
 from radiotwin.footprints.shapefiles import read_shapefile
-from radiotwin.footprints.shells import make_shell_prisms
+from radiotwin.footprints.shells import elevation_fact, make_shell_prisms
 from radiotwin.footprints.solids import (
     Contacts,
     Prism,
@@ -182,13 +182,13 @@ def build_scene_from_map(
     declared = Declared(str(source), map_name(source), extent, origin,
                         _provenance(str(source), counts, map_options, options),
                         _facts(table["building"].nunique(), len(city.names) - 1, counts, origin,
-                               map_options, vegetation), vegetation)
+                               map_options, vegetation, shells), vegetation)
     return finish_scene(city, declared, out_folder, options, check_only, table)
 
 
 def _facts(
     buildings: int, blocks: int, counts: dict[str, int], origin: Origin, map_options: MapOptions,
-    vegetation: list[VegetationConfig],
+    vegetation: list[VegetationConfig], shells: list[Feature],
 ) -> tuple[tuple[str, str], ...]:
     """Return lines for the report."""
     heights = ", ".join(
@@ -197,6 +197,7 @@ def _facts(
         + [f"default: {counts.get('default', 0):,}"])
     return (("buildings", f"{buildings:,} in {blocks:,} blocks"),
             ("heights from", f"{heights} ({map_options.height_m:g} m)"),
+            *([("elevations", elevation_fact(shells))] if shells else []),
             *([("vegetation", vegetation_fact(vegetation))] if vegetation else []),
             ("origin", f"latitude {origin.latitude_deg}, longitude {origin.longitude_deg}"))
 

@@ -82,12 +82,14 @@ def column_name(text: str) -> str:
 
 
 def full_names(cut: Iterable[str], length: int = 10) -> dict[str, str]:
-    """Return the known columns that names were cut to, as Shapefiles do; ambiguous ones are not.
+    """Return the known columns that names were cut to, as Shapefiles do.
+
+    Those of elevations are left out: `b3_h_dak_m` may be of the highest or of the lowest roof.
 
     >>> full_names(["b3_h_maaiv", "b3_h_dak_m", "height"])
     {'b3_h_maaiv': 'b3_h_maaiveld'}
     """
-    known = {name for column in KNOWN for name in (column.name, column.ground)}
+    known = {column.ground or column.name for column in KNOWN}
     found = {}
     for name in cut:
         longer = [one for one in known if len(one) > length and one[:length] == name]

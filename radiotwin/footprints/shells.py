@@ -11,6 +11,7 @@ from typing import Any
 import mapbox_earcut
 import numpy as np
 import shapely
+import trimesh
 from manifold3d import Error, Manifold, Mesh64
 
 from radiotwin.budgets import CORNERS, FACES
@@ -21,6 +22,7 @@ from radiotwin.footprints.solids import GRID_M, SLIVER_AREA_M2, Body, Prism
 from radiotwin.geodesy import to_local
 from radiotwin.scene.meshes import clean
 from radiotwin.scene.problems import Problem
+from radiotwin.scene.surfaces import Surfaces
 from radiotwin.tables import Origin
 
 _WALL_SINE = 0.02  # of a triangle's area, seen from above, below which it belongs to a wall
@@ -64,13 +66,24 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
         prisms.append(Prism(feature.name, area, height, *table.material_of(feature.tags), body))
     return prisms, [
         *problems_of(no_area, "building(s) have no area seen from above: left out"),
-        *problems_of(too_high, f"building(s) are no height from 0 to {MAX_HEIGHT_M:g} m: left out; "
-                               "are their elevations in metres?"),
+        *problems_of(too_high, f"building(s) are not between 0 and {MAX_HEIGHT_M:g} m tall: left "
+                               "out; are their elevations in metres?"),
         *problems_of(opened, "building(s) are not closed, or cross themselves: kept as they are, "
                              "and not united with what they touch"),
         *problems_of(unknown, "building(s) have a building:material that is not in the table; the "
                               "default was taken. Name it in --material-table or with --material "
                               "NAME=ITU")]
+
+
+def elevation_fact(features: Sequence[Feature]) -> str:
+    """Return where the ground of buildings was, a line for a report.
+
+    Args:
+        features: buildings with shells, at least one.
+    """
+    ground_m = [feature.shell.ground_m for feature in features if feature.shell is not None]
+    return (f"buildings begin at {min(ground_m):.1f} to {max(ground_m):.1f} m above the file's "
+            "vertical datum; each was put on the ground")
 
 
 def triangulate(shell: Shell, origin: Origin) -> tuple[np.ndarray, np.ndarray]:
@@ -135,10 +148,22 @@ def _body(vertices: np.ndarray, faces: np.ndarray) -> tuple[Body, bool]:
     """Return the surfaces, as a solid where they are closed, and whether they are."""
     used, faces = np.unique(faces, return_inverse=True)
     vertices, faces = vertices[used], faces.reshape(-1, 3)
+    solid = _solid(vertices, faces)
+    if solid is None:  # surfaces that stand beside a solid may face either way
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        trimesh.repair.fix_winding(mesh)
+        faces = np.asarray(mesh.faces)
+        solid = _solid(vertices, faces)
+    if solid is not None:
+        return Body(solid, None), True
+    cleaned = clean(vertices, faces)[:2]
+    surfaces = Surfaces([cleaned])
+    return Body(None, (cleaned[0], surfaces.turned(surfaces.inward()).faces)), False
+
+
+def _solid(vertices: np.ndarray, faces: np.ndarray) -> Manifold | None:
+    """Return the solid that triangles enclose; None where they do not."""
     solid = Manifold(Mesh64(vertices, faces.astype(np.uint64)))
-    if solid.status() == Error.NoError and not solid.is_empty():
-        if solid.volume() < 0:
-            solid = Manifold(Mesh64(vertices, faces[:, ::-1].astype(np.uint64)))
-        if solid.volume() > 0:
-            return Body(solid, None), True
-    return Body(None, clean(vertices, faces)[:2]), False
+    if solid.status() == Error.NoError and solid.volume() < 0:
+        solid = Manifold(Mesh64(vertices, faces[:, ::-1].astype(np.uint64)))
+    return solid if solid.status() == Error.NoError and solid.volume() > 0 else None

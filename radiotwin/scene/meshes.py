@@ -111,7 +111,7 @@ def load_shape(shape: DeclaredShape) -> RawMesh:
     with np.errstate(all="ignore"):
         vertices = raw.vertices @ linear.T + offset
         mirrored = np.linalg.det(linear) < 0
-    _check_vertices(vertices, f"{shape.node.position}, after the transform")
+    check_vertices(vertices, f"{shape.node.position}, after the transform")
     return RawMesh(vertices, raw.faces[:, ::-1] if mirrored else raw.faces, raw.polygons)
 
 
@@ -138,7 +138,7 @@ def cut_polygons(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -
         BadInput: a coordinate is not finite or too large, a face names a vertex that is not there,
             or there are too many faces.
     """
-    _check_vertices(vertices, str(path))
+    check_vertices(vertices, str(path))
     for group in polygons:
         wrong = (group < 0) | (group >= len(vertices))
         if wrong.any():
@@ -151,7 +151,16 @@ def cut_polygons(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -
                    sum(len(group) for group in areal if group.shape[1] > 3))
 
 
-def _check_vertices(vertices: np.ndarray, source: str) -> None:
+def check_vertices(vertices: np.ndarray, source: str) -> None:
+    """Check the corners of a mesh.
+
+    Args:
+        vertices: (v, 3)
+        source: of the mesh; the message begins with it.
+
+    Raises:
+        BadInput: a coordinate is not finite, or too large.
+    """
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         raise BadInput(f"{source}: vertex {np.flatnonzero(~finite)[0] + 1} is not finite (NaN or "

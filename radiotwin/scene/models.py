@@ -17,7 +17,13 @@ from radiotwin.budgets import DOCUMENT_BYTES, FACES, SHAPES
 from radiotwin.errors import BadInput
 from radiotwin.inputs import check_input, read_bytes
 from radiotwin.scene.gltf import read_gltf
-from radiotwin.scene.meshes import MeshBudget, RawMesh, cut_polygons, read_obj_groups
+from radiotwin.scene.meshes import (
+    MeshBudget,
+    RawMesh,
+    check_vertices,
+    cut_polygons,
+    read_obj_groups,
+)
 from radiotwin.scene.ply import read_ply
 
 UP_AXES = {".obj": "z", ".glb": "y", ".gltf": "y", ".stl": "z", ".ply": "z"}
@@ -74,6 +80,7 @@ def read_model(path: Path) -> list[ModelPart]:
     budget = MeshBudget(path)
     for part in parts:
         budget.add(part.mesh)
+        check_vertices(part.mesh.vertices, f"{path}, {part.name}")
     return parts
 
 
