@@ -36,8 +36,8 @@ def build_scene(
         help="Frequency of the scene's radio [2.4e9].")] = None,
     material: Annotated[list[str] | None, typer.Option(
         metavar="NAME=ITU", help="Use an ITU material for the file's material NAME; of a map, for "
-                                 "the value NAME of building:material, or default, or ground. May "
-                                 "be repeated.")] = None,
+                                 "the value NAME of building:material, or default, ground or roof. "
+                                 "May be repeated.")] = None,
     scale: Annotated[float | None, typer.Option(
         help="Factor from the file's unit to metres (feet: 0.3048).")] = None,
     up: Annotated[str | None, typer.Option(

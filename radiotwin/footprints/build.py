@@ -12,7 +12,7 @@ from radiotwin.errors import BadInput
 from radiotwin.footprints.building_table import building_table, height_counts
 from radiotwin.footprints.citygml import read_citygml
 from radiotwin.footprints.cityjson import read_cityjson
-from radiotwin.footprints.extrude import make_blocks
+from radiotwin.footprints.extrude import make_blocks, split_roof
 from radiotwin.footprints.features import (
     Feature,
     MapFile,
@@ -181,8 +181,8 @@ def build_scene_from_map(
     city.problems.extend(unusable)
     declared = Declared(str(source), map_name(source), extent, origin,
                         _provenance(str(source), counts, map_options, options),
-                        _facts(table["building"].nunique(), len(city.names) - 1, counts, origin,
-                               map_options, vegetation, shells), vegetation)
+                        _facts(table["building"].nunique(), len(set(shape_of.values())), counts,
+                               origin, map_options, vegetation, shells), vegetation)
     return finish_scene(city, declared, out_folder, options, check_only, table)
 
 
@@ -341,9 +341,14 @@ def _city(
     for block in make_blocks(prisms, contacts):
         name = unique_name(safe_name(prisms[block.members[0]].name), taken)
         shape_of |= dict.fromkeys(block.members, name)
+        walls, roof = split_roof(block.mesh) if table.roof else (block.mesh, None)
         names.append(name)
         materials.append(block.material)
-        meshes.append((np.asarray(block.mesh.vertices), np.asarray(block.mesh.faces)))
+        meshes.append((np.asarray(walls.vertices), np.asarray(walls.faces)))
+        if roof is not None:
+            names.append(unique_name(f"{name}_roof", taken))
+            materials.append(itu_material(table.roof or ""))
+            meshes.append((np.asarray(roof.vertices), np.asarray(roof.faces)))
     surfaces = Surfaces(meshes)
     is_ground = surfaces.shape == 0
     city = ImportedCity(names, materials, surfaces, is_ground, problems)

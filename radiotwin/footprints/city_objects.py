@@ -33,8 +33,6 @@ BUILT = ("Building", "BuildingPart", "BuildingInstallation", "BuildingConstructi
          "BridgeConstructionElement", "BridgeConstructiveElement", "OtherConstruction",
          "ConstructiveElement")
 """Objects that are read; others (terrain, plants, water, traffic) are counted in a warning."""
-SURFACES = {"RoofSurface": "roof", "WallSurface": "wall", "GroundSurface": "ground",
-            "OuterCeilingSurface": "wall", "OuterFloorSurface": "roof"}
 _NOT_BUILT = "object(s) have no surfaces that can be used: left out"
 
 Polygon = list[np.ndarray]
@@ -47,12 +45,10 @@ class Geometry:
     Attributes:
         lod: level of detail, 0 to 4; 3D BAG has 1.2, 1.3 and 2.2.
         polygons: rings of (n, 3) corners as the file gives them.
-        surfaces: what each polygon is, a value of `SURFACES` or "".
     """
 
     lod: float
     polygons: list[Polygon] = field(default_factory=list)
-    surfaces: list[str] = field(default_factory=list)
 
 
 @dataclass
@@ -187,7 +183,7 @@ def _features(chosen: list[tuple[CityObject, str, list[Geometry]]], points: list
         if geometry.lod < 1:
             features.append(Feature(root, tags, _outline(geometry, known)))
             continue
-        shell = Shell(known, _indices(geometry), geometry.surfaces, ground_m[root])
+        shell = Shell(known, _indices(geometry), ground_m[root])
         features.append(Feature(root, tags, shapely.MultiPoint(known[:, :2]).convex_hull, shell))
     return features
 

@@ -18,7 +18,6 @@ from radiotwin.budgets import FEATURES, NESTING, VERTICES
 from radiotwin.errors import BadInput
 from radiotwin.footprints.city_objects import (
     BUILT,
-    SURFACES,
     CityObject,
     Geometry,
     Polygon,
@@ -34,6 +33,8 @@ _LOD = re.compile(r"lod([0-4])(\w+)")
 _SKIPPED = ("Room", "BuildingRoom", "BuildingFurniture", "IntBuildingInstallation",
             "interiorBuildingInstallation", "InteriorWallSurface", "CeilingSurface",
             "FloorSurface", "ImplicitGeometry", "appearanceMember", "appearance")
+_BOUNDARIES = ("RoofSurface", "WallSurface", "GroundSurface", "ClosureSurface",
+               "OuterCeilingSurface", "OuterFloorSurface")
 _POLYGONS = ("Polygon", "PolygonPatch", "Triangle", "Rectangle")
 _VALUES = ("stringAttribute", "doubleAttribute", "intAttribute", "measureAttribute")
 _NAME_LENGTH = 200
@@ -74,8 +75,7 @@ class _Surfaces:
             if solid is None or other is None:
                 found.append(solid or other or Geometry(lod))
             elif lod in self.referring or not solid.polygons:
-                found.append(Geometry(lod, solid.polygons + other.polygons,
-                                      solid.surfaces + other.surfaces))
+                found.append(Geometry(lod, solid.polygons + other.polygons))
             else:
                 found.append(solid)
         return found
@@ -92,7 +92,7 @@ class _Reader:
         self.open: list[tuple[int, CityObject, _Surfaces]] = []  # with their depths
         self.skipped = 0  # depth of the element that is skipped with all in it
         self.lod: tuple[int, float, bool] | None = None  # depth, level, whether of a solid
-        self.surface: tuple[int, str] | None = None  # depth, what it is
+        self.surface = 0  # depth of the wall, roof, … that is open
         self.dimensions: list[tuple[int, int]] = []  # depths, and dimensions of positions
         self.rings: Polygon | None = None
         self.numbers: list[float] = []
@@ -142,8 +142,8 @@ class _Reader:
         surfaces = self.open[-1][2]
         if found := _LOD.fullmatch(name):
             self.lod = depth, float(found[1]), "Solid" in found[2]
-        elif name.endswith("Surface") and name in (*SURFACES, "ClosureSurface"):
-            self.surface = depth, SURFACES.get(name, "")
+        elif name in _BOUNDARIES:
+            self.surface = depth
         elif name in _POLYGONS and self.lod:
             self.rings = []
         elif self.rings is not None:
@@ -153,7 +153,7 @@ class _Reader:
             surfaces.referring.add(self.lod[1])
         elif name in _VALUES:
             self.attribute = attributes.get("name", "")
-        elif self.lod is None and self.surface is None:
+        elif not self.lod and not self.surface:
             self.text, self.unit = [], attributes.get("uom", "")
 
     def add_text(self, text: str) -> None:
@@ -179,8 +179,8 @@ class _Reader:
         self.text = None
         if self.lod and self.lod[0] == depth:
             self.lod = None
-        if self.surface and self.surface[0] == depth:
-            self.surface = None
+        if self.surface == depth:
+            self.surface = 0
         if name in _VALUES:
             self.attribute = ""
         if self.open[-1][0] == depth:
@@ -207,7 +207,6 @@ class _Reader:
                 kept = (surfaces.solids if is_solid else surfaces.others).setdefault(
                     lod, Geometry(lod))
                 kept.polygons.append(self.rings)
-                kept.surfaces.append(self.surface[1] if self.surface else "")
             self.rings = None
 
     def _add_numbers(self, text: str, dimension: int) -> None:

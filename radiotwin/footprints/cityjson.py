@@ -15,7 +15,7 @@ import numpy as np
 
 from radiotwin.budgets import DOCUMENT_BYTES, FEATURES, VERTICES
 from radiotwin.errors import BadInput
-from radiotwin.footprints.city_objects import SURFACES, CityObject, Geometry, Polygon, city_features
+from radiotwin.footprints.city_objects import CityObject, Geometry, Polygon, city_features
 from radiotwin.footprints.features import MapFile
 from radiotwin.inputs import decode_text, open_gzip, parse_json
 
@@ -122,30 +122,13 @@ def _geometries(geometry: Mapping, corners: np.ndarray) -> Iterator[Geometry]:
     if kind not in _DEPTHS:
         return
     boundaries = geometry["boundaries"]
-    semantics = geometry.get("semantics")
-    semantics = semantics if isinstance(semantics, dict) else {}
-    names = [SURFACES.get(str(one.get("type")), "") for one in semantics.get("surfaces") or []]
-    values = semantics.get("values")
     lod = float(geometry.get("lod", 2))
     depth = _DEPTHS[kind]
-    if depth == 2:
-        solids = [(solid, _item(values, number)) for number, solid in enumerate(boundaries)]
-    else:
-        solids = [(boundaries if depth else [boundaries], values if depth else [values])]
-    for shells, shell_values in solids:
-        found = Geometry(lod)
+    solids = boundaries if depth == 2 else [boundaries] if depth == 1 else [[boundaries]]
+    for shells in solids:
         # Cavities are inner shells: no ray gets there
-        surface_values = _item(shell_values, 0)
-        for number, surface in enumerate(shells[0] if shells else []):
-            which = _item(surface_values, number)
-            found.polygons.append(_polygon(surface, corners))
-            found.surfaces.append(names[which] if isinstance(which, int)
-                                  and 0 <= which < len(names) else "")
-        yield found
-
-
-def _item(values: Any, number: int) -> Any:
-    return values[number] if isinstance(values, list) and number < len(values) else None
+        yield Geometry(lod, [_polygon(surface, corners) for surface in shells[0]]
+                       if shells else [])
 
 
 def _polygon(rings: list, corners: np.ndarray) -> Polygon:

@@ -21,6 +21,7 @@ from radiotwin.scene.materials import Material
 from radiotwin.scene.meshes import clean, is_volume
 
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+MIN_ROOF_COSINE = 0.2  # of a roof's normal to the vertical: the steepest have about 78 degrees
 SLOT_M = 0.02  # [m], more than the 1 cm below which the 3D map takes two surfaces for one
 # [m], how far a surface may move to remove a splinter; files hold single precision, 0.1 mm at 1 km
 SIMPLIFY_M = 1e-3
@@ -84,6 +85,25 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
             if not solid.is_empty():
                 blocks.append(Block(members, prisms[members[0]].material, _mesh(solid)))
     return blocks
+
+
+def split_roof(mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, trimesh.Trimesh | None]:
+    """Part the roofs of a block, which face upwards, from its walls and bottom.
+
+    Args:
+        mesh: of the block.
+
+    Returns:
+        Walls with bottom, and roofs; None where nothing, or everything, faces upwards.
+    """
+    is_roof = mesh.face_normals[:, 2] > MIN_ROOF_COSINE
+    if is_roof.all() or not is_roof.any():
+        return mesh, None
+    walls, roof = (trimesh.Trimesh(mesh.vertices, mesh.faces[which], process=False)
+                   for which in (~is_roof, is_roof))
+    for part in (walls, roof):
+        part.remove_unreferenced_vertices()
+    return walls, roof
 
 
 def _union(solids: list[Manifold]) -> Manifold:

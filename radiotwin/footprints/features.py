@@ -19,13 +19,11 @@ class Shell:
         points: (n, 3) longitude, latitude [degrees] and elevation [m].
         polygons: rings of each surface, the outer one first: indices of points, the first not
             again at the end.
-        surfaces: what each polygon is, `roof`, `wall`, `ground` or "".
         ground_m: elevation of the ground beside the building: that of its lowest point [m].
     """
 
     points: np.ndarray
     polygons: Sequence[Sequence[np.ndarray]]
-    surfaces: Sequence[str]
     ground_m: float
 
 

@@ -23,7 +23,7 @@ from radiotwin.footprints.features import (
     is_building,
 )
 from radiotwin.footprints.height_columns import ALIASES
-from radiotwin.footprints.systems import WGS84, find_system
+from radiotwin.footprints.systems import WGS84, degrees_from, find_system
 from radiotwin.inputs import parse_json, read_text
 
 _OTHER_TAG = re.compile(r'[\s,]*+"((?:[^"\\]|\\.)*+)"\s*+=>\s*+"((?:[^"\\]|\\.)*+)"', re.DOTALL)
@@ -166,15 +166,9 @@ def _other_tags(text: str) -> dict[str, str]:
 def _to_degrees(path: Path, features: list[Feature], crs: str | None) -> list[Feature]:
     if not features or crs in WGS84:
         return features
-    from pyproj import Transformer
-
     if crs is None:
         raise BadInput(f"{path} has no coordinate reference system; assign one (in QGIS: Layer "
                        "CRS) and export it again")
-    transformer = Transformer.from_crs(find_system(path, crs), "EPSG:4326", always_xy=True)
-
-    def project(points: np.ndarray) -> np.ndarray:
-        return np.column_stack(transformer.transform(*points.T))
-
+    project = degrees_from(path, find_system(path, crs))
     return [Feature(feature.name, feature.tags, shapely.transform(feature.area, project))
             for feature in features]

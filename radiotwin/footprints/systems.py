@@ -5,6 +5,7 @@ only an authority with its code, a title of PROJ's database, and WKT without gri
 """
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -55,6 +56,36 @@ def _is_harmless_wkt(text: str) -> bool:
     return "[" in text and not any(word in text.upper() for word in _FILES_IN_WKT)
 
 
+def degrees_from(path: Path, system: "CRS") -> Callable[[np.ndarray], np.ndarray]:
+    """Return a conversion of (n, 2) east and north to (n, 2) longitude and latitude [degrees].
+
+    Args:
+        path: file that names the system, for the message.
+        system: of two dimensions.
+
+    Raises:
+        BadInput: now or when it is used, the system cannot be converted.
+    """
+    from pyproj import Transformer
+    from pyproj.exceptions import ProjError
+
+    def refuse(error: ProjError) -> BadInput:
+        return BadInput(f"{path}: its coordinate reference system {system.name[:60]!r} cannot be "
+                        f"converted ({error!s:.120}); export it in EPSG:4326")
+
+    def convert(points: np.ndarray) -> np.ndarray:
+        try:
+            return np.column_stack(transformer.transform(*points.T))
+        except ProjError as error:
+            raise refuse(error) from None
+
+    try:
+        transformer = Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+    except ProjError as error:
+        raise refuse(error) from None
+    return convert
+
+
 def find_city_system(path: Path, name: str) -> "CRS":
     """Find the system of a 3D city model, as GML and CityJSON name it.
 
@@ -101,14 +132,12 @@ def to_degrees(path: Path, system: "CRS", points: np.ndarray) -> np.ndarray:
     Raises:
         BadInput: in neither order the points lie where the system is used.
     """
-    from pyproj import Transformer
-
-    east_first = Transformer.from_crs(plane_of(system), "EPSG:4326", always_xy=True)
+    convert = degrees_from(path, plane_of(system))
     is_own_north_first = system.is_geographic and system.to_authority() != ("OGC", "CRS84")
     orders = [points[:, ::-1], points] if is_own_north_first else [points, points[:, ::-1]]
     area = system.area_of_use
     for ordered in orders:
-        degrees = np.column_stack(east_first.transform(*ordered.T))
+        degrees = convert(ordered)
         if area is None:
             return degrees
         middle = np.median(degrees, axis=0)  # NaN and infinite compare as outside

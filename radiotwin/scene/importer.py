@@ -312,7 +312,8 @@ def _move_to_origin(city: ImportedCity) -> ImportedCity:
             f"the city lies {np.hypot(*middle[:2]) / 1000:.0f} km from the origin, too far for "
             f"single precision: moved by ({offset[0]:.0f}, {offset[1]:.0f}) m"))
     if city.ground.any():
-        corners = city.surfaces.faces[city.ground & (city.surfaces.area_vectors[:, 2] > 0)]
+        upward = city.ground & (city.surfaces.area_vectors[:, 2] > 0)
+        corners = city.surfaces.faces[upward if upward.any() else city.ground]
         lowest, highest = vertices[corners, 2].min(), vertices[corners, 2].max()
         uneven = highest - lowest > 2 * FLAT_M
         datum = lowest if uneven else city.surfaces.level_m(city.ground)

@@ -7,7 +7,13 @@ import pytest
 from pyproj import CRS
 
 from radiotwin.errors import BadInput
-from radiotwin.footprints.systems import find_city_system, find_system, plane_of, to_degrees, vertical_unit_m
+from radiotwin.footprints.systems import (
+    find_city_system,
+    find_system,
+    plane_of,
+    to_degrees,
+    vertical_unit_m,
+)
 
 FILE = Path("a.gml")
 
