@@ -60,7 +60,7 @@ KNOWN = (
         "height", "building:height", "measuredheight", "gesamthoehe", "gebaeudehoehe", "hoehe",
         "height_m", "hauteur", "relhmax", "relh2")),
     *(HeightColumn(name, "ft") for name in ("heightroof", "height_roof", "height_ft")),
-    *_elevations("b3_h_maaiveld", "b3_h_dak_max", "b3_h_max", "b3_h_nok", "b3_h_dak_70p",
+    *_elevations("b3_h_maaiveld", "b3_h_dak_max", "b3_h_max", "b3_h_dak_70p",
                  "b3_h_70p", "b3_h_dak_50p", "b3_h_50p"),
     *_elevations("h_maaiveld", "h_dak_max"),
     *_elevations("gelaendepunkt", "dach_max"),
