@@ -75,8 +75,10 @@ def make_blocks(prisms: Sequence[Prism], contacts: Contacts) -> list[Block]:
             advance(1)
             body = prisms[members[0]].body
             if body is not None and body.mesh is not None:
-                blocks.append(Block(members, prisms[members[0]].material,
-                                    trimesh.Trimesh(*body.mesh, process=False)))
+                vertices, faces = body.mesh
+                rise_m = prisms[members[0]].height.top_m - vertices[:, 2].max()
+                mesh = trimesh.Trimesh(vertices + [0, 0, rise_m], faces, process=False)
+                blocks.append(Block(members, prisms[members[0]].material, mesh))
                 continue
             solid = _union([_solid(prisms[i]) for i in members])
             if block in cut_by:
@@ -113,11 +115,31 @@ def _union(solids: list[Manifold]) -> Manifold:
 def _solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
     """Return a prism, with all its faces moved outwards by `wider_m`."""
     if prism.body is not None:
-        assert prism.body.solid is not None
-        return prism.body.solid if not wider_m else _union(
-            [prism.body.solid.translate(wider_m * corner) for corner in _CORNERS])
+        solid = _placed(prism)
+        return _union([solid.translate(wider_m * corner) for corner in _CORNERS]) if wider_m \
+            else solid
     assert isinstance(prism.area, shapely.Polygon)
     area = prism.area.buffer(wider_m, join_style="mitre") if wider_m else prism.area
+    return _extruded(area, prism.height.bottom_m - wider_m, prism.height.top_m + wider_m)
+
+
+def _placed(prism: Prism) -> Manifold:
+    """Return the solid of a body with its top at that of the prism, and walls down to its bottom.
+
+    A building on terrain begins below the ground that its file has.
+    """
+    assert prism.body is not None and prism.body.solid is not None
+    _, _, low_m, _, _, high_m = prism.body.solid.bounding_box()
+    rise_m, height = prism.height.top_m - high_m, prism.height
+    solid = prism.body.solid.translate((0, 0, rise_m))
+    if low_m + rise_m - height.bottom_m <= GRID_M:
+        return solid
+    return _union([solid, *(_extruded(polygon, height.bottom_m, low_m + rise_m)
+                            for polygon in shapely.get_parts(prism.area))])
+
+
+def _extruded(area: shapely.Polygon, bottom_m: float, top_m: float) -> Manifold:
+    """Return a solid with vertical walls."""
     rings = [shapely.get_coordinates(ring) for ring in (area.exterior, *area.interiors)]
     points, ends = np.concatenate(rings), np.cumsum([len(ring) for ring in rings])
     roof: np.ndarray = mapbox_earcut.triangulate_float64(points, ends).reshape(-1, 3)
@@ -132,7 +154,7 @@ def _solid(prism: Prism, wider_m: float = 0.0) -> Manifold:
     outer = ~np.isin(start * n + end, end * n + start)
     start, end = start[outer], end[outer]
     walls = np.stack([end + n, start + n, end, end, start + n, start], axis=1).reshape(-1, 3)
-    height_m = np.repeat([prism.height.bottom_m - wider_m, prism.height.top_m + wider_m], n)
+    height_m = np.repeat([bottom_m, top_m], n)
     vertices = np.column_stack([np.tile(points, (2, 1)), height_m])
     faces = np.concatenate([roof[:, ::-1], roof + n, walls])
     return Manifold(Mesh64(vertices, faces.astype(np.uint64)))

@@ -2,6 +2,7 @@
 
 import gzip
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -14,9 +15,13 @@ from radiotwin.errors import BadInput
 from radiotwin.footprints import MapOptions, build_scene_from_map, with_pairs
 from radiotwin.footprints.citygml import read_citygml
 from radiotwin.footprints.cityjson import read_cityjson
+from radiotwin.footprints.extrude import make_blocks
 from radiotwin.footprints.material_table import STANDARD
+from radiotwin.footprints.shells import make_shell_prisms
+from radiotwin.footprints.solids import find_contacts
 from radiotwin.geodesy import to_local
 from radiotwin.scene import Scene
+from radiotwin.tables import Origin
 from tests.footprints import city_models as made
 
 HOUSES = [(0, 0, 1.2), (10, 0, 1.5), (40, 0, 1.2)]  # the first two share a wall
@@ -281,3 +286,14 @@ def test_roofs_of_a_material_of_their_own(tmp_path):
     # Two slopes a house, of 5 m to 3 m of height: sqrt(34) wide and 12 m long
     assert sum(mesh.area for mesh in roofs) == pytest.approx(3 * 2 * 34**0.5 * 12, rel=2e-3)
     assert any("nothing diffracts there" in problem.message for problem in report.problems)
+
+
+def test_a_body_stands_where_its_prism_does(tmp_path):
+    """As on terrain: 5 m up, with walls that reach 1 m below its own."""
+    (feature,) = read_cityjson(write(tmp_path, made.cityjson([(0, 0, 1.2)]))).features
+    origin = Origin(latitude_deg=52.0, longitude_deg=4.37)
+    (prism,), _ = make_shell_prisms([feature], origin, STANDARD)
+    raised = replace(prism, height=replace(prism.height, bottom_m=4.0, top_m=14.0))
+    (block,) = make_blocks([raised], find_contacts([raised]))
+    assert block.mesh.is_volume and block.mesh.bounds[:, 2] == pytest.approx([4, 14], abs=1e-3)
+    assert block.mesh.volume == pytest.approx(made.VOLUME_M3 + 120, rel=2e-3)
