@@ -22,8 +22,8 @@ from radiotwin.errors import BadInput
 from radiotwin.inputs import parse_json, read_bytes, require_within
 
 _MAGIC, _JSON, _BINARY = b"glTF", b"JSON", b"BIN\0"
-_TYPES = {5121: np.dtype("<u1"), 5123: np.dtype("<u2"), 5125: np.dtype("<u4"),
-          5126: np.dtype("<f4")}
+_TYPES: dict[int, np.dtype[Any]] = {5121: np.dtype("<u1"), 5123: np.dtype("<u2"),
+                                   5125: np.dtype("<u4"), 5126: np.dtype("<f4")}
 _COMPONENTS = {"SCALAR": 1, "VEC3": 3}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _COMPRESSED = ("KHR_draco_mesh_compression", "EXT_meshopt_compression",
@@ -61,7 +61,8 @@ def read_gltf(path: Path) -> list[Part]:
 
 def _chunks(path: Path, data: bytes) -> tuple[bytes, bytes | None]:
     """Return the JSON and the binary chunk of a `.glb` file."""
-    chunks, at = {}, 12
+    chunks: dict[bytes, bytes] = {}
+    at = 12
     while at + 8 <= len(data):
         length, kind = struct.unpack_from("<I4s", data, at)
         if at + 8 + length > len(data):
