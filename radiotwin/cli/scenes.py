@@ -25,9 +25,10 @@ def add_commands(app: typer.Typer) -> None:
 
 def build_scene(
     source: Annotated[str, typer.Argument(
-        metavar="CITY", help="A map (.osm, .osm.pbf, .geojson, .gpkg), a Mitsuba or Sionna RT XML "
-                             "file, sionna:NAME (munich, etoile, …), or preset:NAME (rbm, rdm, "
-                             "small).")],
+        metavar="CITY", help="A map (.osm, .osm.pbf, .geojson, .gpkg, .shp, or a .zip of it), a 3D "
+                             "city model (.city.json, .gml), a Mitsuba or Sionna RT XML file, a "
+                             "model (.obj, .glb, .gltf, .stl, .ply), sionna:NAME (munich, etoile, "
+                             "…), or preset:NAME (rbm, rdm, small).")],
     out: Annotated[Path | None, typer.Option(
         "--out", "-o", help="Scene folder to write [scenes/NAME].")] = None,
     check: Annotated[bool, typer.Option(
@@ -41,7 +42,7 @@ def build_scene(
     scale: Annotated[float | None, typer.Option(
         help="Factor from the file's unit to metres (feet: 0.3048).")] = None,
     up: Annotated[str | None, typer.Option(
-        help="Axis of the file that points up: x, y or z.")] = None,
+        help="Axis of the file that points up: x, y or z [z; of glTF y].")] = None,
     bbox: Annotated[str | None, typer.Option(
         metavar="A,B,C,D", help="Keep only this part: XMIN,YMIN,XMAX,YMAX [m]; of a map S,W,N,E "
                                 "[degrees].")] = None,
@@ -75,6 +76,7 @@ def build_scene(
     """
     from radiotwin.footprints import map_suffix
     from radiotwin.scene.report import print_report
+    from radiotwin.scene.sources import MAP_SUFFIXES
 
     common = _given(frequency_hz=frequency_hz, devices=devices, uavs=uavs, seed=seed,
                     origin=parse_origin(origin))
@@ -87,7 +89,7 @@ def build_scene(
         _refuse(of_cities, f"{source} is a map")
         report = _build_from_map(source, out, common, pairs, bounds, of_maps, check)
     else:
-        _refuse(of_maps, f"{source} is not a map (.osm, .osm.pbf, .geojson, .gpkg)")
+        _refuse(of_maps, f"{source} is not a map ({MAP_SUFFIXES})")
         options = common | of_cities | _given(materials=pairs or None, bbox=bounds)
         report = _build_from_city(source, out, options, check)
     print_report(report, console)
