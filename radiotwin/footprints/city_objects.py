@@ -33,6 +33,7 @@ BUILT = ("Building", "BuildingPart", "BuildingInstallation", "BuildingConstructi
          "BridgeConstructionElement", "BridgeConstructiveElement", "OtherConstruction",
          "ConstructiveElement")
 """Objects that are read; others (terrain, plants, water, traffic) are counted in a warning."""
+_MAX_PARENTS = 10  # a building, its part, an installation of that: three
 _NOT_BUILT = "object(s) have no surfaces that can be used: left out"
 
 Polygon = list[np.ndarray]
@@ -110,10 +111,10 @@ def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[s
 
 def _root(one: CityObject, by_name: Mapping[str, CityObject]) -> str:
     """Return the name of the building that an object belongs to."""
-    seen = {one.name}
-    while one.parent in by_name and one.parent not in seen:
+    for _ in range(_MAX_PARENTS):  # in a file, an object may be a part of itself
+        if one.parent not in by_name:
+            break
         one = by_name[one.parent]
-        seen.add(one.name)
     return one.name
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from radiotwin.budgets import FEATURES, NESTING, VERTICES
+from radiotwin.budgets import FEATURES, NESTING, TAG_BYTES, VERTICES
 from radiotwin.errors import BadInput
 from radiotwin.footprints.city_objects import (
     BUILT,
@@ -97,10 +97,11 @@ class _Reader:
         self.rings: Polygon | None = None
         self.numbers: list[float] = []
         self.text: list[str] | None = None
+        self.text_length = 0
         self.attribute = ""  # name of the generic attribute that is open
         self.unit = ""
         self.corners = 0
-        self.limits = NESTING.limit, VERTICES.limit
+        self.limits = NESTING.limit, VERTICES.limit, TAG_BYTES.limit
         self.line = 0
 
     def start(self, tag: str, attributes: dict[str, str], line: int) -> None:
@@ -159,6 +160,9 @@ class _Reader:
     def add_text(self, text: str) -> None:
         if self.text is not None:
             self.text.append(text)
+            self.text_length += len(text)
+            if self.text_length > self.limits[2]:
+                TAG_BYTES.check(self.text_length, f"{self.path}, line {self.line}")
 
     def end(self, tag: str) -> None:
         name, depth = self.tags[-1], len(self.tags)
@@ -176,7 +180,7 @@ class _Reader:
             self._end_of_geometry(name, dimension)
         elif self.text is not None:
             self._end_of_value(name, "".join(self.text).strip()[:_MAX_VALUE])
-        self.text = None
+        self.text, self.text_length = None, 0
         if self.lod and self.lod[0] == depth:
             self.lod = None
         if self.surface == depth:
@@ -222,6 +226,8 @@ class _Reader:
             flat = np.array(numbers).reshape(-1, 2)
             numbers = np.column_stack([flat, np.zeros(len(flat))]).ravel().tolist()
         self.numbers += numbers
+        if len(self.numbers) > 3 * self.limits[1]:
+            VERTICES.check(len(self.numbers) / 3, self.path)
 
     def _end_of_value(self, name: str, value: str) -> None:
         """Keep the text of an element of the object itself, or of a generic attribute."""

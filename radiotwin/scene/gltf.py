@@ -134,10 +134,11 @@ class _Document:
 
     def parts(self) -> Iterator[Part]:
         """Yield what the scene's objects are made of."""
-        vertices = 0
-        for number, (name, mesh, to_world) in enumerate(self._placed(), start=1):
-            SHAPES.check(number, self.path)
+        vertices = parts = 0
+        for name, mesh, to_world in self._placed():
             for primitive in self._at("meshes", mesh)["primitives"]:
+                parts += 1
+                SHAPES.check(parts, self.path)
                 points = self._accessor(primitive["attributes"]["POSITION"], "VEC3")
                 vertices += len(points)
                 VERTICES.check(vertices, self.path)

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 from pyproj import Transformer
 
-from radiotwin.budgets import VERTICES
+from radiotwin.budgets import TAG_BYTES, VERTICES
 from radiotwin.errors import BadInput
 from radiotwin.footprints import MapOptions, build_scene_from_map, with_pairs
 from radiotwin.footprints.citygml import read_citygml
@@ -297,3 +297,17 @@ def test_a_body_stands_where_its_prism_does(tmp_path):
     (block,) = make_blocks([raised], find_contacts([raised]))
     assert block.mesh.is_volume and block.mesh.bounds[:, 2] == pytest.approx([4, 14], abs=1e-3)
     assert block.mesh.volume == pytest.approx(made.VOLUME_M3 + 120, rel=2e-3)
+
+
+def test_an_object_that_is_a_part_of_itself(tmp_path):
+    model = made.cityjson([(0, 0, 0)])
+    model["CityObjects"]["B0"]["parents"] = ["B0-0"]
+    report = build_scene_from_map(write(tmp_path, model), tmp_path / "out", check_only=True)
+    assert report.shapes == 2 and report.tallest_m == pytest.approx(9, abs=1e-3)
+
+
+def test_a_text_without_an_end(tmp_path, monkeypatch):
+    monkeypatch.setenv(TAG_BYTES.variable, "10_000")
+    text = GOOD_GML.replace("691000.000", "1 " * 6_000, 1)
+    with pytest.raises(BadInput, match="a.gml, line 1: 12,.* bytes in one tag; at most 10,000"):
+        read_citygml(write(tmp_path, text, "a.gml"))
