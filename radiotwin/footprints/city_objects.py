@@ -111,10 +111,12 @@ def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[s
 
 def _root(one: CityObject, by_name: Mapping[str, CityObject]) -> str:
     """Return the name of the building that an object belongs to."""
-    for _ in range(_MAX_PARENTS):  # in a file, an object may be a part of itself
-        if one.parent not in by_name:
-            break
+    seen = [one.name]
+    while one.parent in by_name and len(seen) < _MAX_PARENTS:
         one = by_name[one.parent]
+        if one.name in seen:  # in a file, an object may be a part of itself
+            return min(seen)
+        seen.append(one.name)
     return one.name
 
 
