@@ -14,13 +14,14 @@ from radiotwin.footprints import (
     read_material_table,
     with_pairs,
 )
+from radiotwin.footprints.height_columns import HeightColumn, declared_column
 from radiotwin.footprints.material_table import STANDARD
 from radiotwin.footprints.overpass import download_osm
 from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.build import build_scene as build_from_city
 from radiotwin.scene.presets import build_preset_scene
 from radiotwin.scene.report import BuildReport
-from radiotwin.scene.sources import scene_name
+from radiotwin.scene.sources import MAP_SUFFIXES, scene_name
 from radiotwin.tables import Origin, as_origin
 
 PRESET = "preset:"
@@ -36,14 +37,16 @@ def build_scene(
     altitudes_m: Sequence[float] | None = None,
     extent_m: tuple[float, float, float, float] | None = None, scale: float | None = None,
     up: str | None = None, default_height_m: float | None = None,
+    height_column: str | None = None, ground_column: str | None = None,
     material_table: MaterialTable | Path | str | None = None, overpass: bool = False,
     check_only: bool = False,
 ) -> BuildReport:
     """Build a scene folder from a map or a city model, and report on it.
 
     Args:
-        source: map (`.osm`, `.osm.pbf`, `.geojson`, `.gpkg`), Mitsuba or Sionna RT XML file,
-            `sionna:NAME`, or `preset:NAME`, which takes no option but `check_only`.
+        source: map (`.osm`, `.osm.pbf`, `.geojson`, `.gpkg`, `.shp`, `.city.json`, `.gml`), model
+            (`.obj`, `.glb`, `.gltf`, `.stl`, `.ply`), Mitsuba or Sionna RT XML file, `sionna:NAME`,
+            or `preset:NAME`, which takes no option but `check_only`.
         folder: scene folder to write; a scene that is already in it is replaced. None:
             `scenes/NAME`.
         frequency_hz: of the scene's radio [Hz]; None: 2.4 GHz.
@@ -61,7 +64,10 @@ def build_scene(
         extent_m: of the lattice: (x_min, y_min, x_max, y_max) [m]; None: around the buildings.
         scale: of a city model: factor from the file's unit to metres.
         up: of a city model: axis of the file that points up, `x`, `y` or `z`.
-        default_height_m: of a map: height of buildings without one [m]; None: 10.
+        default_height_m: of a map: height of buildings without one [m]; None: 10, with a warning.
+        height_column: of a map: column of heights, with its unit, such as `Hoehe:m` or
+            `floors:storeys`; None: the columns that are known by name.
+        ground_column: of a map: column of the ground's elevation, which is subtracted.
         material_table: of a map: materials of its tags, or the file that declares them.
         overpass: download the map `source`, an .osm file that does not exist yet, for `bbox`.
         check_only: write nothing, and return errors in the report instead of raising them.
@@ -78,19 +84,21 @@ def build_scene(
                     altitudes_m=None if altitudes_m is None else tuple(altitudes_m),
                     extent_m=extent_m)
     of_cities = _given(scale=scale, up=up)
-    of_maps = _given(default_height_m=default_height_m, material_table=material_table,
+    of_maps = _given(default_height_m=default_height_m, height_column=height_column,
+                     ground_column=ground_column, material_table=material_table,
                      overpass=overpass or None)
     text = str(source)
     if map_suffix(source):
         _refuse(of_cities, f"{source} is a map")
         table = _material_table(material_table, materials or {})
-        options = MapOptions(bbox, of_maps.get("default_height_m", 10.0), table)
+        options = MapOptions(bbox, default_height_m, table,
+                             _height_column(height_column, ground_column))
         options.check()
         if overpass:
             _download(source, bbox)
         return build_scene_from_map(source, folder or Path("scenes") / map_name(source), options,
                                     BuildOptions(**common), check_only)
-    _refuse(of_maps, f"{source} is not a map (.osm, .osm.pbf, .geojson, .gpkg)")
+    _refuse(of_maps, f"{source} is not a map ({MAP_SUFFIXES})")
     given = common | of_cities | _given(materials=materials or None, bbox=bbox)
     if not text.startswith(PRESET):
         return build_from_city(source, folder or Path("scenes") / scene_name(source),
@@ -100,6 +108,15 @@ def build_scene(
                        "cannot be used with it. Build it without, then change scene.toml")
     name = text.removeprefix(PRESET)
     return build_preset_scene(name, folder or Path("scenes") / name, check_only=check_only)
+
+
+def _height_column(column: str | None, ground: str | None) -> HeightColumn | None:
+    if column is not None:
+        return declared_column(column, ground)
+    if ground is not None:
+        raise BadInput("--ground-column is subtracted from the column of roofs; name that with "
+                       "--height-column, too")
+    return None
 
 
 def _material_table(table: MaterialTable | Path | str | None,

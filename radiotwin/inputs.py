@@ -151,8 +151,21 @@ def read_text(path: Path | str, what: str = "text file",
     Raises:
         BadInput: as `open_input`, or it is not UTF-8.
     """
+    return decode_text(read_bytes(path, what, budget), path)
+
+
+def decode_text(data: bytes, path: Path | str) -> str:
+    """Decode a text in UTF-8, with or without a byte-order mark.
+
+    Args:
+        data: of the file.
+        path: of the file, for the message.
+
+    Raises:
+        BadInput: it is not UTF-8.
+    """
     try:
-        return read_bytes(path, what, budget).decode("utf-8-sig").replace("\r\n", "\n")
+        return data.decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
         raise BadInput(f"{path} is not text in UTF-8 (byte {error.start + 1}); save it as "
                        "UTF-8") from None

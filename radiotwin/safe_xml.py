@@ -26,7 +26,7 @@ def parse_elements(path: Path, start: Callable[[str, dict[str, str], int], None]
         start: Called as `start(tag, attributes, line)` where an element begins.
         end: Called as `end(tag)` where it ends.
         budget: Of the file's bytes.
-        text: Called with the text between tags, piece by piece.
+        text: Called with each piece of text between tags; None: texts are not read.
 
     Returns:
         Bytes read.

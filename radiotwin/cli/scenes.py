@@ -31,9 +31,10 @@ def add_commands(app: typer.Typer) -> None:
 
 def build_scene(
     source: Annotated[str, typer.Argument(
-        metavar="CITY", help="A map (.osm, .osm.pbf, .geojson, .gpkg), a Mitsuba or Sionna RT XML "
-                             "file, sionna:NAME (munich, etoile, …), or preset:NAME (rbm, rdm, "
-                             "small).")],
+        metavar="CITY", help="A map (.osm, .osm.pbf, .geojson, .gpkg, .shp, or a .zip of it), a 3D "
+                             "city model (.city.json, .gml), a Mitsuba or Sionna RT XML file, a "
+                             "model (.obj, .glb, .gltf, .stl, .ply), sionna:NAME (munich, etoile, "
+                             "…), or preset:NAME (rbm, rdm, small).")],
     out: Annotated[Path | None, typer.Option(
         "--out", "-o", help="Scene folder to write [scenes/NAME].")] = None,
     check: Annotated[bool, typer.Option(
@@ -42,17 +43,23 @@ def build_scene(
         help="Frequency of the scene's radio [2.4e9].")] = None,
     material: Annotated[list[str] | None, typer.Option(
         metavar="NAME=ITU", help="Use an ITU material for the file's material NAME; of a map, for "
-                                 "the value NAME of building:material, or default, or ground. May "
-                                 "be repeated.")] = None,
+                                 "the value NAME of building:material, or default, ground or roof. "
+                                 "May be repeated.")] = None,
     scale: Annotated[float | None, typer.Option(
         help="Factor from the file's unit to metres (feet: 0.3048).")] = None,
     up: Annotated[str | None, typer.Option(
-        help="Axis of the file that points up: x, y or z.")] = None,
+        help="Axis of the file that points up: x, y or z [z; of glTF y].")] = None,
     bbox: Annotated[str | None, typer.Option(
         metavar="A,B,C,D", help="Keep only this part: XMIN,YMIN,XMAX,YMAX [m]; of a map S,W,N,E "
                                 "[degrees].")] = None,
     height_default: Annotated[float | None, typer.Option(
         metavar="M", help="Height of buildings without one in a map [10].")] = None,
+    height_column: Annotated[str | None, typer.Option(
+        metavar="NAME[:UNIT]", help="Column of a map with the buildings' heights above ground; "
+                                    "UNIT is m [default], ft, cm or storeys.")] = None,
+    ground_column: Annotated[str | None, typer.Option(
+        metavar="NAME", help="Column with the elevation of the ground, where that of "
+                             "--height-column is an elevation, too.")] = None,
     material_table: Annotated[Path | None, typer.Option(
         metavar="FILE.toml", help="Materials of a map's tags, where they differ from the standard "
                                   "table.")] = None,
@@ -87,7 +94,8 @@ def build_scene(
     report = build(source, out, frequency_hz=frequency_hz, materials=_pairs(material or []),
                    bbox=_bounds(bbox), devices=devices, uavs=uavs, seed=seed,
                    origin=parse_origin(origin), scale=scale, up=up,
-                   default_height_m=height_default, material_table=material_table,
+                   default_height_m=height_default, height_column=height_column,
+                   ground_column=ground_column, material_table=material_table,
                    overpass=overpass, step_m=step,
                    altitudes_m=None if altitudes is None else
                    parse_numbers("--altitudes", altitudes),

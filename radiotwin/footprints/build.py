@@ -10,16 +10,26 @@ import shapely
 from radiotwin.budgets import FEATURES, SHAPES
 from radiotwin.errors import BadInput
 from radiotwin.footprints.building_table import building_table, height_counts
-from radiotwin.footprints.extrude import make_blocks
-from radiotwin.footprints.features import Feature, MapFile, problems_of
+from radiotwin.footprints.citygml import read_citygml
+from radiotwin.footprints.cityjson import read_cityjson
+from radiotwin.footprints.extrude import make_blocks, split_roof
+from radiotwin.footprints.features import (
+    Feature,
+    MapFile,
+    left_out_problems,
+    problems_of,
+)
 from radiotwin.footprints.geopackage import read_geopackage
 from radiotwin.footprints.gis_files import read_geojson
-from radiotwin.footprints.heights import LEVEL_M
+from radiotwin.footprints.height_columns import HeightColumn, check_declared, no_height_text
+from radiotwin.footprints.heights import source_text as height_text
 from radiotwin.footprints.material_table import STANDARD, MaterialTable
 from radiotwin.footprints.osm import assemble
 from radiotwin.footprints.osm_pbf import read_osm_pbf
 from radiotwin.footprints.osm_xml import read_osm_xml
 from radiotwin.footprints.outlines import OutlineBudget
+from radiotwin.footprints.shapefiles import read_shapefile
+from radiotwin.footprints.shells import elevation_fact, make_shell_prisms
 from radiotwin.footprints.solids import (
     Contacts,
     Prism,
@@ -43,15 +53,19 @@ from radiotwin.scene.surfaces import Surfaces
 from radiotwin.scene.vegetation import VegetationConfig
 from radiotwin.tables import Origin
 
+OSM_SUFFIXES = (".osm", ".osm.pbf")
 READERS: dict[str, Callable[[Path], MapFile]] = {
     ".osm": lambda path: assemble(read_osm_xml(path)),
     ".osm.pbf": lambda path: assemble(read_osm_pbf(path)),
-    ".geojson": read_geojson, ".gpkg": read_geopackage}
+    ".geojson": read_geojson, ".gpkg": read_geopackage,
+    ".shp": read_shapefile, ".zip": read_shapefile,
+    ".city.json": read_cityjson, ".city.json.gz": read_cityjson, ".json": read_cityjson,
+    ".cityjson": read_cityjson, ".jsonl": read_cityjson, ".gml": read_citygml,
+    ".citygml": read_citygml}
 GROUND_MARGIN_M = 100.0  # [m], of the ground plane beyond buildings and extent
 MAX_WIDTH_M = 50e3  # [m], chosen so that a plane and single precision are good enough
 ORIGIN_DECIMALS = 6  # of latitude and longitude [degrees]: a decimetre
-HEIGHT_SOURCES = {"height": "height tag", "building:levels": f"building:levels × {LEVEL_M:g} m",
-                  "default": "default"}
+DEFAULT_HEIGHT_M = 10.0  # [m], about three storeys
 Bounds = tuple[float, float, float, float]
 
 
@@ -62,18 +76,26 @@ class MapOptions:
     Attributes:
         bbox_deg: (south, west, north, east) [degrees]: only buildings that reach into it are kept,
             and it becomes the extent; None: all of the file.
-        default_height_m: height of buildings whose tags give none [m].
+        default_height_m: height of buildings whose tags give none [m]; None: 10 m, with a warning,
+            and an error where a table has columns of numbers and none of them is known.
+        height_column: column that goes before all known ones; None: the known ones.
         materials: by tag.
     """
 
     bbox_deg: Bounds | None = None
-    default_height_m: float = 10.0
+    default_height_m: float | None = None
     materials: MaterialTable = STANDARD
+    height_column: HeightColumn | None = None
+
+    @property
+    def height_m(self) -> float:
+        """Height of buildings whose tags give none [m]."""
+        return DEFAULT_HEIGHT_M if self.default_height_m is None else self.default_height_m
 
     def check(self) -> None:
         """Raise BadInput for an impossible value."""
-        if not 0 < self.default_height_m <= 1000:
-            raise BadInput(f"a default height of {self.default_height_m:g} m is not possible; give "
+        if not 0 < self.height_m <= 1000:
+            raise BadInput(f"a default height of {self.height_m:g} m is not possible; give "
                            "more than 0 and at most 1000 m")
         if self.bbox_deg is not None:
             south, west, north, east = self.bbox_deg
@@ -135,9 +157,17 @@ def build_scene_from_map(
     SHAPES.check(len(features), path)
     origin = options.origin or _origin(features, map_options.bbox_deg)
     _check_sizes(features, origin, path)
-    prisms, problems = make_prisms(features, origin, map_options.materials,
-                                   map_options.default_height_m)
-    problems = found.problems + problems
+    if map_options.height_column is not None:
+        check_declared(map_options.height_column, [one.tags for one in features], path)
+    flat, shells = ([one for one in features if (one.shell is not None) == has_shell]
+                    for has_shell in (False, True))
+    prisms, problems = make_prisms(flat, origin, map_options.materials, map_options.height_m,
+                                   map_options.height_column)
+    bodies, found_in_bodies = make_shell_prisms(shells, origin, map_options.materials)
+    prisms += bodies
+    problems += found_in_bodies
+    problems = (found.problems + left_out_problems(found.left_out, map_options.bbox_deg)
+                + problems + _without_height(prisms, features, map_options, path))
     if not prisms:
         raise BadInput("\n".join([f"{path}: none of its {len(features)} buildings can be used:",
                                   *(problem.message for problem in problems)]))
@@ -154,19 +184,23 @@ def build_scene_from_map(
     city.problems.extend(unusable)
     declared = Declared(str(source), map_name(source), extent, origin,
                         _provenance(str(source), counts, map_options, options),
-                        _facts(table["building"].nunique(), len(city.names) - 1, counts, origin,
-                               map_options, vegetation), vegetation)
+                        _facts(table["building"].nunique(), len(set(shape_of.values())), counts,
+                               origin, map_options, vegetation, shells), vegetation)
     return finish_scene(city, declared, out_folder, options, check_only, table)
 
 
 def _facts(
     buildings: int, blocks: int, counts: dict[str, int], origin: Origin, map_options: MapOptions,
-    vegetation: list[VegetationConfig],
+    vegetation: list[VegetationConfig], shells: list[Feature],
 ) -> tuple[tuple[str, str], ...]:
     """Return lines for the report."""
-    heights = ", ".join(f"{text}: {counts.get(key, 0):,}" for key, text in HEIGHT_SOURCES.items())
+    heights = ", ".join(
+        [f"{height_text(key, map_options.height_column)}: {number:,}"
+         for key, number in counts.items() if key != "default"]
+        + [f"default: {counts.get('default', 0):,}"])
     return (("buildings", f"{buildings:,} in {blocks:,} blocks"),
-            ("heights from", f"{heights} ({map_options.default_height_m:g} m)"),
+            ("heights from", f"{heights} ({map_options.height_m:g} m)"),
+            *([("elevations", elevation_fact(shells))] if shells else []),
             *([("vegetation", vegetation_fact(vegetation))] if vegetation else []),
             ("origin", f"latitude {origin.latitude_deg}, longitude {origin.longitude_deg}"))
 
@@ -176,18 +210,38 @@ def _provenance(
 ) -> dict[str, str]:
     """Return `[provenance]` of `scene.toml`."""
     known = {"source": source_text(source), "seed": str(options.seed),
-             "height_default_m": f"{map_options.default_height_m:g}",
+             "height_default_m": f"{map_options.height_m:g}",
              "heights_from": ", ".join(f"{key} {number}" for key, number in counts.items())}
     if map_options.bbox_deg is not None:
         known["bbox_deg"] = ", ".join(map(repr, map_options.bbox_deg))
     return known
 
 
+def _without_height(prisms: list[Prism], features: list[Feature], map_options: MapOptions,
+                    path: Path) -> list[Problem]:
+    """Return a warning if the default height was taken though nobody declared one.
+
+    Raises:
+        BadInput: it was taken for every building of a table that has other columns of numbers.
+    """
+    buildings = {prism.name for prism in prisms}
+    guessed = {prism.name for prism in prisms if prism.height.source == "default"}
+    if not guessed or map_options.default_height_m is not None:
+        return []
+    text = no_height_text([feature.tags for feature in features])
+    if guessed == buildings and text and map_suffix(path) not in OSM_SUFFIXES:
+        raise BadInput(f"{path}: {text}")
+    return problems_of(
+        sorted(guessed), f"of {len(buildings):,} building(s) have no height in the map: "
+        f"{map_options.height_m:g} m was taken for them. Give the height of such buildings with "
+        "--height-default M, or name a column with --height-column")
+
+
 def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> list[Feature]:
     """Return the features that reach into the box."""
     if not features:
         raise BadInput(f"{path} holds no buildings (closed ways or multipolygons with the tag "
-                       "building or building:part; in GeoJSON and GeoPackage polygons)")
+                       "building or building:part; of a table polygons)")
     bounds_deg = np.array([feature.area.bounds for feature in features])  # NaN of an empty area
     for feature, bounds in zip(features, bounds_deg):
         if (np.abs(bounds) > (180, 90, 180, 90)).any():
@@ -209,10 +263,13 @@ def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> lis
     if not kept:
         west_, south_ = np.nanmin(bounds_deg[:, :2], axis=0)
         east_, north_ = np.nanmax(bounds_deg[:, 2:], axis=0)
+        swapped = ((bounds_deg[:, 1] <= east) & (bounds_deg[:, 3] >= west)
+                   & (bounds_deg[:, 0] <= north) & (bounds_deg[:, 2] >= south)).any()
+        hint = "; latitude and longitude seem to be swapped in the file" if swapped else ""
         raise BadInput(f"{path}: no building reaches into the bbox "
                        f"{south:g},{west:g},{north:g},{east:g}; the file's lie in "
                        f"{south_:.5f},{west_:.5f},{north_:.5f},{east_:.5f} "
-                       "(south,west,north,east)")
+                       f"(south,west,north,east){hint}")
     return kept
 
 
@@ -293,9 +350,14 @@ def _city(
     for block in make_blocks(prisms, contacts):
         name = unique_name(safe_name(prisms[block.members[0]].name), taken)
         shape_of |= dict.fromkeys(block.members, name)
+        walls, roof = split_roof(block.mesh) if table.roof else (block.mesh, None)
         names.append(name)
         materials.append(block.material)
-        meshes.append((np.asarray(block.mesh.vertices), np.asarray(block.mesh.faces)))
+        meshes.append((np.asarray(walls.vertices), np.asarray(walls.faces)))
+        if roof is not None:
+            names.append(unique_name(f"{name}_roof", taken))
+            materials.append(itu_material(table.roof or ""))
+            meshes.append((np.asarray(roof.vertices), np.asarray(roof.faces)))
     surfaces = Surfaces(meshes)
     is_ground = surfaces.shape == 0
     city = ImportedCity(names, materials, surfaces, is_ground, problems)

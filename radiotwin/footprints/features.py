@@ -3,11 +3,28 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 from shapely.geometry.base import BaseGeometry
 
 from radiotwin.scene.problems import Problem, Severity, listed
 
 BUILDING_KEYS = ("building", "building:part")  # tags of OpenStreetMap
+
+
+@dataclass(frozen=True, eq=False)
+class Shell:
+    """Surfaces of a building in three dimensions.
+
+    Attributes:
+        points: (n, 3) longitude, latitude [degrees] and elevation [m].
+        polygons: rings of each surface, the outer one first: indices of points, the first not
+            again at the end.
+        ground_m: elevation of the ground beside the building: that of its lowest point [m].
+    """
+
+    points: np.ndarray
+    polygons: Sequence[Sequence[np.ndarray]]
+    ground_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,17 +35,34 @@ class Feature:
         name: as in the file: `way/17`, `relation/3`, `feature 4`.
         tags: as in OpenStreetMap: `building`, `building:part`, `height`, `building:levels`, ….
         area: polygons, or the line of a row of trees, in longitude and latitude [degrees]; as in
-            the file, so possibly invalid.
+            the file, so possibly invalid. Of a feature with a shell, the hull of its points.
+        shell: its surfaces; None: the area is to be extruded.
     """
 
     name: str
     tags: Mapping[str, str]
     area: BaseGeometry
+    shell: Shell | None = None
 
     @property
     def is_part(self) -> bool:
         """Whether it is part of a building and not a building itself."""
         return _is_set(self.tags, "building:part") and not _is_set(self.tags, "building")
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Something of a map file that could not be used.
+
+    Attributes:
+        name: as in the file.
+        reason: what it is and why, as `problems_of` continues a number with.
+        place: where it lies, longitude and latitude [degrees]; None: unknown.
+    """
+
+    name: str
+    reason: str
+    place: BaseGeometry | None
 
 
 @dataclass
@@ -38,10 +72,12 @@ class MapFile:
     Attributes:
         features: buildings and parts, in the file's order.
         vegetation: areas, and lines of trees, see `radiotwin.footprints.vegetation`.
-        problems: parts of the file that could not be used, and why.
+        left_out: parts of the file that could not be used.
+        problems: findings about the whole file.
     """
 
     features: list[Feature]
+    left_out: list[LeftOut] = field(default_factory=list)
     problems: list[Problem] = field(default_factory=list)
     vegetation: list[Feature] = field(default_factory=list)
 
@@ -49,6 +85,29 @@ class MapFile:
 def problems_of(names: Sequence[str], text: str, severity: Severity = "warning") -> list[Problem]:
     """Return one problem about several features, with their number and first names; none: empty."""
     return [Problem(severity, "", f"{len(names)} {text} ({listed(names)})")] if names else []
+
+
+def left_out_problems(left_out: Sequence[LeftOut],
+                      bbox_deg: tuple[float, float, float, float] | None) -> list[Problem]:
+    """Return one problem about all that was left out for the same reason.
+
+    Args:
+        left_out: in the file's order.
+        bbox_deg: (south, west, north, east) [degrees]: only what reaches into it is named; None:
+            all.
+    """
+    by_reason: dict[str, list[str]] = {}
+    for one in left_out:
+        if bbox_deg is not None:
+            south, west, north, east = bbox_deg
+            if one.place is None or one.place.is_empty:
+                continue
+            x0, y0, x1, y1 = one.place.bounds
+            if not (x0 <= east and x1 >= west and y0 <= north and y1 >= south):
+                continue
+        by_reason.setdefault(one.reason, []).append(one.name)
+    return [problem for reason, names in by_reason.items()
+            for problem in problems_of(names, reason)]
 
 
 def is_building(tags: Mapping[str, str]) -> bool:

@@ -57,7 +57,7 @@ def read_geopackage(path: Path) -> MapFile:
                 rows = _rows(path, database, layer, geometry)
                 part = map_file(path, rows, _system(database, srs))
                 found.features += part.features
-                found.problems += part.problems
+                found.left_out += part.left_out
     except (sqlite3.Error, shapely.errors.GEOSException, OverflowError) as error:
         raise _unreadable(path, error) from None
     return found

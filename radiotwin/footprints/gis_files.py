@@ -18,22 +18,16 @@ from radiotwin.errors import BadInput
 from radiotwin.footprints.features import (
     BUILDING_KEYS,
     Feature,
+    LeftOut,
     MapFile,
     is_building,
-    problems_of,
 )
+from radiotwin.footprints.height_columns import ALIASES
+from radiotwin.footprints.systems import WGS84, degrees_from, find_system
 from radiotwin.inputs import parse_json, read_text
 
-WGS84 = ("EPSG:4326", "OGC:CRS84", "urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:EPSG::4326")
-_ALIASES = {key.replace(":", "_"): key for key in (
-    "building:part", "building:levels", "building:min_level", "building:material")}
 _OTHER_TAG = re.compile(r'[\s,]*+"((?:[^"\\]|\\.)*+)"\s*+=>\s*+"((?:[^"\\]|\\.)*+)"', re.DOTALL)
 _NAME_LENGTH = 200  # characters of an id that are kept
-# Names of systems that name no file: an authority and its code, or a title of the database. In
-# PROJ's own language, or in WKT with grids, a name can open any file.
-_CODE = re.compile(r"(?:urn:ogc:def:crs:)?([A-Za-z]+):(?:[\d.]*:)?(\w+)")
-_TITLE = re.compile(r"[\w .,()/'-]+")
-_FILES_IN_WKT = ("PARAMETERFILE", "EXTENSION", "NADGRIDS", "+INIT")
 
 
 def read_geojson(path: Path) -> MapFile:
@@ -68,11 +62,11 @@ def read_geojson(path: Path) -> MapFile:
 
 
 def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None:
-    """Return the polygons of a GeoJSON geometry; None if it is of another type."""
+    """Return the polygons of a GeoJSON geometry, or the points of another type; None: none."""
     kind = geometry.get("type")
     coordinates: Any = geometry.get("coordinates")  # unchecked: no list raises TypeError below
     if kind not in ("Polygon", "MultiPolygon"):
-        return None
+        return _points(coordinates)
     try:
         polygons = [[np.array([point[:2] for point in ring], dtype=float) for ring in polygon]
                     for polygon in ([coordinates] if kind == "Polygon" else coordinates)]
@@ -85,6 +79,24 @@ def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None
     except (TypeError, ValueError, LookupError, OverflowError):
         raise BadInput(f"{path}: feature {number} has coordinates that are not rings of finite "
                        "numbers; export the map again") from None
+
+
+def _points(coordinates: Any) -> BaseGeometry | None:
+    """Return all positions of a geometry that is no area, for where it lies."""
+    points, waiting = [], [coordinates]
+    while waiting:
+        part = waiting.pop()
+        if not isinstance(part, list):
+            return None
+        if len(part) > 1 and all(isinstance(value, int | float) for value in part[:2]):
+            points.append(part[:2])
+        else:
+            waiting += part
+    try:
+        known = np.array(points, dtype=float).reshape(-1, 2)
+    except OverflowError:
+        return None
+    return shapely.MultiPoint(known) if np.isfinite(known).all() else None
 
 
 def _crs_name(path: Path, data: Mapping) -> str:
@@ -118,12 +130,12 @@ def map_file(
         if marked and not is_building(tags):
             continue
         if area is None or area.geom_type not in ("Polygon", "MultiPolygon", "GeometryCollection"):
-            unusable.append(name)
+            unusable.append(Feature(name, {}, shapely.Point() if area is None else area))
             continue
         features.append(Feature(name, tags if marked else tags | {"building": "yes"}, area))
-    problems = problems_of(
-        unusable, "building(s) are points or lines, without an area: left out")
-    return MapFile(_to_degrees(path, features, crs), problems)
+    return MapFile(_to_degrees(path, features, crs), [
+        LeftOut(one.name, "building(s) are points or lines, without an area: left out", one.area)
+        for one in _to_degrees(path, unusable, crs)])
 
 
 def _tags(properties: Mapping) -> dict[str, str]:
@@ -138,12 +150,8 @@ def _tags(properties: Mapping) -> dict[str, str]:
             tags |= _other_tags(str(value))
         else:
             is_float = isinstance(value, float | np.floating)
-            tags[_ALIASES.get(key, key)] = f"{value:g}" if is_float else str(value)
+            tags[ALIASES.get(key, key)] = f"{value:g}" if is_float else str(value)
     return tags
-
-
-def _is_harmless_wkt(text: str) -> bool:
-    return "[" in text and not any(word in text.upper() for word in _FILES_IN_WKT)
 
 
 def _other_tags(text: str) -> dict[str, str]:
@@ -158,27 +166,9 @@ def _other_tags(text: str) -> dict[str, str]:
 def _to_degrees(path: Path, features: list[Feature], crs: str | None) -> list[Feature]:
     if not features or crs in WGS84:
         return features
-    from pyproj import CRS, Transformer
-    from pyproj.exceptions import CRSError
-
     if crs is None:
         raise BadInput(f"{path} has no coordinate reference system; assign one (in QGIS: Layer "
                        "CRS) and export it again")
-    try:
-        if code := _CODE.fullmatch(crs):
-            system = CRS.from_authority(code[1].upper(), code[2])
-        elif _TITLE.fullmatch(crs) or _is_harmless_wkt(crs):
-            system = CRS.from_user_input(crs)
-        else:
-            raise CRSError("it is neither AUTHORITY:CODE, nor a title, nor WKT without grids")
-        transformer = Transformer.from_crs(system, "EPSG:4326", always_xy=True)
-    except CRSError as error:
-        raise BadInput(f"{path}: its coordinate reference system {crs[:60]!r} is unknown "
-                       f"({error}); "
-                       "export it in EPSG:4326") from None
-
-    def project(points: np.ndarray) -> np.ndarray:
-        return np.column_stack(transformer.transform(*points.T))
-
+    project = degrees_from(path, find_system(path, crs))
     return [Feature(feature.name, feature.tags, shapely.transform(feature.area, project))
             for feature in features]

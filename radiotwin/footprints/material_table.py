@@ -9,6 +9,7 @@ from radiotwin.inputs import read_toml
 from radiotwin.scene.materials import Material, itu_material
 
 KEY = "building:material"
+_OWN = ("default", "ground", "roof")
 
 
 @dataclass(frozen=True)
@@ -19,11 +20,13 @@ class MaterialTable:
         default: material of buildings without a tag of the table.
         ground: material of the ground plane.
         by_tag: key -> value -> material; keys are looked up in this order.
+        roof: material of roofs; None: that of their buildings.
     """
 
     default: str
     ground: str
     by_tag: Mapping[str, Mapping[str, str]]
+    roof: str | None = None
 
     def material_of(self, tags: Mapping[str, str]) -> tuple[Material, str]:
         """Return the material of a building and its source.
@@ -74,8 +77,8 @@ def read_material_table(path: Path | str) -> MaterialTable:
     """Read a TOML file that changes the standard table.
 
     Args:
-        path: file with `default`, `ground`, and tables named after keys of tags, which are looked
-            up in the order of the file, before the other keys of the standard table.
+        path: file with `default`, `ground`, `roof`, and tables named after keys of tags, which are
+            looked up in the order of the file, before the other keys of the standard table.
 
     Returns:
         The changed table.
@@ -85,7 +88,8 @@ def read_material_table(path: Path | str) -> MaterialTable:
     """
     path = Path(path)
     data = read_toml(path, "TOML file with materials by tag")
-    own = {name: data.pop(name) for name in ("default", "ground") if name in data}
+    own = {name: data.pop(name) for name in _OWN
+           if name in data and not (name == "roof" and isinstance(data[name], dict))}  # a tag
     named: list[tuple[str, object]] = list(own.items())
     for key, values in data.items():
         if not isinstance(values, dict):
@@ -112,14 +116,14 @@ def with_pairs(table: MaterialTable, pairs: Mapping[str, str]) -> MaterialTable:
 
     Args:
         table: to change.
-        pairs: value of `building:material`, or `default` or `ground` -> ITU material.
+        pairs: value of `building:material`, or `default`, `ground` or `roof` -> ITU material.
 
     Raises:
         BadInput: a material is not in ITU-R P.2040.
     """
     for name in pairs.values():
         itu_material(name)
-    own = {name: itu for name, itu in pairs.items() if name in ("default", "ground")}
+    own = {name: itu for name, itu in pairs.items() if name in _OWN}
     values = {name.lower(): itu for name, itu in pairs.items() if name not in own}
     return replace(table, **own,
                    by_tag=dict(table.by_tag) | {KEY: dict(table.by_tag[KEY]) | values})

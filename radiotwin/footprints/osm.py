@@ -9,6 +9,7 @@ A closed way is an area, and so is a relation of type multipolygon whose ways fo
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 from typing import Literal
 
 import shapely
@@ -16,10 +17,15 @@ from shapely.geometry.base import BaseGeometry
 
 from radiotwin.budgets import OUTLINE_CORNERS
 from radiotwin.errors import BadInput
-from radiotwin.footprints.features import Feature, MapFile, is_building, problems_of
+from radiotwin.footprints.features import Feature, LeftOut, MapFile, is_building
 from radiotwin.footprints.outlines import OutlineBudget
 from radiotwin.footprints.vegetation import kind_of
 
+INCOMPLETE = ("building(s) lack nodes or ways, as where an extract was cut off: left out; take a "
+              "larger extract")
+UNCLOSED = "building(s) have an outline that is not closed: left out"
+NO_VEGETATION = "area(s) of vegetation are incomplete, not closed or too intricate: left out"
+_PLACE_NODES = 1000  # that say where something lies: many relations may name one long way
 MIN_RING_NODES = 4  # a triangle, with the first node again at the end
 
 
@@ -74,8 +80,7 @@ def assemble(elements: OsmElements) -> MapFile:
         The areas, ways first; incomplete or open outlines are left out and reported.
     """
     budget = OutlineBudget("the map")
-    incomplete: list[str] = []
-    unclosed: list[str] = []
+    left_out: list[LeftOut] = []
     relations: list[Feature] = []
     used: set[int] = set()
     for number, relation in elements.relations.items():
@@ -84,7 +89,8 @@ def assemble(elements: OsmElements) -> MapFile:
             continue
         area = _relation_area(f"relation/{number}", relation, elements, budget)
         if isinstance(area, str):
-            (incomplete if area == "incomplete" else unclosed).append(f"relation/{number}")
+            left_out.append(LeftOut(f"relation/{number}", INCOMPLETE if area == "incomplete"
+                                    else UNCLOSED, _place(relation, elements)))
             continue
         used.update(way for way, role in relation.members if role != "inner")
         relations.append(Feature(f"relation/{number}", tags, area))
@@ -93,25 +99,30 @@ def assemble(elements: OsmElements) -> MapFile:
         if number in used or not is_building(way.tags):
             continue
         if any(node not in elements.positions for node in way.nodes):
-            incomplete.append(f"way/{number}")
+            left_out.append(LeftOut(f"way/{number}", INCOMPLETE, _place(way, elements)))
         elif len(way.nodes) < MIN_RING_NODES or way.nodes[0] != way.nodes[-1]:
-            unclosed.append(f"way/{number}")
+            left_out.append(LeftOut(f"way/{number}", UNCLOSED, _place(way, elements)))
         else:
             OUTLINE_CORNERS.check(len(way.nodes), f"way/{number}")
             ways.append(Feature(f"way/{number}", way.tags, _polygon(way.nodes, elements)))
-    problems = problems_of(incomplete, "building(s) lack nodes or ways, as where an extract was "
-                                       "cut off: left out; take a larger extract")
-    problems += problems_of(unclosed, "building(s) have an outline that is not closed: left out")
+    left_out.sort(key=lambda one: one.reason != INCOMPLETE)
     vegetation, unusable = _vegetation(elements)
-    problems += problems_of(unusable, "area(s) of vegetation are incomplete, not closed or too "
-                                      "intricate: left out")
-    return MapFile(ways + relations, problems, vegetation)
+    return MapFile(ways + relations, left_out + unusable, vegetation=vegetation)
 
 
-def _vegetation(elements: OsmElements) -> tuple[list[Feature], list[str]]:
-    """Return areas of vegetation and rows of trees, and the names of those that are unusable."""
+def _place(element: Way | Relation, elements: OsmElements) -> BaseGeometry:
+    """Return the first points that are known of a way, or of the ways of a relation."""
+    ways = [element] if isinstance(element, Way) else [
+        elements.ways[number] for number, _ in element.members if number in elements.ways]
+    nodes = islice((node for way in ways for node in way.nodes), _PLACE_NODES)
+    return shapely.MultiPoint([elements.positions[node] for node in nodes
+                               if node in elements.positions])
+
+
+def _vegetation(elements: OsmElements) -> tuple[list[Feature], list[LeftOut]]:
+    """Return areas of vegetation and rows of trees, and those that are unusable."""
     found: list[Feature] = []
-    unusable: list[str] = []
+    unusable: list[LeftOut] = []
     budget = OutlineBudget("the map")
     ways: list[tuple[str, Way | Relation]] = [
         (f"way/{number}", way) for number, way in elements.ways.items()]
@@ -128,7 +139,7 @@ def _vegetation(elements: OsmElements) -> tuple[list[Feature], list[str]]:
         except BadInput:  # a wood may have more corners than any building
             area = "incomplete"
         if isinstance(area, str):
-            unusable.append(name)
+            unusable.append(LeftOut(name, NO_VEGETATION, _place(element, elements)))
         else:
             found.append(Feature(name, element.tags, area))
     return found, unusable

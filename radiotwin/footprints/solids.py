@@ -6,10 +6,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 import shapely
+from manifold3d import Manifold
 from shapely.geometry.base import BaseGeometry
 
 from radiotwin.budgets import OVERLAPS, PART_PAIRS, TOUCHING_CORNERS
 from radiotwin.footprints.features import Feature, problems_of
+from radiotwin.footprints.height_columns import KNOWN, HeightColumn
 from radiotwin.footprints.heights import Height, height_of
 from radiotwin.footprints.material_table import MaterialTable
 from radiotwin.geodesy import to_local
@@ -29,22 +31,37 @@ Area = tuple[Feature, shapely.MultiPolygon]
 
 
 @dataclass(frozen=True, eq=False)
+class Body:
+    """Surfaces of a building that its file has in three dimensions, in the local frame [m].
+
+    Attributes:
+        solid: where they are closed, else None.
+        mesh: (v, 3) corners and (f, 3) faces where they are not, else None.
+    """
+
+    solid: Manifold | None
+    mesh: tuple[np.ndarray, np.ndarray] | None
+
+
+@dataclass(frozen=True, eq=False)
 class Prism:
-    """A solid with vertical walls and a flat roof.
+    """A solid with vertical walls and a flat roof, or with a body of its own.
 
     Attributes:
         name: of the feature; several prisms may share one.
-        area: one valid polygon in the local frame [m].
+        area: one valid polygon in the local frame, or of a body what it covers [m].
         height: bottom and top, and their source.
         material: of its surfaces.
         material_from: the tag that the material follows from, or `default`.
+        body: its surfaces; None: walls and a roof over its area.
     """
 
     name: str
-    area: shapely.Polygon
+    area: shapely.Polygon | shapely.MultiPolygon
     height: Height
     material: Material
     material_from: str
+    body: Body | None = None
 
     def overlaps_in_height(self, other: "Prism") -> bool:
         """Return whether both share some height."""
@@ -53,7 +70,8 @@ class Prism:
 
 
 def make_prisms(
-    features: Sequence[Feature], origin: Origin, table: MaterialTable, default_height_m: float
+    features: Sequence[Feature], origin: Origin, table: MaterialTable, default_height_m: float,
+    height_column: HeightColumn | None = None
 ) -> tuple[list[Prism], list[Problem]]:
     """Make prisms from buildings and their parts.
 
@@ -62,6 +80,7 @@ def make_prisms(
         origin: of the local frame.
         table: materials by tag.
         default_height_m: of a building whose tags give no height [m].
+        height_column: column that goes before all known ones.
 
     Returns:
         The prisms, parts first, and the defects that were found.
@@ -72,7 +91,7 @@ def make_prisms(
     parts = [(feature, area) for feature, area in areas if feature.is_part]
     prisms = []
     for feature, area in _resolve_parts(wholes, parts, defects):
-        height = height_of(feature.tags, default_height_m)
+        height = height_of(feature.tags, default_height_m, height_column)
         if height.unusable:
             defects.add("height", f"{feature.name}: {', '.join(height.unusable)}")
         if height.bottom_m >= height.top_m:
@@ -193,8 +212,10 @@ def _inherit(part: Feature, whole: Feature) -> Feature:
     """Return a part with the tags of its building that it lacks, except the bottom."""
     tags = {key: value for key, value in whole.tags.items()
             if key not in ("min_height", "building:min_level")}
-    if "building:levels" in part.tags and "height" not in part.tags:
-        tags.pop("height", None)  # which would take precedence over the part's own levels
+    known = [column.name for column in KNOWN]
+    own = next((row for row, name in enumerate(known) if name in part.tags), 0)
+    for name in known[:own]:  # which would take precedence over what the part itself has
+        tags.pop(name, None)
     return replace(part, tags=tags | dict(part.tags))
 
 

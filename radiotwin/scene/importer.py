@@ -1,7 +1,7 @@
 """Import a city model: clean meshes in the scene's frame, and all problems found on the way."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,11 @@ from scipy.sparse.csgraph import connected_components
 from radiotwin.errors import BadInput
 from radiotwin.progress import progress
 from radiotwin.scene import checks
-from radiotwin.scene.material_mapping import map_materials
+from radiotwin.scene.material_mapping import map_materials, materials_by_name
 from radiotwin.scene.materials import Material
-from radiotwin.scene.meshes import MeshBudget, clean, load_shape
-from radiotwin.scene.mitsuba_xml import DeclaredShape, read_mitsuba_xml
+from radiotwin.scene.meshes import MeshBudget, RawMesh, clean, load_shape
+from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
+from radiotwin.scene.models import UP_AXES, read_model
 from radiotwin.scene.names import RESERVED_NAMES, Names, safe_name, unique_name
 from radiotwin.scene.problems import Problem, error, fixed, listed, warning
 from radiotwin.scene.surfaces import FLAT_M, Surfaces
@@ -54,10 +55,11 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
     """Read and clean a city.
 
     Args:
-        path: Mitsuba or Sionna RT XML file.
+        path: Mitsuba or Sionna RT XML file, or a model with a suffix of `UP_AXES`.
         overrides: Name of a material in the file -> ITU material to use for it.
         scale: Factor to metres; None: 1, with a warning if the city seems to be in another unit.
-        up: Axis that points up; None: z, with an error if another one seems to.
+        up: Axis that points up; None: z, with an error if another one seems to; that of `UP_AXES`
+            for models.
         bbox: (x_min, y_min, x_max, y_max) after `scale` and `up` [m]: only shapes that reach into
             it are kept.
 
@@ -65,24 +67,24 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
         The city, with the problems found.
 
     Raises:
-        BadInput: The XML file cannot be read, an override matches nothing, or nothing lies within
+        BadInput: The file cannot be read, an override matches nothing, or nothing lies within
             `bbox`.
     """
-    declared = read_mitsuba_xml(path)
-    if not declared.shapes:
-        raise BadInput(f"{path} declares no shapes; give a scene file with <shape> elements")
-    materials, problems = map_materials(declared.shapes, declared.materials, overrides)
-    names, name_problems = _safe_names(declared.shapes)
-    meshes, mesh_problems = _load_meshes(
-        path, declared.shapes, names, scale or 1.0, up or "z")
-    problems += name_problems + mesh_problems
-    kept = [index for index, mesh in enumerate(meshes) if mesh is not None]
-    names, materials = [names[index] for index in kept], [materials[index] for index in kept]
+    source = _read_source(path, overrides)
+    up = up or UP_AXES.get(path.suffix.lower())
+    loaded = _load_meshes(path, source, scale or 1.0, up or "z", bbox)
+    materials, problems = source.materials_of(loaded.inside)
+    names, name_problems = _safe_names([source.names[index] for index in loaded.inside])
+    problems += name_problems + loaded.problems
+    kept = [row for row, index in enumerate(loaded.inside) if index in loaded.meshes]
+    meshes = [loaded.meshes[index] for index in loaded.inside if index in loaded.meshes]
+    names, materials = [names[row] for row in kept], [materials[row] for row in kept]
     if not kept:
+        if bbox is not None and loaded.bounds is not None:
+            raise _nothing_in(bbox, *loaded.bounds)
         problems.append(error(f"{path}: no shape could be read"))
         return ImportedCity([], [], None, np.zeros(0, dtype=bool), problems)
-    surfaces, sense_problems = _outward(
-        Surfaces([mesh for mesh in meshes if mesh is not None]), names)
+    surfaces, sense_problems = _outward(Surfaces(meshes), names)
     names, materials, surfaces, join_problems = _joined(names, materials, surfaces)
     ground = surfaces.ground_faces()
     problems += sense_problems + join_problems
@@ -98,11 +100,42 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
     return city
 
 
-def _safe_names(shapes: Sequence[DeclaredShape]) -> tuple[list[str], list[Problem]]:
+@dataclass(frozen=True, eq=False)
+class _Source:
+    """Shapes of a file, whatever its format.
+
+    Attributes:
+        names: As in the file.
+        load: Reads the shape of an index.
+        materials_of: Finds materials of the shapes of some indices, and problems with them.
+    """
+
+    names: Sequence[str]
+    load: Callable[[int], RawMesh]
+    materials_of: Callable[[Sequence[int]], tuple[list[Material | None], list[Problem]]]
+
+
+def _read_source(path: Path, overrides: Mapping[str, str]) -> _Source:
+    if path.suffix.lower() in UP_AXES:
+        parts = read_model(path)
+        materials_by_name([part.material for part in parts], overrides)
+        return _Source([part.name for part in parts], lambda index: parts[index].mesh,
+                       lambda chosen: materials_by_name(
+                           [parts[index].material for index in chosen], overrides, False))
+    declared = read_mitsuba_xml(path)
+    if not declared.shapes:
+        raise BadInput(f"{path} declares no shapes; give a scene file with <shape> elements")
+    map_materials(declared.shapes, declared.materials, overrides)
+    return _Source([shape.name.removeprefix("mesh-") for shape in declared.shapes],
+                   lambda index: load_shape(declared.shapes[index]),
+                   lambda chosen: map_materials([declared.shapes[index] for index in chosen],
+                                                declared.materials, overrides, False))
+
+
+def _safe_names(wanted_names: Sequence[str]) -> tuple[list[str], list[Problem]]:
     taken = Names(RESERVED_NAMES)
     names, changed, double = [], [], []
-    for shape in shapes:
-        wanted = shape.name.removeprefix("mesh-")
+    for wanted in wanted_names:
         safe = safe_name(wanted)
         name = unique_name(safe, taken)
         names.append(name)
@@ -121,32 +154,59 @@ def _safe_names(shapes: Sequence[DeclaredShape]) -> tuple[list[str], list[Proble
     return names, problems
 
 
-def _load_meshes(path: Path, shapes: Sequence[DeclaredShape], names: Sequence[str], scale: float,
-                 up: str) -> tuple[list[Mesh | None], list[Problem]]:
-    """Read (vertices, faces) of each shape, None where it has none."""
-    meshes: list[Mesh | None] = []
+@dataclass
+class _Loaded:
+    """What was read.
+
+    Attributes:
+        inside: Indices of the shapes that reach into the box, or whose place is not known.
+        meshes: Index -> vertices [m] and faces of each that has some.
+        bounds: (2,) lowest and highest x and y of all shapes [m]; None: nothing was read.
+        problems: With shapes inside.
+    """
+
+    inside: list[int] = field(default_factory=list)
+    meshes: dict[int, Mesh] = field(default_factory=dict)
+    bounds: tuple[np.ndarray, np.ndarray] | None = None
+    problems: list[Problem] = field(default_factory=list)
+
+
+def _load_meshes(path: Path, source: _Source, scale: float, up: str, bbox: Box | None) -> _Loaded:
+    """Read the shapes that reach into the box."""
+    loaded = _Loaded()
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
     budget = MeshBudget(path)
     unreadable, empty = [], []
     slivers: dict[str, int] = {}
     polygons: dict[str, int] = {}
-    with progress("reading meshes", total=len(shapes)) as advance:
-        for shape, name in zip(shapes, names):
+    with progress("reading meshes", total=len(source.names)) as advance:
+        for index, wanted in enumerate(source.names):
             advance(1)
+            name = safe_name(wanted)
             try:
-                raw = load_shape(shape)
+                raw = source.load(index)
             except BadInput as bad:
                 unreadable.append(error(str(bad), name))
-                meshes.append(None)
+                loaded.inside.append(index)
                 continue
             budget.add(raw)
-            vertices, faces, dropped = clean(checks.upright(raw.vertices * scale, up), raw.faces)
+            vertices = checks.upright(raw.vertices * scale, up)
+            if len(vertices):
+                lowest, highest = vertices[:, :2].min(axis=0), vertices[:, :2].max(axis=0)
+                low, high = np.minimum(low, lowest), np.maximum(high, highest)
+                loaded.bounds = low, high
+                if bbox is not None and ((lowest > bbox[2:]) | (highest < bbox[:2])).any():
+                    continue
+            loaded.inside.append(index)
+            vertices, faces, dropped = clean(vertices, raw.faces)
             if dropped:
                 slivers[name] = dropped
             if raw.polygons:
                 polygons[name] = raw.polygons
             if not len(faces):
                 empty.append(name)
-            meshes.append((vertices, faces) if len(faces) else None)
+            else:
+                loaded.meshes[index] = vertices, faces
     problems = unreadable[:_MAX_UNREADABLE]
     if len(unreadable) > _MAX_UNREADABLE:
         more = [problem.shape for problem in unreadable[_MAX_UNREADABLE:]]
@@ -162,7 +222,8 @@ def _load_meshes(path: Path, shapes: Sequence[DeclaredShape], names: Sequence[st
     if empty:
         problems.append(fixed(f"{len(empty)} shape(s) have an empty mesh and were left out "
                               f"({listed(empty)})"))
-    return meshes, problems
+    loaded.problems = problems
+    return loaded
 
 
 def _outward(surfaces: Surfaces, names: Sequence[str]) -> tuple[Surfaces, list[Problem]]:
@@ -227,14 +288,16 @@ def _cut(city: ImportedCity, surfaces: Surfaces, bbox: Box) -> ImportedCity:
     keep = np.where(city.ground, overlaps, np.asarray(reaches)[surfaces.shape])
     shapes = np.unique(surfaces.shape[keep])
     if len(shapes) == 0:
-        x_min, y_min, _ = surfaces.vertices.min(axis=0)
-        x_max, y_max, _ = surfaces.vertices.max(axis=0)
-        raise BadInput(f"the part x {bbox[0]:g} to {bbox[2]:g} m, y {bbox[1]:g} to {bbox[3]:g} m "
-                       f"is empty; the city lies in x {x_min:.0f} to {x_max:.0f} m, y {y_min:.0f} "
-                       f"to {y_max:.0f} m")
+        raise _nothing_in(bbox, surfaces.vertices.min(axis=0), surfaces.vertices.max(axis=0))
     return replace(city, names=[city.names[index] for index in shapes],
                    materials=[city.materials[index] for index in shapes],
                    surfaces=Surfaces(surfaces.meshes(keep)), ground=city.ground[keep])
+
+
+def _nothing_in(bbox: Box, low: np.ndarray, high: np.ndarray) -> BadInput:
+    return BadInput(f"the part x {bbox[0]:g} to {bbox[2]:g} m, y {bbox[1]:g} to {bbox[3]:g} m "
+                    f"is empty; the city lies in x {low[0]:.0f} to {high[0]:.0f} m, y {low[1]:.0f} "
+                    f"to {high[1]:.0f} m")
 
 
 def _move_to_origin(city: ImportedCity) -> ImportedCity:
@@ -249,7 +312,8 @@ def _move_to_origin(city: ImportedCity) -> ImportedCity:
             f"the city lies {np.hypot(*middle[:2]) / 1000:.0f} km from the origin, too far for "
             f"single precision: moved by ({offset[0]:.0f}, {offset[1]:.0f}) m"))
     if city.ground.any():
-        corners = city.surfaces.faces[city.ground & (city.surfaces.area_vectors[:, 2] > 0)]
+        upward = city.ground & (city.surfaces.area_vectors[:, 2] > 0)
+        corners = city.surfaces.faces[upward if upward.any() else city.ground]
         lowest, highest = vertices[corners, 2].min(), vertices[corners, 2].max()
         uneven = highest - lowest > 2 * FLAT_M
         datum = lowest if uneven else city.surfaces.level_m(city.ground)

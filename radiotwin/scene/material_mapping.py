@@ -1,6 +1,7 @@
 """Radio materials for the materials that a scene file declares, older forms included."""
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from radiotwin.errors import BadInput
@@ -19,19 +20,23 @@ from radiotwin.scene.names import safe_name, unique_name
 from radiotwin.scene.problems import Problem, listed
 from radiotwin.scene.xml_tree import Node
 
+DEFAULT_MATERIAL = "concrete"
+_COPY = re.compile(r"\.\d{3}$")
 _LIMITS = {  # far beyond any material, and well inside single precision
     "relative_permittivity": (1, 1e6), "conductivity_s_per_m": (0, 1e10), "thickness_m": (0, 1e4),
     "scattering_coefficient": (0, 1), "xpd_coefficient": (0, 1)}
 
 
 def map_materials(shapes: Sequence[DeclaredShape], declared: Mapping[str, Node],
-                  overrides: Mapping[str, str]) -> tuple[list[Material | None], list[Problem]]:
+                  overrides: Mapping[str, str], must_use_all: bool = True
+                  ) -> tuple[list[Material | None], list[Problem]]:
     """Find the radio material of every shape.
 
     Args:
         shapes: As declared.
         declared: `<bsdf>` elements of the file by identifier.
         overrides: Identifier of a material (with or without `mat-`) -> ITU material to use.
+        must_use_all: Whether each override has to name a material of these shapes.
 
     Returns:
         The material of each shape, None where there is none, and the problems found.
@@ -42,10 +47,56 @@ def map_materials(shapes: Sequence[DeclaredShape], declared: Mapping[str, Node],
     mapper = _Mapper(declared, overrides)
     materials = [mapper.material_of(shape) for shape in shapes]
     unused = set(overrides) - mapper.overridden
-    if unused:
-        raise BadInput(f"material {min(unused)!r} is to be replaced, but the city does not use it; "
-                       f"it uses: {', '.join(sorted(mapper.known))}")
+    if unused and must_use_all:
+        raise _unused(unused, mapper.known)
     return materials, mapper.all_problems()
+
+
+def _unused(names: Collection[str], known: Iterable[str]) -> BadInput:
+    return BadInput(f"material {min(names)!r} is to be replaced, but the city does not use it; "
+                    f"it uses: {', '.join(sorted(known)) or '(none)'}")
+
+
+def materials_by_name(names: Sequence[str | None], overrides: Mapping[str, str],
+                      must_use_all: bool = True) -> tuple[list[Material | None], list[Problem]]:
+    """Find radio materials by nothing but their names, as models in OBJ or glTF have them.
+
+    Args:
+        names: Of the material of each shape; None: it has none.
+        overrides: Name of a material -> ITU material to use; `default`: of all others.
+        must_use_all: Whether each override has to name a material of these shapes.
+
+    Returns:
+        The material of each shape, and a problem about those that concrete was taken for.
+
+    Raises:
+        BadInput: An override names a material that the model does not use, or no ITU material.
+    """
+    by_name: dict[str | None, Material | None] = {}
+    unknown: list[str] = []
+    used: set[str] = set()
+    default = itu_material(overrides.get("default", DEFAULT_MATERIAL))
+    for name in dict.fromkeys(names):
+        key = next((key for key in (name, (name or "").removeprefix("mat-")) if key in overrides),
+                   None)
+        # Blender numbers copies (brick.001), exported scenes have constants of ITU's (brick-fixed)
+        itu = itu_name(_COPY.sub("", name or "").removesuffix("-fixed").lower())
+        if key is not None:
+            used.add(key)
+            by_name[name] = itu_material(overrides[key])
+        elif itu is not None:
+            by_name[name] = itu_material(itu)
+        else:
+            by_name[name] = default
+            unknown.append(name or "(no material)")
+    unused = set(overrides) - used - {"default"}
+    if unused and must_use_all:
+        raise _unused(unused, [name for name in by_name if name])
+    found = [] if "default" in overrides or not unknown else [problems.warning(
+        f"{len(unknown)} material(s) have no name of an ITU material ({listed(unknown)}): "
+        f"{DEFAULT_MATERIAL} was taken. Say what they are with --material NAME=ITU, or of all such "
+        "with --material default=ITU")]
+    return [by_name[name] for name in names], found
 
 
 class _Unmapped(Exception):

@@ -10,7 +10,7 @@ from pathlib import Path
 import mapbox_earcut
 import numpy as np
 
-from radiotwin.budgets import CORNERS, DOCUMENT_BYTES, FACES, VERTICES
+from radiotwin.budgets import CORNERS, DOCUMENT_BYTES, FACES, SHAPES, VERTICES
 from radiotwin.errors import BadInput
 from radiotwin.inputs import read_bytes
 from radiotwin.scene.mitsuba_xml import DeclaredShape
@@ -20,6 +20,7 @@ from radiotwin.scene.xml_tree import read_vector
 WELD_M = 1e-4  # vertices equal when rounded to this are one; float32 resolves 6e-5 m at 1 km
 # Height of a triangle over its longest side below which its normal is numerical noise
 _MIN_ASPECT = 1e-6
+_MAX_NAME = 200  # characters of an object or a material
 # In the file's units: a city in UTM coordinates and millimetres reaches 10^10
 _MAX_COORDINATE = 1e11
 
@@ -110,7 +111,7 @@ def load_shape(shape: DeclaredShape) -> RawMesh:
     with np.errstate(all="ignore"):
         vertices = raw.vertices @ linear.T + offset
         mirrored = np.linalg.det(linear) < 0
-    _check_vertices(vertices, f"{shape.node.position}, after the transform")
+    check_vertices(vertices, f"{shape.node.position}, after the transform")
     return RawMesh(vertices, raw.faces[:, ::-1] if mirrored else raw.faces, raw.polygons)
 
 
@@ -122,8 +123,22 @@ def _read_mesh_file(shape: DeclaredShape) -> RawMesh:
     if not os.path.exists(path):
         raise BadInput(f"mesh file {path} does not exist (named in {shape.node.position}); put it "
                        "there or remove the shape")
-    vertices, polygons = read_ply(path) if shape.kind == "ply" else read_obj(path)
-    _check_vertices(vertices, str(path))
+    return cut_polygons(path, *(read_ply(path) if shape.kind == "ply" else read_obj(path)))
+
+
+def cut_polygons(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -> RawMesh:
+    """Check the polygons of a mesh file, and cut them into triangles.
+
+    Args:
+        path: mesh file, for messages.
+        vertices: (v, 3)
+        polygons: (n, k) indices of vertices, for each number of corners k.
+
+    Raises:
+        BadInput: a coordinate is not finite or too large, a face names a vertex that is not there,
+            or there are too many faces.
+    """
+    check_vertices(vertices, str(path))
     for group in polygons:
         wrong = (group < 0) | (group >= len(vertices))
         if wrong.any():
@@ -136,7 +151,16 @@ def _read_mesh_file(shape: DeclaredShape) -> RawMesh:
                    sum(len(group) for group in areal if group.shape[1] > 3))
 
 
-def _check_vertices(vertices: np.ndarray, source: str) -> None:
+def check_vertices(vertices: np.ndarray, source: str) -> None:
+    """Check the corners of a mesh.
+
+    Args:
+        vertices: (v, 3)
+        source: of the mesh; the message begins with it.
+
+    Raises:
+        BadInput: a coordinate is not finite, or too large.
+    """
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         raise BadInput(f"{source}: vertex {np.flatnonzero(~finite)[0] + 1} is not finite (NaN or "
@@ -184,10 +208,30 @@ def read_obj(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
         (v, 3) vertices, and an (n, k) array of vertex indices for each number of corners k.
 
     Raises:
+        BadInput: As `read_obj_groups`.
+    """
+    vertices, groups = read_obj_groups(path)
+    return vertices, [polygons for group in groups.values() for polygons in group]
+
+
+def read_obj_groups(path: Path
+                    ) -> tuple[np.ndarray, dict[tuple[str, str | None], list[np.ndarray]]]:
+    """Read vertices and polygons of a Wavefront OBJ file by object (`o`, else `g`) and material.
+
+    Args:
+        path: OBJ file; the file of materials that it names is not opened.
+
+    Returns:
+        (v, 3) vertices, and for each pair of an object and a material with faces an (n, k) array of
+        vertex indices for each number of corners k.
+
+    Raises:
         BadInput: No such file, too large, or a line with a wrong number, with its row.
     """
     vertices = array("d")
-    polygons: dict[int, array] = {}
+    groups: dict[tuple[str, str | None], dict[int, array]] = {}
+    has_objects, name, material = False, "", None
+    polygons: dict[int, array] = groups.setdefault((name, material), {})
     data = read_bytes(path, "OBJ mesh", DOCUMENT_BYTES)
     for row, line in enumerate(io.TextIOWrapper(io.BytesIO(data), "utf-8", "replace"), start=1):
         words = line.split()
@@ -202,12 +246,23 @@ def read_obj(path: Path) -> tuple[np.ndarray, list[np.ndarray]]:
                 corners = [n - 1 if n > 0 else len(vertices) // 3 + n if n else -1
                            for n in numbers]
                 polygons.setdefault(len(corners), array("q")).extend(corners)
+            elif words[:1] in (["o"], ["g"], ["usemtl"]):
+                value = " ".join(words[1:])[:_MAX_NAME]
+                if words[0] == "usemtl":
+                    material = value or None
+                elif words[0] == "o" or not has_objects:
+                    has_objects, name = has_objects or words[0] == "o", value
+                if (name, material) not in groups:
+                    SHAPES.check(len(groups), path)
+                polygons = groups.setdefault((name, material), {})
         except (ValueError, OverflowError):
             raise BadInput(f"{path}, row {row}: {line.strip()[:60]!r} is not a vertex or face as "
                            "OBJ has them; export the mesh again") from None
     VERTICES.check(len(vertices) // 3, path)
     return (np.array(vertices, dtype=float).reshape(-1, 3),
-            [np.array(group, dtype=np.int64).reshape(-1, k) for k, group in polygons.items() if k])
+            {key: [np.array(group, dtype=np.int64).reshape(-1, k)
+                   for k, group in polygons.items() if k]
+             for key, polygons in groups.items() if polygons})
 
 
 def _analytic(shape: DeclaredShape) -> RawMesh:

@@ -6,6 +6,9 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from radiotwin.errors import BadInput
+from radiotwin.scene.models import UP_AXES
+
+MAP_SUFFIXES = ".osm, .osm.pbf, .geojson, .gpkg, .shp, .zip, .city.json, .gml"
 
 
 def sionna_scenes() -> dict[str, Path]:
@@ -18,13 +21,14 @@ def sionna_scenes() -> dict[str, Path]:
 
 
 def find_source(source: Path | str) -> Path:
-    """Return the XML file of a source.
+    """Return the file of a source.
 
     Args:
         source: A path, or `sionna:NAME`.
 
     Raises:
-        BadInput: Unknown name (the message lists the known ones), no such file, or not XML.
+        BadInput: Unknown name (the message lists the known ones), no such file, or neither XML nor
+            a model.
     """
     text = str(source)
     if text.startswith("sionna:"):
@@ -38,12 +42,13 @@ def find_source(source: Path | str) -> Path:
         return scenes[name]
     path = Path(source)
     if not os.path.isfile(path):  # unlike Path, False for an impossible name, too
-        raise BadInput(f"{path} is not a file; give a map, a Mitsuba or Sionna RT scene (.xml), or "
+        raise BadInput(f"{path} is not a file; give a map, a Mitsuba or Sionna RT scene (.xml), a "
+                       f"model ({', '.join(UP_AXES)}), or "
                        "sionna:NAME with one of: "
                        f"{', '.join(sionna_scenes()) or '(sionna-rt is not installed)'}")
-    if path.suffix.lower() != ".xml":
-        raise BadInput(f"{path}: '{path.suffix}' is not read; give a map (.osm, .osm.pbf, "
-                       ".geojson, .gpkg) or a Mitsuba or Sionna RT scene (.xml)")
+    if path.suffix.lower() not in (".xml", *UP_AXES):
+        raise BadInput(f"{path}: '{path.suffix}' is not read; give a map ({MAP_SUFFIXES}), a "
+                       f"Mitsuba or Sionna RT scene (.xml), or a model ({', '.join(UP_AXES)})")
     return path
 
 

@@ -193,8 +193,9 @@ class Surfaces:
         return faces
 
     def level_m(self, faces: np.ndarray) -> float:
-        """Return the height that halves the upward area of the faces, (f,) bool [m]."""
+        """Return the height that halves the upward area of the faces, (f,) bool, not none [m]."""
         up = faces & (self.area_vectors[:, 2] > 0)
+        up = up if up.any() else faces
         order = np.argsort(self.centres[up, 2])
         area = np.cumsum(self.areas[up][order])
         return float(self.centres[up, 2][order][np.searchsorted(area, area[-1] / 2)])

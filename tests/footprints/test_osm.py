@@ -3,6 +3,7 @@ import pytest
 import shapely
 
 from radiotwin.errors import BadInput
+from radiotwin.footprints.features import left_out_problems
 from radiotwin.footprints.osm import assemble, stitch
 from radiotwin.footprints.osm_pbf import read_osm_pbf
 from radiotwin.footprints.osm_xml import read_osm_xml
@@ -27,7 +28,7 @@ def test_the_town(town_osm):
     assert names == {f"way/{n}" for n in (*range(101, 115), 118, 119)} | {"relation/201", "relation/202"}
     areas = {feature.name: feature.area for feature in found.features}
     assert len(areas["relation/201"].interiors) == 1 and areas["relation/202"].geom_type == "MultiPolygon"
-    messages = "\n".join(problem.message for problem in found.problems)
+    messages = "\n".join(problem.message for problem in left_out_problems(found.left_out, None))
     assert "'way/116'" in messages and "not closed: left out ('way/115')" in messages
 
 
@@ -62,7 +63,7 @@ def test_a_relation_without_its_ways_is_cut(tmp_path):
     path.write_text(relation("outer", "", '<tag k="type" v="multipolygon"/><tag k="building" v="yes"/>'
                              '<member type="way" ref="5" role="outer"/>'))
     found = assemble(read_osm_xml(path))
-    assert not found.features and "lack nodes or ways" in found.problems[0].message
+    assert not found.features and "lack nodes or ways" in found.left_out[0].reason
 
 
 @pytest.mark.parametrize(("text", "message"), [

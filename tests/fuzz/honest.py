@@ -21,6 +21,8 @@ from unittest import mock
 import numpy as np
 import pandas as pd
 
+from tests.footprints import city_models
+
 SQUARE = [[8.001, 50.001], [8.002, 50.001], [8.002, 50.002], [8.001, 50.002], [8.001, 50.001]]
 RUN = "scene --truth segmented --real-episodes 1 --episodes 8 --flights 2 --compare false --planner-iterations 50 --hidden 8"
 COMMANDS = (
@@ -131,6 +133,20 @@ def _write_maps(folder: Path) -> None:
 
     pyogrio.raw.write(folder / "town.gpkg", np.array([shapely.to_wkb(shapely.Polygon(SQUARE))]), [np.array(["12"])],
                       ["height"], geometry_type="Polygon", crs="EPSG:4326", driver="GPKG")
+    pyogrio.raw.write(folder / "town.shp", np.array([shapely.to_wkb(shapely.Polygon(SQUARE))]), [np.array([12.5])],
+                      ["HOEHE"], geometry_type="Polygon", crs="EPSG:4326", driver="ESRI Shapefile")
+    with zipfile.ZipFile(folder / "town.zip", "w") as archive:
+        for suffix in (".shp", ".dbf", ".prj"):
+            archive.write(folder / f"town{suffix}", f"town{suffix}")
+    (folder / "town.city.json").write_text(json.dumps(city_models.cityjson([(0, 0, 1.2)])))
+    (folder / "town.gml").write_text(city_models.citygml([city_models.house(691_000, 5_336_000, 500, "H")]))
+    import trimesh
+
+    box = trimesh.creation.box(bounds=[[0, 0, 0], [20, 30, 10]])
+    for suffix in ("glb", "gltf", "stl"):
+        data = box.export(file_type=suffix)
+        for name, content in (data if suffix == "gltf" else {f"box.{suffix}": data}).items():
+            (folder / name.replace("model", "box")).write_bytes(content)
     (folder / "city.xml").write_text("""<scene version="2.1.0"><default name="side" value="40"/>
 <bsdf type="itu-radio-material" id="wall"><string name="type" value="concrete"/></bsdf>
 <shape type="cube" id="block"><transform name="to_world"><scale x="$side" y="20" z="10"/>

@@ -322,6 +322,7 @@ def _parquet(data: bytes, where: float, what: int) -> bytes:
 def _of(suffix: str) -> dict[str, Callable[[bytes, float, int], bytes]]:
     return {
         ".json": TEXT | {"node": _json_node, "deep": _json_deep}, ".geojson": TEXT | {"node": _json_node, "deep": _json_deep},
+        ".gltf": TEXT | {"node": _json_node, "deep": _json_deep},
         ".gz": {"inside": _inside, "bomb": _bomb}, ".safetensors": {"header": _header},
         ".nc": {"object": _hdf5}, ".args": {"value": _value_of_option}, ".gpkg": {"statement": _sqlite}, ".parquet": {"column": _parquet},
     }.get(suffix, TEXT)
