@@ -1,0 +1,40 @@
+"""Settings of a federation, checked when they are given; each becomes an option."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from marl.settings import LearnerSettings
+from radiotwin.errors import BadInput
+
+
+class FederationSettings(BaseModel):
+    """Settings of a federation over Flower."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    strategy: Literal["fedavg", "fedavgm", "fedprox"] = Field(
+        "fedavg", description="Flower's strategy: mean weighted by episodes, the same with "
+        "momentum, or with a proximal term in the replicas' loss")
+    server_momentum: float = Field(0.5, ge=0, lt=1, description="momentum of fedavgm")
+    proximal_mu: float = Field(0.01, gt=0, le=1e6, description="weight of fedprox's term")
+    min_clients: int = Field(
+        2, ge=1, le=10_000, description="parties that a round goes on with; with fewer it is "
+        "repeated from the mean before")
+    round_timeout_s: float = Field(
+        600.0, ge=1, le=10**6, description="seconds that a round waits for parties that do not "
+        "answer")
+
+
+def check_federation(federation: FederationSettings, learner: LearnerSettings,
+                     clients: int) -> None:
+    """Refuse settings that are allowed one by one, but not together.
+
+    Raises:
+        BadInput: momentum over the optimiser's squares, or more parties needed than there are.
+    """
+    if federation.strategy == "fedavgm" and learner.federate_all:
+        raise BadInput("strategy fedavgm: momentum can make the optimiser's mean squares negative; "
+                       "give --federate-all false with it, so that only weights are averaged")
+    if federation.min_clients > clients:
+        raise BadInput(f"--min-clients {federation.min_clients}: there are {clients} parties")
