@@ -241,9 +241,10 @@ class Client:
             write_csv(pd.DataFrame(self._rows), temporary)
 
     def _save(self) -> None:
-        tables = [] if self._measured is not None or self._reality is None else self._reality.tables
+        flown = self._measured is None and self._reality is not None
         state = {"done": self._done, "entered": self._entered, "rows": self._rows,
-                 "spent": dict(self._spent), "tables": tables, "replica": self._replica.state(last=False), "twin": None}
+                 "spent": dict(self._spent), "tables": self._reality.tables if flown else [],
+                 "replica": self._replica.state(last=False), "twin": None}
         if self._twin is not None:
             self._twin.save(self._party.folder / "twin")
             record, channel = self._twin.encode()

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from flwr.app import ArrayRecord, Context, Error, Message, MetricRecord, RecordDict
+from flwr.app import Context, Error, Message, MetricRecord, RecordDict
 from flwr.clientapp import ClientApp
 
 from marl.fedqmix.client import Client, Party
@@ -80,9 +80,8 @@ def _reply(message: Message, context: Context, work: Callable[[Client], RecordDi
         limit_threads(1)
         keep_memory()
         shared = Shared.of(context.run_config)
-        mu = shared.federation.proximal_mu if shared.federation.strategy == "fedprox" else 0.0
-        return Message(work(Client(shared.run, shared.learner, party_of(context), mu)),
-                       reply_to=message)
+        client = Client(shared.run, shared.learner, party_of(context), shared.proximal_mu)
+        return Message(work(client), reply_to=message)
     except Exception:
         # Flower would send the text of the exception, which may name files and values.
         traceback.print_exc()

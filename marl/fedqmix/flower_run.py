@@ -18,13 +18,14 @@ import tomli_w
 
 from marl.fedqmix.client import Party
 from marl.fedqmix.flower_client import PARTIES
-from marl.fedqmix.flower_server import FOLDER
+from marl.fedqmix.flower_server import DONE, FOLDER, WEIGHTS
 from marl.fedqmix.keys import make_certificates, make_node_key
 from marl.threads import die_with_parent
+from radiotwin.console import notice
 from radiotwin.errors import RunFailed
 
 HOST, LINK = "127.0.0.1", "federation"
-START_S, END_S, POLL_S = 90.0, 15.0, 0.5
+START_S, END_S, POLL_S, STATUS_S, RESTART_S = 120.0, 15.0, 0.5, 30.0, 15.0
 _LAST_LINES = 15  # of a log, in a message
 
 
@@ -68,23 +69,24 @@ class Processes:
             raise RunFailed(f"{shlex.join(command)} failed: {(done.stdout + done.stderr)[-800:]}")
         return done.stdout
 
-    def require_running(self) -> None:
-        """Raise where a process has ended.
+    def is_running(self, name: str) -> bool:
+        """Return whether a process that was started has not ended."""
+        return self._running[name].poll() is None
 
-        Raises:
-            RunFailed: with the end of its log.
-        """
-        for name, process in self._running.items():
-            if process.poll() is not None:
-                log = (self._logs / f"{name}.log").read_text(errors="replace").splitlines()
-                raise RunFailed("\n".join([f"{name} has ended with status {process.returncode}; its "
-                                           "log ends with", *log[-_LAST_LINES:]]))
+    def end_of_log(self, name: str) -> str:
+        """Return the last lines of a process's log."""
+        log = (self._logs / f"{name}.log").read_text(errors="replace").splitlines()
+        return "\n".join(log[-_LAST_LINES:])
 
-    def stop(self, name: str, at_once: bool = False) -> None:
-        """End a process and what it has started; `at_once`: it is killed."""
+    def kill(self, name: str) -> None:
+        """End a process as a power cut would; what it has started notices by itself."""
+        self._running[name].kill()
+
+    def stop(self, name: str) -> None:
+        """End a process and all that it has started."""
         process = self._running.pop(name)
         others = _descendants(process.pid)
-        (process.kill if at_once else process.terminate)()
+        process.terminate()
         try:
             process.wait(END_S)
         except subprocess.TimeoutExpired:
@@ -112,6 +114,7 @@ class Federation:
 
     def __init__(self, parties: Sequence[Party], out: Path, home: Path, simulation: bool) -> None:
         self._parties, self._home, self._simulation = parties, home, simulation
+        self._out, self._started = out, dict[int, float]()
         logs = out / "logs"
         logs.mkdir(parents=True, exist_ok=True)
         configs = [_config_of(party) for party in parties]
@@ -141,7 +144,7 @@ class Federation:
             "--ssl-ca-certfile", str(made.authority), "--ssl-certfile", str(made.certificate),
             "--ssl-keyfile", str(made.key), "--disable-runtime-dependency-installation",
             "--simulation" if self._simulation else "--enable-supernode-auth"])
-        self._wait_for(lambda: _listens(self._port), "the SuperLink does not answer")
+        self._wait_for_superlink()
         if not self._simulation:
             for number in range(len(self._parties)):
                 public = make_node_key(self._home / f"node-{number}")
@@ -150,6 +153,7 @@ class Federation:
 
     def start_node(self, number: int) -> None:
         """Start the SuperNode of a party."""
+        self._started[number] = time.monotonic()
         self.processes.start(f"supernode-{number}", [
             "flower-supernode", "--superlink", self._link, "--root-certificates",
             str(self._certificates.authority), "--auth-supernode-private-key",
@@ -164,22 +168,66 @@ class Federation:
                         "client-resources-num-cpus=1"]
         return str(json.loads(self.processes.call(command))["run-id"])
 
-    def status(self, run: str) -> str:
-        """Return the status of a run, such as `running` or `finished:completed`."""
-        listed = json.loads(self.processes.call(["flwr", "list", LINK, "--run-id", run, "--format",
-                                                 "json"]))
-        return str(listed["runs"][0]["status"])
+    def watch(self, run: str, on_progress: Callable[[int], None]) -> None:
+        """Wait for the end of a run; a SuperNode that ends is started again.
+
+        Flower takes a SuperNode that was killed back when it has missed two heartbeats, which is
+        after a minute; until then it ends again.
+
+        Args:
+            run: its number.
+            on_progress: called with the number of rounds since the last call.
+
+        Raises:
+            RunFailed: the run or the SuperLink has ended early.
+        """
+        done, asked = 0, time.monotonic()
+        while True:
+            self._require_superlink()
+            if not self._simulation:
+                self._start_again()
+            rounds = len(list((self._out / WEIGHTS).glob("round-*"))) - 1  # and the initial ones
+            if rounds > done:
+                on_progress(rounds - done)
+                done = rounds
+            ended = (self._out / DONE).exists()
+            # Asking takes seconds of a processor.
+            if ended or time.monotonic() - asked > STATUS_S:
+                status, asked = self._status(run), time.monotonic()
+                if status == "finished:completed":
+                    return
+                if status.startswith("finished"):
+                    raise RunFailed(f"Flower's run is {status}; the log of the SuperLink ends "
+                                    "with\n" + self.processes.end_of_log("superlink"))
+            time.sleep(POLL_S)
 
     def close(self) -> None:
         """End all processes."""
         self.processes.close()
 
-    def _wait_for(self, condition: Callable[[], bool], failure: str) -> None:
+    def _status(self, run: str) -> str:
+        listed = json.loads(self.processes.call(["flwr", "list", LINK, "--run-id", run, "--format",
+                                                 "json"]))
+        return str(listed["runs"][0]["status"])
+
+    def _start_again(self) -> None:
+        for number in range(len(self._parties)):
+            if not self.processes.is_running(f"supernode-{number}") and \
+                    time.monotonic() - self._started[number] > RESTART_S:
+                notice(f"the SuperNode of party {number} has ended; it is started again")
+                self.start_node(number)
+
+    def _require_superlink(self) -> None:
+        if not self.processes.is_running("superlink"):
+            raise RunFailed("the SuperLink has ended; its log ends with\n"
+                            + self.processes.end_of_log("superlink"))
+
+    def _wait_for_superlink(self) -> None:
         end = time.monotonic() + START_S
-        while not condition():
-            self.processes.require_running()
+        while not _listens(self._port):
+            self._require_superlink()
             if time.monotonic() > end:
-                raise RunFailed(f"{failure} for {START_S:.0f} s")
+                raise RunFailed(f"the SuperLink does not answer for {START_S:.0f} s")
             time.sleep(POLL_S)
 
 

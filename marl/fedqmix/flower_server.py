@@ -3,6 +3,7 @@
 It writes into the folder that the environment variable `RADIOTWIN_FEDERATION` names.
 """
 
+import json
 import os
 import time
 from collections.abc import Iterable
@@ -21,15 +22,13 @@ from marl.checkpoint import save_checkpoint
 from marl.fedqmix.client import rounds_of
 from marl.fedqmix.federation import Weights, require_weights
 from marl.fedqmix.flower_records import arrays_of, weights_of
-from marl.fedqmix.shared import Shared
-from marl.mission import Mission
-from marl.qmix import QNetworks
+from marl.fedqmix.shared import Shared, initial_weights
 from radiotwin.cells import write_csv
-from radiotwin.errors import BadInput
-from radiotwin.files import atomic_path
+from radiotwin.errors import BadInput, RunFailed
+from radiotwin.files import atomic_file, atomic_path
 
 FOLDER = "RADIOTWIN_FEDERATION"
-WEIGHTS, ROUNDS = "weights", "rounds.csv"
+WEIGHTS, ROUNDS, DONE = "weights", "rounds.csv", "done.json"
 
 app = ServerApp()
 
@@ -46,22 +45,14 @@ def main(grid: Grid, context: Context) -> None:
     _wait(grid, shared, timeout_s)
     result = strategy.start(grid, arrays_of(initial), num_rounds=len(rounds), timeout=timeout_s,
                             evaluate_fn=record.keep)
-    content = RecordDict({"arrays": result.arrays or arrays_of(initial)})
-    messages = [Message(content, node, MessageType.EVALUATE) for node in grid.get_node_ids()]
+    if not result.arrays:
+        raise RunFailed("in no round did enough parties train; their logs say why")
+    messages = [Message(RecordDict({"arrays": result.arrays}), node, MessageType.EVALUATE)
+                for node in grid.get_node_ids()]
     replies = list(grid.send_and_receive(messages, timeout=timeout_s))
-    log(INFO, "%d of %d parties have evaluated", sum(each.has_content() for each in replies),
-        shared.clients)
-
-
-def initial_weights(shared: Shared) -> Weights:
-    """Return the weights that `FedQMIX` begins with, from the sizes alone."""
-    links = np.zeros((shared.uavs, shared.devices, 1, 1), np.float32)
-    each = np.zeros(shared.uavs, np.int64)
-    sizes = Mission(links, links, np.zeros((shared.uavs, 1, 1), np.int64),
-                    np.zeros((shared.uavs, 2), np.int64), each, each.astype(float),
-                    np.zeros(shared.devices), np.zeros((shared.devices, 2)), 1.0, 1.0, 0.0, 0.0,
-                    np.zeros(2), False)
-    return QNetworks(shared.learner, sizes, shared.run.seed).weights()
+    evaluated = sum(reply.has_content() for reply in replies)
+    log(INFO, "%d of %d parties have evaluated", evaluated, shared.clients)
+    record.close(evaluated)
 
 
 class _Record:
@@ -84,6 +75,11 @@ class _Record:
                 write_csv(pd.DataFrame(self._rows), temporary)
         self.heard, self.episodes, self._started = 0, 0, time.perf_counter()
         return None
+
+    def close(self, evaluated: int) -> None:
+        """Write that all is done."""
+        with atomic_file(self._folder / DONE) as file:
+            file.write(json.dumps({"rounds": len(self._rows), "evaluated": evaluated}).encode())
 
 
 class _Checked(FedAvg):

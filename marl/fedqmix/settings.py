@@ -19,8 +19,8 @@ class FederationSettings(BaseModel):
     server_momentum: float = Field(0.5, ge=0, lt=1, description="momentum of fedavgm")
     proximal_mu: float = Field(0.01, gt=0, le=1e6, description="weight of fedprox's term")
     min_clients: int = Field(
-        2, ge=1, le=10_000, description="parties that a round goes on with; with fewer it is "
-        "repeated from the mean before")
+        2, ge=1, le=10_000, description="parties that a round needs; with fewer the mean stays "
+        "as it was")
     round_timeout_s: float = Field(
         600.0, ge=1, le=10**6, description="seconds that a round waits for parties that do not "
         "answer")
@@ -38,3 +38,20 @@ def check_federation(federation: FederationSettings, learner: LearnerSettings,
                        "give --federate-all false with it, so that only weights are averaged")
     if federation.min_clients > clients:
         raise BadInput(f"--min-clients {federation.min_clients}: there are {clients} parties")
+
+
+class EngineSettings(BaseModel):
+    """What means are made with, and what the parties have."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    federation: Literal["in-process", "flower", "flower-processes", "flower-app"] = Field(
+        "in-process", description="what averages replicas of fedqmix: this process; Flower in its "
+        "simulation engine; Flower's SuperLink and SuperNodes as processes of this machine, with "
+        "TLS and keys; flower-app only writes the Flower App, for parties on several machines")
+    party_scenes: str = Field(
+        "", max_length=10_000, description="scene folders of the parties, separated by commas; "
+        "without: --scene once for each of its UAVs")
+    party_measurements: str = Field(
+        "", max_length=10_000, description="measurements of the parties, separated by commas, to "
+        "learn their twins from; without: real flights are simulated in each scene's truth")

@@ -5,10 +5,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 import tomli_w
 from pydantic import BaseModel, ValidationError
 
+from marl.fedqmix.federation import Weights
 from marl.fedqmix.settings import FederationSettings, check_federation
+from marl.mission import Mission
+from marl.qmix import QNetworks
 from marl.settings import LearnerSettings, RunSettings, check_together
 from radiotwin import __version__
 from radiotwin.errors import BadInput
@@ -60,6 +64,12 @@ class Shared:
         check_federation(shared.federation, shared.learner, shared.clients)
         return shared
 
+    @property
+    def proximal_mu(self) -> float:
+        """Weight of the proximal term; 0: there is none."""
+        federation = self.federation
+        return federation.proximal_mu if federation.strategy == "fedprox" else 0.0
+
     def config(self) -> dict[str, Any]:
         """Return the tables of the app's configuration."""
         return {"clients": self.clients, "uavs": self.uavs, "devices": self.devices,
@@ -82,6 +92,17 @@ def write_app(shared: Shared, folder: Path) -> None:
                "description": "Federated QMIX of radiotwin", "dependencies": []}
     with atomic_file(folder / "pyproject.toml") as file:
         file.write(tomli_w.dumps({"project": project, "tool": {"flwr": {"app": app}}}).encode())
+
+
+def initial_weights(shared: Shared) -> Weights:
+    """Return the weights that `FedQMIX` begins with, from the sizes alone."""
+    links = np.zeros((shared.uavs, shared.devices, 1, 1), np.float32)
+    each = np.zeros(shared.uavs, np.int64)
+    sizes = Mission(links, links, np.zeros((shared.uavs, 1, 1), np.int64),
+                    np.zeros((shared.uavs, 2), np.int64), each, each.astype(float),
+                    np.zeros(shared.devices), np.zeros((shared.devices, 2)), 1.0, 1.0, 0.0, 0.0,
+                    np.zeros(2), False)
+    return QNetworks(shared.learner, sizes, shared.run.seed).weights()
 
 
 def _checked(model: type[_Settings], group: str, config: Mapping[str, Any],
