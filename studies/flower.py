@@ -44,7 +44,8 @@ def measure(seed: int, settings: dict) -> dict[str, Any]:
     """
     run = RunSettings(seed=seed, device="cpu", real_episodes=settings["real_episodes"],
                       episodes=settings["episodes"], flights=settings["flights"])
-    learner = PRESETS["fast"].model_copy(update={"epsilon_slots": settings["epsilon_slots"]})
+    learner = PRESETS["fast"].model_copy(update={
+        name: settings[name] for name in ("epsilon_slots", "federate_every", "hidden")})
     shared = Shared(run, learner, FederationSettings(round_timeout_s=settings["timeout_s"]),
                     len(CITIES), 3, 10)
     result: dict[str, Any] = {}
@@ -117,8 +118,9 @@ def _difference(out: Path, means: list[Weights]) -> float:
 
 
 def _cases(seed: int) -> dict[str, dict]:
-    base = {"real_episodes": 2, "episodes": 500, "flights": 64, "epsilon_slots": 20_000,
-            "survey_flights": 5, "timeout_s": 90, "killed_after": 0, "compare_means": False}
+    base = {"real_episodes": 2, "episodes": 200, "federate_every": 40, "hidden": 32, "flights": 64,
+            "epsilon_slots": 10_000, "survey_flights": 3, "timeout_s": 120, "killed_after": 0,
+            "compare_means": False}
     cases = {"in-process": base | {"engine": "in-process"},
              "flower, one killed": base | {"engine": "flower", "killed_after": 3}}
     if seed == 0:
