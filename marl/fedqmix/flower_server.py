@@ -39,7 +39,7 @@ def main(grid: Grid, context: Context) -> None:
     shared = Shared.of(context.run_config)
     initial = initial_weights(shared)
     rounds = rounds_of(shared.run, shared.learner)
-    record = _Record(Path(os.environ.get(FOLDER, f"federation-{context.run_id}")))
+    record = Record(Path(os.environ.get(FOLDER, f"federation-{context.run_id}")))
     strategy = make_strategy(shared, initial, [episodes for _, episodes in rounds], record)
     timeout_s = shared.federation.round_timeout_s
     _wait(grid, shared, timeout_s)
@@ -55,7 +55,7 @@ def main(grid: Grid, context: Context) -> None:
     record.close(evaluated)
 
 
-class _Record:
+class Record:
     """Folder with the mean after every round, and a table of the rounds."""
 
     def __init__(self, folder: Path) -> None:
@@ -87,7 +87,7 @@ class _Checked(FedAvg):
 
     like: Weights
     most: list[int]  # episodes of each round
-    record: _Record
+    record: Record
 
     def aggregate_train(self, server_round: int, replies: Iterable[Message],
                         ) -> tuple[ArrayRecord | None, MetricRecord | None]:
@@ -123,7 +123,7 @@ class _FedProx(_Checked, FedProx):
     pass
 
 
-def make_strategy(shared: Shared, like: Weights, most: list[int], record: _Record) -> FedAvg:
+def make_strategy(shared: Shared, like: Weights, most: list[int], record: Record) -> FedAvg:
     """Return Flower's strategy, with its replies checked.
 
     Args:
