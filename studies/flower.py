@@ -69,8 +69,8 @@ def measure(seed: int, settings: dict) -> dict[str, Any]:
 def _parties(folder: Path, seed: int, flights: int) -> list[Party]:
     scenes = [scene_folder(name).absolute() for name in CITIES]
     scene = Scene.load(scenes[MEASURED])
-    measured = fly_survey(scene, read_truth(scene, "traced"), flights=flights, pattern="random-waypoint",
-                          seed=1000 + seed)
+    measured = fly_survey(scene, read_truth(scene, "traced"), flights=flights,
+                          pattern="random-waypoint", seed=1000 + seed)
     path = folder / "survey" / "measurements.csv"
     path.parent.mkdir()
     measured.write(path)

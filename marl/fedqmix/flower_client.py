@@ -16,7 +16,7 @@ from flwr.clientapp import ClientApp
 from marl.fedqmix.client import Client, Party
 from marl.fedqmix.flower_records import arrays_of, weights_of
 from marl.fedqmix.shared import Shared
-from marl.threads import keep_memory, limit_threads, torch_device
+from marl.threads import die_with_parent, keep_memory, limit_threads, torch_device
 from radiotwin.errors import BadInput
 from radiotwin.inputs import read_json
 
@@ -77,6 +77,9 @@ def party_of(context: Context) -> Party:
 
 def _reply(message: Message, context: Context, work: Callable[[Client], RecordDict]) -> Message:
     try:
+        if PARTIES not in os.environ:
+            # One that outlives its killed SuperNode would write over what the next one does.
+            die_with_parent(os.getppid())
         limit_threads(1)
         keep_memory()
         shared = Shared.of(context.run_config)

@@ -125,6 +125,7 @@ class Federation:
         self.processes = Processes(home, logs, environment)
         self._certificates = made = make_certificates(home)
         self._port = free_port()
+        self.ports = [self._port]  # that were opened
         self._link = f"{HOST}:{self._port}"
         (home / "config.toml").write_text(tomli_w.dumps({"superlink": {
             "default": LINK,
@@ -154,10 +155,11 @@ class Federation:
     def start_node(self, number: int) -> None:
         """Start the SuperNode of a party."""
         self._started[number] = time.monotonic()
+        self.ports.append(free_port())
         self.processes.start(f"supernode-{number}", [
             "flower-supernode", "--superlink", self._link, "--root-certificates",
             str(self._certificates.authority), "--auth-supernode-private-key",
-            str(self._home / f"node-{number}"), "--host", HOST, "--port", str(free_port()),
+            str(self._home / f"node-{number}"), "--host", HOST, "--port", str(self.ports[-1]),
             "--node-config", str(self._home / f"node-{number}.toml")])
 
     def run(self, app: Path) -> str:

@@ -23,6 +23,7 @@ from marl.fedqmix.client import rounds_of
 from marl.fedqmix.federation import Weights, require_weights
 from marl.fedqmix.flower_records import arrays_of, weights_of
 from marl.fedqmix.shared import Shared, initial_weights
+from marl.threads import die_with_parent
 from radiotwin.cells import write_csv
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.files import atomic_file, atomic_path
@@ -36,6 +37,7 @@ app = ServerApp()
 @app.main()
 def main(grid: Grid, context: Context) -> None:
     """Run all rounds, then have each party evaluate its policy for itself."""
+    die_with_parent(os.getppid())  # Flower's own end waits for a SuperLink that is no more
     shared = Shared.of(context.run_config)
     initial = initial_weights(shared)
     rounds = rounds_of(shared.run, shared.learner)

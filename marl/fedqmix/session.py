@@ -169,7 +169,8 @@ def _check_engine(engine: str, federation: FederationSettings) -> None:
     if engine == "in-process":
         if federation.strategy == "fedavgm":
             raise BadInput("strategy fedavgm: it is Flower's; give --federation flower with it")
-    elif find_spec("flwr") is None or (engine == "flower" and find_spec("ray") is None):
+    elif engine != "flower-app" and (
+            find_spec("flwr") is None or (engine == "flower" and find_spec("ray") is None)):
         raise RunFailed("federation over Flower needs the extra flower: pip install "
                         "'radiotwin[flower]', in an environment of its own if other packages need "
                         "newer versions of what Flower pins")

@@ -1,5 +1,6 @@
 """A party of a federation, driven from outside, and the means of several in one process."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -13,11 +14,12 @@ from marl.fedqmix import federation
 from marl.fedqmix.client import Client, Party, rounds_of
 from marl.fedqmix.federation import average, require_weights
 from marl.fedqmix.proximal import ProximalNetworks
-from marl.fedqmix.session import federate
-from marl.fedqmix.settings import FederationSettings, check_federation
+from marl.fedqmix.session import FederatedSession, federate
+from marl.fedqmix.settings import EngineSettings, FederationSettings, check_federation
 from marl.fedqmix.shared import Shared, initial_weights
 from marl.settings import PRESETS, RunSettings
 from radiotwin.errors import BadInput
+from radiotwin.exits import exit_status
 from radiotwin.survey import fly_survey, segmented_truth
 
 LEARNER = PRESETS["fast"].model_copy(update={
@@ -181,6 +183,56 @@ def test_settings_survive_the_way_through_an_app(shared):
 def test_more_parties_than_there_are_cannot_be_needed():
     with pytest.raises(BadInput, match="--min-clients 3: there are 2"):
         check_federation(FederationSettings(min_clients=3), LEARNER, 2)
+
+
+@pytest.mark.parametrize("options, status, message", [
+    (["--federation", "flower", "--algorithm", "qmix"], 2, "--algorithm fedqmix"),
+    (["--federation", "flower", "--resume"], 2, "without --resume"),
+    (["--strategy", "fedavgm"], 2, "of a federation"),
+    (["--party-scenes", "a,b", "--strategy", "fedavgm", "--federate-all", "false"], 2, "it is Flower's"),
+    (["--federation", "flower-app", "--strategy", "fedavgm"], 2, "--federate-all false"),
+    (["--federation", "flower-app", "--min-clients", "4"], 2, "there are 2 parties"),
+    (["--federation", "flower-app", "--party-measurements", "a,b,c", "--party-scenes", "x,y"], 2, "3 files for 2"),
+    (["--federation", "flower"], 1, "extra flower"),
+    (["--federation", "flower-app"], 0, "app"),
+])
+def test_options_that_do_not_go_together_end_with_one_message(options, status, message, small_scene, tmp_path,
+                                                              monkeypatch, capsys):
+    from marl.fedqmix import session
+    from marl.fedqmix.__main__ import app
+
+    monkeypatch.setattr(session, "find_spec", lambda name: None)
+    out = tmp_path / "out"
+    given = ["--scene", str(small_scene.folder), "--truth", "segmented", "--out", str(out), *options]
+    monkeypatch.setattr("sys.argv", ["fedqmix", *given])
+    assert exit_status(app, "") == status
+    printed = capsys.readouterr()
+    assert message in " ".join((printed.out + printed.err).split())
+    assert (out / "app" / "pyproject.toml").exists() == (status == 0) == out.exists()
+
+
+def test_scenes_of_other_sizes_are_refused(small_scene, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(small_scene.folder, other)
+    text = (other / "scene.toml").read_text()
+    first = text.index("[[uavs]]")
+    second = text.index("[[", first + 1)
+    (other / "scene.toml").write_text(text[:first] + text[second:])
+    engine = EngineSettings(party_scenes=f"{small_scene.folder},{other}")
+    run = RUN.model_copy(update={"scene": small_scene.folder})
+    with pytest.raises(BadInput, match="equal"):
+        FederatedSession(run, LEARNER, FederationSettings(), engine, tmp_path / "out").execute()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_session_in_one_process_writes_what_each_party_collects(small_scene, tmp_path, capsys):
+    engine = EngineSettings(party_scenes=f"{small_scene.folder},{small_scene.folder}")
+    run = RUN.model_copy(update={"scene": small_scene.folder, "twin": "truth", "real_episodes": 1, "episodes": 8})
+    FederatedSession(run, LEARNER, FederationSettings(), engine, tmp_path / "out").execute()
+    assert "in its truth" in " ".join(capsys.readouterr().out.split())
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["app", "config.json", "curve.png", "parties"]
+    with pytest.raises(BadInput, match="not an empty folder"):
+        FederatedSession(run, LEARNER, FederationSettings(), engine, tmp_path / "out").execute()
 
 
 def test_the_proximal_term_is_that_of_the_paper(shared, city_mission):

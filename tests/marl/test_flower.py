@@ -4,20 +4,21 @@ Flower pins older versions of what radiotwin uses: where it is not installed the
 `make test-flower` runs them in an environment of their own.
 """
 
+import json
 import os
+import signal
 import socket
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 pytest.importorskip("flwr", reason="Flower is not installed; `make test-flower` has an environment with it")
 
-from flwr.app import ArrayRecord, ConfigRecord, Context, Message, MetricRecord, RecordDict  # noqa: E402
+from flwr.app import ConfigRecord, Context, Message, MetricRecord, RecordDict  # noqa: E402
 from flwr.supercore.inflatable.inflatable_object import get_all_nested_objects  # noqa: E402
 from flwr.supercore.task_identity import TaskIdentity  # noqa: E402
 
@@ -26,12 +27,16 @@ from marl.checkpoint import load_checkpoint  # noqa: E402
 from marl.fedqmix import flower_client  # noqa: E402
 from marl.fedqmix.client import Party  # noqa: E402
 from marl.fedqmix.flower_records import arrays_of  # noqa: E402
-from marl.fedqmix.flower_run import Federation  # noqa: E402
+from marl.fedqmix.flower_run import Federation, free_port  # noqa: E402
 from marl.fedqmix.flower_server import Record, make_strategy  # noqa: E402
+from marl.fedqmix.keys import make_node_key  # noqa: E402
 from marl.fedqmix.session import federate  # noqa: E402
 from marl.fedqmix.settings import FederationSettings  # noqa: E402
 from marl.fedqmix.shared import Shared, initial_weights, write_app  # noqa: E402
 from marl.settings import PRESETS, RunSettings  # noqa: E402
+from radiotwin.errors import RunFailed  # noqa: E402
+
+MAX_S = 900  # of a test, on a machine that does much else
 
 LEARNER = PRESETS["fast"].model_copy(update={
     "parallel": 4, "batch": 4, "replay": 16, "hidden": 8, "mixing_width": 4, "federate_every": 8,
@@ -192,3 +197,141 @@ def test_an_error_says_nothing_of_what_a_party_holds(change, shared, context, ca
     reply = flower_client.app(asked(shared), context)
     assert reply.has_error() and reply.error.reason == flower_client.ERROR_REASON
     assert "BadInput" in capfd.readouterr().err  # the party itself is told
+
+
+@pytest.fixture(autouse=True)
+def bounded():
+    """End a test that hangs, so that its processes are ended, too."""
+    def give_up(number, frame):
+        raise TimeoutError("the test takes too long")
+
+    before = signal.signal(signal.SIGALRM, give_up)
+    signal.alarm(MAX_S)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def left_over(folder):
+    """Processes that were started with a path of a folder in their arguments or environment."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            told = (path / "cmdline").read_bytes() + (path / "environ").read_bytes()
+            zombie = (path / "stat").read_text().rpartition(")")[2].split()[0] == "Z"
+        except OSError:
+            continue
+        if str(folder).encode() in told and not zombie and int(path.name) != os.getpid():
+            found.append(told[:200])
+    return found
+
+
+def is_open(port):
+    with socket.socket() as caller:
+        return caller.connect_ex(("127.0.0.1", port)) == 0
+
+
+@pytest.fixture
+def parties(small_scene, tmp_path):
+    return [Party(small_scene.folder, tmp_path / "parties" / str(number), number, "segmented") for number in range(3)]
+
+
+def run_federation(shared, parties, tmp_path, simulation, on_progress=lambda rounds: None, made=Federation):
+    out, home = tmp_path / "out", tmp_path / "home"
+    home.mkdir()
+    write_app(shared, out / "app")
+    federation = made(parties, out, home, simulation)
+    try:
+        federation.open()
+        federation.watch(federation.run(out / "app"), on_progress)
+    finally:
+        federation.close()
+    assert not left_over(tmp_path)
+    assert not any(map(is_open, federation.ports))
+    return out
+
+
+def means_of(out):
+    return [load_checkpoint(path)["weights"] for path in sorted((out / "weights").iterdir())]
+
+
+def same_means(out, shared, parties):
+    """Whether every mean is that of one process, to 1e-6."""
+    expected, got = federate(shared, parties, lambda count: None), means_of(out)
+    assert len(got) == len(expected)
+    for a, b in zip(got, expected):
+        for name in b:
+            np.testing.assert_allclose(a[name], b[name], rtol=0, atol=1e-6)
+    assert any((expected[0][name] != expected[-1][name]).any() for name in expected[0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("simulation", [False, True])
+def test_flower_makes_the_means_of_one_process(simulation, shared, parties, tmp_path):
+    out = run_federation(shared, parties, tmp_path, simulation)
+    same_means(out, shared, parties)
+    for party in parties:
+        assert len(list(party.folder.glob("run-[0-9]*/metrics.csv"))) == 1
+
+
+@pytest.mark.slow
+def test_a_party_that_is_killed_comes_back(shared, parties, tmp_path):
+    # Rounds go on with two of three; Flower takes the third back a minute after its last heartbeat.
+    run = shared.run.model_copy(update={"episodes": 48})
+    shared = replace(shared, run=run, learner=shared.learner.model_copy(update={"federate_every": 4}))
+    federations, killed = [], []
+
+    class Watched(Federation):
+        def watch(self, *given):
+            federations.append(self)
+            super().watch(*given)
+
+    def on_progress(rounds):
+        if not killed:
+            federations[0].processes.kill("supernode-1")
+            killed.append(rounds)
+
+    out = run_federation(shared, parties, tmp_path, False, on_progress, Watched)
+    heard = pd.read_csv(out / "rounds.csv")["parties"].tolist()
+    assert len(heard) == 12 and heard[0] == 3 and heard[-1] == 3 and 2 in heard and min(heard) >= 2
+    done = json.loads((out / "done.json").read_text())
+    assert done == {"rounds": 12, "evaluated": 3}
+    [table] = [pd.read_csv(path) for path in parties[1].folder.glob("run-[0-9]*/metrics.csv")]
+    assert 4 <= table["simulated_episodes"].iloc[-1] < 48
+
+
+@pytest.mark.slow
+def test_strangers_are_not_let_in(shared, parties, tmp_path):
+    out, home = tmp_path / "out", tmp_path / "home"
+    home.mkdir()
+    federation = Federation(parties[:1], out, home, simulation=False)
+    try:
+        federation.open()
+        link = f"127.0.0.1:{federation.ports[0]}"
+        make_node_key(home / "stranger")
+        for name, options in (
+                ("unregistered", ["--root-certificates", str(home / "ca.crt"), "--auth-supernode-private-key",
+                                  str(home / "stranger")]),
+                ("nameless", ["--root-certificates", str(home / "ca.crt")]),
+                ("other-authority", ["--max-wait-time", "1", "--auth-supernode-private-key", str(home / "node-0")]),
+                ("plain", ["--max-wait-time", "1", "--insecure"])):
+            federation.processes.start(name, ["flower-supernode", "--superlink", link, "--port", str(free_port()),
+                                              *options])
+            end = time.monotonic() + 120
+            while federation.processes.is_running(name) and time.monotonic() < end:
+                time.sleep(0.5)
+            assert not federation.processes.is_running(name), federation.processes.end_of_log(name)
+            assert "SuperNode ID" not in federation.processes.end_of_log(name)
+        assert federation.processes.is_running("supernode-0")
+    finally:
+        federation.close()
+    assert not left_over(tmp_path)
+
+
+def test_a_command_that_fails_ends_with_its_message(shared, parties, tmp_path):
+    home = tmp_path / "home"
+    home.mkdir()
+    federation = Federation(parties, tmp_path / "out", home, simulation=False)
+    with pytest.raises(RunFailed, match="flwr run"):
+        federation.run(tmp_path / "no-app")
+    federation.close()
