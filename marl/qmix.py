@@ -286,7 +286,7 @@ class QMIX(Learner):
     it is trained in; the best one there, earlier rounds included, is the one that flies.
     """
 
-    networks: type[QNetworks] = QNetworks
+    networks: Callable[..., QNetworks] = QNetworks
 
     def __init__(self, setup: Setup, numbers: Sequence[int] = (0,)) -> None:
         super().__init__(setup)

@@ -118,9 +118,10 @@ def _difference(out: Path, means: list[Weights]) -> float:
 
 
 def _cases(seed: int) -> dict[str, dict]:
-    base = {"real_episodes": 2, "episodes": 200, "federate_every": 40, "hidden": 32, "flights": 32,
-            "epsilon_slots": 10_000, "survey_flights": 3, "timeout_s": 900, "killed_after": 0,
-            "compare_means": False}
+    base: dict[str, Any] = {
+        "real_episodes": 2, "episodes": 200, "federate_every": 40, "hidden": 32, "flights": 32,
+        "epsilon_slots": 10_000, "survey_flights": 3, "timeout_s": 900, "killed_after": 0,
+        "compare_means": False}
     cases = {"in-process": base | {"engine": "in-process"},
              "flower, one killed": base | {"engine": "flower", "killed_after": 3}}
     if seed == 0:

@@ -241,9 +241,11 @@ class Client:
             write_csv(pd.DataFrame(self._rows), temporary)
 
     def _save(self) -> None:
-        flown = self._measured is None and self._reality is not None
+        tables = []
+        if self._measured is None and self._reality is not None:
+            tables = self._reality.tables
         state = {"done": self._done, "entered": self._entered, "rows": self._rows,
-                 "spent": dict(self._spent), "tables": self._reality.tables if flown else [],
+                 "spent": dict(self._spent), "tables": tables,
                  "replica": self._replica.state(last=False), "twin": None}
         if self._twin is not None:
             self._twin.save(self._party.folder / "twin")

@@ -61,7 +61,8 @@ class Record:
     """Folder with the mean after every round, and a table of the rounds."""
 
     def __init__(self, folder: Path) -> None:
-        self._folder, self._rows, self._started = folder, [], time.perf_counter()
+        self._folder, self._rows = folder, list[dict]()
+        self._started = time.perf_counter()
         self.heard, self.episodes = 0, 0  # in the present round
 
     def keep(self, number: int, arrays: ArrayRecord) -> MetricRecord | None:

@@ -52,7 +52,8 @@ class Shared:
         Raises:
             BadInput: names what is not allowed.
         """
-        numbers = {name: config.get(name) for name in ("clients", "uavs", "devices")}
+        numbers: dict[str, Any] = {name: config.get(name)
+                                   for name in ("clients", "uavs", "devices")}
         for name, value in numbers.items():
             if type(value) is not int or not 1 <= value <= 10_000:
                 raise BadInput(f"{name} = {str(value)[:40]} in the settings of the federation; "

@@ -6,6 +6,7 @@ Flower pins older versions of what radiotwin uses: where it is not installed the
 
 import json
 import os
+import re
 import signal
 import socket
 import time
@@ -30,8 +31,8 @@ from marl.fedqmix.flower_records import arrays_of  # noqa: E402
 from marl.fedqmix.flower_run import Federation, free_port  # noqa: E402
 from marl.fedqmix.flower_server import Record, make_strategy  # noqa: E402
 from marl.fedqmix.keys import make_node_key  # noqa: E402
-from marl.fedqmix.session import federate  # noqa: E402
-from marl.fedqmix.settings import FederationSettings  # noqa: E402
+from marl.fedqmix.session import FederatedSession, federate  # noqa: E402
+from marl.fedqmix.settings import EngineSettings, FederationSettings  # noqa: E402
 from marl.fedqmix.shared import Shared, initial_weights, write_app  # noqa: E402
 from marl.settings import PRESETS, RunSettings  # noqa: E402
 from radiotwin.errors import RunFailed  # noqa: E402
@@ -267,11 +268,19 @@ def same_means(out, shared, parties):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("simulation", [False, True])
-def test_flower_makes_the_means_of_one_process(simulation, shared, parties, tmp_path):
-    out = run_federation(shared, parties, tmp_path, simulation)
+def test_flower_makes_the_means_of_one_process(simulation, shared, parties, tmp_path, capsys):
+    out = tmp_path / "out"
+    engine = EngineSettings(federation="flower" if simulation else "flower-processes",
+                            party_scenes=",".join(str(party.scene) for party in parties))
+    run = shared.run.model_copy(update={"truth": "segmented"})
+    FederatedSession(run, shared.learner, FederationSettings(), engine, out).execute()
+    assert not left_over(tmp_path)
+    ports = re.findall(r"127\.0\.0\.1:(\d+)", "".join(path.read_text() for path in (out / "logs").iterdir()))
+    assert len(set(ports)) >= (1 if simulation else 4) and not any(is_open(int(port)) for port in ports)
     same_means(out, shared, parties)
-    for party in parties:
-        assert len(list(party.folder.glob("run-[0-9]*/metrics.csv"))) == 1
+    assert pd.read_csv(out / "rounds.csv")["parties"].tolist() == [3, 3]
+    assert len(list(out.glob("parties/*/run-*/metrics.csv"))) == 3 and (out / "curve.png").exists()
+    assert "in its truth" in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.slow
