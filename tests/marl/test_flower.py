@@ -37,7 +37,7 @@ from marl.fedqmix.shared import Shared, initial_weights, write_app  # noqa: E402
 from marl.settings import PRESETS, RunSettings  # noqa: E402
 from radiotwin.errors import RunFailed  # noqa: E402
 
-MAX_S = 900  # of a test, on a machine that does much else
+MAX_S = 1800  # of a test, on a machine that does much else
 
 LEARNER = PRESETS["fast"].model_copy(update={
     "parallel": 4, "batch": 4, "replay": 16, "hidden": 8, "mixing_width": 4, "federate_every": 8,
