@@ -163,12 +163,19 @@ class Federation:
             "--node-config", str(self._home / f"node-{number}.toml")])
 
     def run(self, app: Path) -> str:
-        """Submit the app, and return the number of its run."""
+        """Submit the app, and return the number of its run.
+
+        Raises:
+            RunFailed: Flower does not take it.
+        """
         command = ["flwr", "run", str(app), LINK, "--format", "json"]
         if self._simulation:
             command += ["--federation-config", f"num-supernodes={len(self._parties)} "
                         "client-resources-num-cpus=1"]
-        return str(json.loads(self.processes.call(command))["run-id"])
+        answer = json.loads(self.processes.call(command))
+        if not answer.get("run-id"):  # with JSON, its exit status says nothing
+            raise RunFailed(f"flwr run has failed: {str(answer)[:800]}")
+        return str(answer["run-id"])
 
     def watch(self, run: str, on_progress: Callable[[int], None]) -> None:
         """Wait for the end of a run; a SuperNode that ends is started again.
