@@ -12,6 +12,8 @@ VENV ?= .venv
 PIP_ARGS ?=
 TORCH_INDEX ?=
 TESTS ?=
+EXTRAS := test
+CONSTRAINTS := constraints.txt
 FAST_TESTS := $(addprefix tests/,antennas channel effects export footprints importing inference links paths \
 	report scene survey trace test_layout.py)
 
@@ -26,12 +28,13 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist load
 CAN_APT := command -v apt-get > /dev/null && $(SUDO) true 2> /dev/null
 APT_INSTALL := $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=120 install -y -q
 
-.PHONY: help demo test test-all check docs bench llvm clean
+.PHONY: help demo test test-all test-flower check docs bench llvm clean
 
 help:
 	@echo "make demo    set up, then the whole chain on a small city"
 	@echo "make test     set up, then every test but the slow ones (under ten minutes on two cores)"
 	@echo "make test-all every test: statistics over many seeds, real data where it is, long chains"
+	@echo "make test-flower the tests of federation over Flower, in an environment of their own"
 	@echo "make check    ruff, mypy and the fast tests (under two minutes)"
 	@echo "make docs    the site, in site/; runs the examples"
 	@echo "make bench   what takes how long; \`python -m studies --list\` lists all studies"
@@ -49,6 +52,12 @@ test: $(INSTALLED)
 test-all: $(INSTALLED)
 	$(PYTEST) $(TESTS)
 
+# Flower pins older versions of typer, rich, packaging and protobuf than constraints.txt has.
+test-flower:
+	$(MAKE) --no-print-directory VENV=$(VENV)-flower EXTRAS=test,flower CONSTRAINTS=constraints-flower.txt \
+		$(VENV)-flower/.installed
+	OMP_NUM_THREADS=1 $(VENV)-flower/bin/python -m pytest --numprocesses 0 tests/marl/test_flower.py tests/marl/test_client.py
+
 check: $(INSTALLED)
 	$(BIN)/ruff check
 	$(BIN)/mypy
@@ -65,11 +74,11 @@ bench: llvm
 	$(BIN)/python -m studies speed --out build/speed
 
 # The second run does nothing, until what is to be installed has changed.
-$(INSTALLED): pyproject.toml constraints.txt
+$(INSTALLED): pyproject.toml $(CONSTRAINTS)
 	@$(BIN)/python -m pip --version > /dev/null 2>&1 || $(MAKE) --no-print-directory $(VENV)
 	@[ -z "$(TORCH_INDEX)" ] || $(BIN)/python -m pip install --disable-pip-version-check --no-deps \
-		--index-url "$(TORCH_INDEX)" "$$(grep '^torch==' constraints.txt)"
-	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c constraints.txt -e '.[test]'
+		--index-url "$(TORCH_INDEX)" "$$(grep '^torch==' $(CONSTRAINTS))"
+	$(BIN)/python -m pip install --disable-pip-version-check $(PIP_ARGS) -c $(CONSTRAINTS) -e '.[$(EXTRAS)]'
 	@touch $@
 
 # Debian and Ubuntu keep the module venv in a package of its own.
@@ -92,5 +101,5 @@ llvm: $(INSTALLED)
 	@$(BIN)/python -m radiotwin.llvm
 
 clean:
-	rm -rf $(VENV) build dist site *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
+	rm -rf $(VENV) $(VENV)-flower build dist site *.egg-info .pytest_cache .ruff_cache .mypy_cache .hypothesis
 	find radiotwin marl tests studies -name __pycache__ -prune -exec rm -rf {} +

@@ -104,11 +104,11 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
             if run.twin == "truth":
                 mission = reality.mission(known)
             else:
-                reality.fly(_measuring(run, reality, twin, known, learner, rng), known)
+                reality.fly(measuring_policy(run, reality, twin, known, learner, rng), known)
                 twin = learn_twin(reality, run.twin, run.seed, twin)
                 known = known if true_positions else Known.of(twin.devices)
                 lasting = reality.measurements() if run.twin_shadowing == "fitted" else None
-                mission = reality.twin_mission(twin, known, lasting)
+                mission = twin_mission(scene, run, twin, known, lasting)
             learned_s = time.perf_counter() - started
             blocks += [{"round": number + 1} | block
                        for block in learner.prepare(mission, on_progress)]
@@ -121,8 +121,8 @@ def run_algorithm(run: RunSettings, learner_settings: LearnerSettings, scene: Sc
             flights = evaluate(real, learner.policy(rng), run.flights,
                                stream(run.seed, "truth evaluation"))
             found = known if twin is None else Known.of(twin.devices)
-            rows.append(_row(run, learner, number + 1, in_twin, flights.ratio(real),
-                             location_errors_m(scene, found))
+            rows.append(round_row(run, learner, number + 1, in_twin, flights.ratio(real),
+                                  location_errors_m(scene, found))
                         | {"evaluation_flights": (number + 1) * run.flights,
                            "learn_twin_s": learned_s, "round_s": time.perf_counter() - started})
             on_progress(0, _summary(rows[-1], run))
@@ -167,21 +167,6 @@ class Reality:
     def mission(self, known: Known) -> Mission:
         """Return the mission in the truth, for UAVs that know these positions."""
         return make_mission(self.scene, self.truth, known, self.assignment)
-
-    def twin_mission(self, twin: Twin, known: Known,
-                     measurements: Measurements | None = None) -> Mission:
-        """Return the mission in a twin.
-
-        Args:
-            twin: it gives the map.
-            known: positions that the UAVs know.
-            measurements: errors of the map last as long as their residuals say; None: for a slot.
-        """
-        radio_map = twin.radio_map(self.scene)
-        if measurements is not None:
-            radio_map = with_shadowing(radio_map, twin, measurements,
-                                       self.scene.config.gain_limit_db, self.seed)
-        return make_mission(self.scene, radio_map, known, self.assignment)
 
     def fly(self, policy: Policy, known: Known) -> Flights:
         """Fly one real episode and keep the measurements of every device in every slot."""
@@ -236,6 +221,24 @@ def learn_twin(reality: Reality, kind: str, seed: int, before: Twin | None) -> T
                     start=before)
 
 
+def twin_mission(scene: Scene, run: RunSettings, twin: Twin, known: Known,
+                 measurements: Measurements | None) -> Mission:
+    """Return the mission in a twin.
+
+    Args:
+        scene: of the twin.
+        run: settings of the run.
+        twin: it gives the map.
+        known: positions that the UAVs know.
+        measurements: errors of the map last as long as their residuals say; None: for a slot.
+    """
+    radio_map = twin.radio_map(scene)
+    if measurements is not None:
+        radio_map = with_shadowing(radio_map, twin, measurements, scene.config.gain_limit_db,
+                                   run.seed)
+    return make_mission(scene, radio_map, known, run.assignment)
+
+
 def location_errors_m(scene: Scene, known: Known) -> np.ndarray:
     """Return the distance of each unknown device's estimate from its true position [m].
 
@@ -247,8 +250,8 @@ def location_errors_m(scene: Scene, known: Known) -> np.ndarray:
         for d in scene.config.devices if d.role == "unknown"])
 
 
-def _measuring(run: RunSettings, reality: Reality, twin: Twin | None, known: Known,
-               learner: Learner, rng: np.random.Generator) -> Policy:
+def measuring_policy(run: RunSettings, reality: Reality, twin: Twin | None, known: Known,
+                     learner: Learner, rng: np.random.Generator) -> Policy:
     """Return the policy of the next real episode."""
     how = run.measure if twin is not None else run.first_flight
     if how == "waypoints":
@@ -256,8 +259,18 @@ def _measuring(run: RunSettings, reality: Reality, twin: Twin | None, known: Kno
     return HeuristicPolicy("random", rng) if twin is None else learner.policy(rng)
 
 
-def _row(run: RunSettings, learner: Learner, number: int, in_twin: np.ndarray, real: np.ndarray,
-         errors_m: np.ndarray) -> dict:
+def round_row(run: RunSettings, learner: Learner, number: int, in_twin: np.ndarray,
+              real: np.ndarray, errors_m: np.ndarray) -> dict:
+    """Return the row of a round in the log.
+
+    Args:
+        run: settings of the run.
+        learner: that has been prepared in so many rounds.
+        number: of the round, from 1.
+        in_twin: (E,) shares collected in the twin.
+        real: (E,) shares collected in the truth.
+        errors_m: see `location_errors_m`.
+    """
     simulated = number * run.episodes * learner.replicas
     located = errors_m[np.isfinite(errors_m)]
     return {

@@ -6,7 +6,7 @@ one map after the other. Exploration, replay memory and schedules are in `marl.t
 
 import copy
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -170,7 +170,7 @@ class QNetworks:
             target = td_lambda_targets(reward, best, valid, settings.discount, settings.td_lambda)
         count = valid.sum() * chosen[0, 0].numel()
         loss = ((chosen - target) * valid).square().sum() / count
-        gradients = torch.autograd.grad(loss, self.parameters())
+        gradients = torch.autograd.grad(loss + self.penalty(), self.parameters())
         norm = torch.stack([gradient.norm() for gradient in gradients]).norm()
         scale = (MAX_GRADIENT_NORM / norm).clamp(max=1.0)
         self.optimiser.step([gradient * scale for gradient in gradients], learning_rate)
@@ -185,6 +185,10 @@ class QNetworks:
         """Return the values that are learned: (T, E) Q_tot of (T, E, U) values of actions."""
         return modules["mixer"](values, state)
 
+    def penalty(self) -> Tensor | float:
+        """Return what a subclass adds to the loss."""
+        return 0.0
+
     def copy_to_targets(self) -> None:
         """Copy the online networks to the target networks."""
         for name, module in self.modules.items():
@@ -195,8 +199,7 @@ class QNetworks:
         count, slots = flights.action.shape[:2]
         flat = Frame(*(array.swapaxes(0, 1).reshape(count * slots, *array.shape[2:])
                        for array in flights.frames))
-        none = np.zeros((count * slots, 0), np.float32)
-        state = global_state(mission, flat) if self.mixes else none
+        state = global_state(mission, flat) if self.mixes else np.zeros((count * slots, 0), "f4")
         observation, mask, state = (
             torch.from_numpy(array).to(self.device).unflatten(0, (slots, count))
             for array in (*observe(mission, flat), state))
@@ -283,40 +286,50 @@ class QMIX(Learner):
     it is trained in; the best one there, earlier rounds included, is the one that flies.
     """
 
-    networks: type[QNetworks] = QNetworks
+    networks: Callable[..., QNetworks] = QNetworks
 
-    def __init__(self, setup: Setup, replicas: int = 1) -> None:
+    def __init__(self, setup: Setup, numbers: Sequence[int] = (0,)) -> None:
         super().__init__(setup)
-        run, settings, mission, self.replicas = setup.run, setup.settings, setup.mission, replicas
+        run, settings, mission = setup.run, setup.settings, setup.mission
+        self.replicas = len(numbers)
         self._current = self.networks(settings, mission, run.seed, setup.device).agent
         self._best = copy.deepcopy(self._current)
-        self._episodes = 0
+        self._episodes, self._highest, self._mission = 0, -np.inf, mission
         self._actions: np.ndarray | None = None  # of the guide's plan
         horizon = setup.rounds * run.episodes
         self._trainers = Replicas([(self.networks, settings, mission, horizon, run.seed, number,
-                                    setup.device) for number in range(replicas)])
+                                    setup.device) for number in numbers])
 
     @override
     def prepare(self, mission: Mission,
                 on_progress: Callable[[int], None]) -> list[dict[str, float]]:
-        run, settings = self.setup.run, self.setup.settings
-        if run.guide == "planner":
-            self._actions = self._better_plan(mission)
-        self._trainers.call("enter", mission, self._actions)
-        records, left = [], run.episodes
-        highest = self._ratio(mission, self._best) if self._episodes else -np.inf
+        self._enter(mission)
+        records, left = [], self.setup.run.episodes
         while left:
-            block = min(left, settings.federate_every)
+            block = min(left, self.setup.settings.federate_every)
             trained, weights = self._train(block)
             left, self._episodes = left - block, self._episodes + block
-            _load(self._current, weights)
-            ratio = self._ratio(mission, self._current)
-            if not ratio <= highest:  # also where it is NaN, so that the last one flies
-                highest = ratio
-                _load(self._best, weights)
+            ratio = self._judge(weights)
             records.append({"episodes": self._episodes, "twin_ratio": ratio} | trained)
             on_progress(block)
         return records
+
+    def _enter(self, mission: Mission) -> None:
+        """Go on in another map."""
+        self._mission = mission
+        if self.setup.run.guide == "planner":
+            self._actions = self._better_plan(mission)
+        self._trainers.call("enter", mission, self._actions)
+        self._highest = self._ratio(mission, self._best) if self._episodes else -np.inf
+
+    def _judge(self, weights: dict[str, np.ndarray]) -> float:
+        """Return the share that these weights collect in the map; keep the best ones."""
+        _load(self._current, weights)
+        ratio = self._ratio(self._mission, self._current)
+        if not ratio <= self._highest:  # also where it is NaN, so that the last one flies
+            self._highest = ratio
+            _load(self._best, weights)
+        return ratio
 
     def _train(self, episodes: int) -> tuple[dict[str, float], dict[str, np.ndarray]]:
         """Train for some episodes; return the record to be logged, and the new weights."""

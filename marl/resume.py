@@ -54,28 +54,33 @@ def restored(path: Path, run: RunSettings, scene: Scene,
     try:
         has_twin = run.twin != "truth"
         require_fields(state, ("rows", "blocks", "tables", "strategy", *["twin"] * has_twin))
-        rows, blocks = _rows(state["rows"], run), _blocks(state["blocks"])
+        rows, blocks = check_rows(state["rows"], 1, run.real_episodes), _blocks(state["blocks"])
         tables = state["tables"]
         if not isinstance(tables, list) or len(tables) != len(rows) * has_twin:
             raise Damaged("each round has one table of measurements")
         for number, table in enumerate(tables):
-            _check_table(table, number, scene)
+            check_table(table, number, scene)
         learner.load_state(state["strategy"])
-        twin = _twin(state["twin"], path, scene) if has_twin else None
+        twin = stored_twin(state["twin"], path, scene) if has_twin else None
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError) as error:
         refuse_damaged(path, error)
     return rows, blocks, tables, twin
 
 
-def _rows(rows: Any, run: RunSettings) -> list[dict]:
-    if not isinstance(rows, list) or not 1 <= len(rows) <= run.real_episodes:
-        raise Damaged(f"a run has 1 to {run.real_episodes} rounds")
+def check_rows(rows: Any, least: int, most: int) -> list[dict]:
+    """Return the rows of a log after a check that there are `least` to `most` of them.
+
+    Raises:
+        Damaged: there are not, or they are none.
+    """
+    if not isinstance(rows, list) or not least <= len(rows) <= most:
+        raise Damaged(f"a run has {least} to {most} rounds")
     for number, row in enumerate(rows):
         require_fields(row, (*_COUNTS, *_NUMBERS))
         for name in _COUNTS:
             require_count(row[name])
         for name in _NUMBERS:
-            _require_number(row[name])
+            require_number(row[name])
         if row["round"] != number + 1:
             raise Damaged("rounds are not in order")
     return rows
@@ -90,16 +95,22 @@ def _blocks(blocks: Any) -> list[dict]:
         for name, value in block.items():
             if len(name) > _MAX_NAME or not name.isidentifier():
                 raise Damaged(f"{name[:_MAX_NAME]!r} is no name")
-            _require_number(value)
+            require_number(value)
     return blocks
 
 
-def _require_number(value: Any) -> None:
+def require_number(value: Any) -> float:
+    """Return a number of a log after a check.
+
+    Raises:
+        Damaged: it is none.
+    """
     if type(value) not in (int, float) or not (math.isnan(value) or abs(value) <= _MAX_NUMBER):
         raise Damaged(f"{str(value)[:40]} should be a number")
+    return value
 
 
-def _check_table(table: Any, number: int, scene: Scene) -> None:
+def check_table(table: Any, number: int, scene: Scene) -> None:
     """Refuse a table of a flight that this scene's UAVs cannot have measured."""
     config, lattice = scene.config, scene.lattice
     known = {"flight": [f"f{number}"], "receiver": [uav.uav for uav in config.uavs],
@@ -124,7 +135,12 @@ def _check_table(table: Any, number: int, scene: Scene) -> None:
             raise Damaged(f"{name} of a measurement is no number from {low:g} to {high:g}")
 
 
-def _twin(content: Any, path: Path, scene: Scene) -> Twin:
+def stored_twin(content: Any, path: Path, scene: Scene) -> Twin:
+    """Return the twin of a checkpoint after a check that it is of the scene's devices.
+
+    Raises:
+        Damaged: it is not.
+    """
     require_fields(content, ("record", "channel"))
     channel = content["channel"]
     if not isinstance(content["record"], str) or not isinstance(channel, np.ndarray) \

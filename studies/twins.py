@@ -10,7 +10,7 @@ import pandas as pd
 import trimesh
 from matplotlib.figure import Figure
 
-from marl.algorithm1 import Reality, location_errors_m
+from marl.algorithm1 import Reality, location_errors_m, twin_mission
 from marl.environment import Environment, Frame
 from marl.figures import COLOURS, MARKERS
 from marl.flights import Flights, Replayed, evaluate, fly
@@ -120,7 +120,7 @@ def train_and_fly(reality: Reality, twin: Twin | None, run: RunSettings, learner
     """
     known = Known.truth(reality.scene) if twin is None else Known.of(twin.devices)
     real = reality.mission(known)
-    inside = real if twin is None else reality.twin_mission(twin, known, measured)
+    inside = real if twin is None else twin_mission(reality.scene, run, twin, known, measured)
     trained, result = make_learner(run, learner, inside, 1), {}
     try:
         with progress(f"training, seed {run.seed}", total=run.episodes) as advance:

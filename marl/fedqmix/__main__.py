@@ -10,14 +10,16 @@ from typing import Annotated
 
 import typer
 
-from marl.options import settings_of, with_settings
+from marl.fedqmix.settings import EngineSettings, FederationSettings
+from marl.options import checked, settings_of, with_settings
 from marl.settings import LearnerSettings, RunSettings
 from radiotwin.command import with_output_options
 from radiotwin.console import say, show_warnings_plainly
+from radiotwin.errors import BadInput
 from radiotwin.exits import exit_status
 
 
-@with_settings(RunSettings, LearnerSettings)
+@with_settings(RunSettings, LearnerSettings, EngineSettings, FederationSettings)
 def fedqmix(
     given: dict[str, str],
     out: Annotated[Path | None, typer.Option(
@@ -32,12 +34,25 @@ def fedqmix(
     """
     show_warnings_plainly()
     run, learner = settings_of(given)
-
-    from marl.session import Session  # torch and all: not for --help
-
+    engine = checked(given, EngineSettings())
+    federation = checked(given, FederationSettings())
     name = f"{run.scene.name}-{run.truth}-{run.twin}-{run.algorithm}-{run.seed}"
     folder = out or Path("runs") / name
-    Session(run, learner, folder, resume).execute()
+    if engine == EngineSettings():  # one owner of all
+        if federation != FederationSettings():
+            raise BadInput("--strategy and what goes with it are of a federation; give "
+                           "--federation or --party-scenes, too")
+        from marl.session import Session  # torch and all: not for --help
+
+        Session(run, learner, folder, resume).execute()
+    else:
+        if run.algorithm != "fedqmix" or resume:
+            raise BadInput("parties of a federation train with --algorithm fedqmix and without "
+                           "--resume; leave out --federation, --party-scenes and "
+                           "--party-measurements, or that")
+        from marl.fedqmix.session import FederatedSession
+
+        FederatedSession(run, learner, federation, engine, folder).execute()
     say(f"wrote {folder}")
 
 

@@ -1,10 +1,13 @@
 """FedQMIX: one QMIX replica for each UAV, averaged from time to time (the paper, Sec. III-C)."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from typing_extensions import override
 
 from marl.learner import Setup
 from marl.qmix import QMIX
+from radiotwin.errors import BadInput
 
 Weights = dict[str, np.ndarray]
 
@@ -21,6 +24,30 @@ def average(replicas: list[Weights]) -> Weights:
             .astype(first.dtype) for name, first in replicas[0].items()}
 
 
+def require_weights(given: Mapping[str, np.ndarray], like: Weights) -> None:
+    """Refuse weights that are not those of these networks: they come from somebody else.
+
+    Args:
+        given: name -> array.
+        like: of the right names, types and shapes.
+
+    Raises:
+        BadInput: they differ, are not finite, or are negative where squares are averaged.
+    """
+    if set(given) != set(like):
+        odd = sorted(set(given) ^ set(like))[0]
+        raise BadInput(f"weights {odd[:100]} are missing or unknown here; all parties need the "
+                       "same settings of learning")
+    for name, array in given.items():
+        expected = like[name]
+        if array.shape != expected.shape or array.dtype != expected.dtype:
+            raise BadInput(f"weights {name} are {array.dtype} of the shape {array.shape}, and "
+                           f"{expected.dtype} of the shape {expected.shape} are needed; all "
+                           "scenes of a federation have equal numbers of UAVs and devices")
+        if not np.isfinite(array).all() or (name.startswith("square.") and (array < 0).any()):
+            raise BadInput(f"weights {name} are not finite, or squares are negative")
+
+
 class FedQMIX(QMIX):
     """`--algorithm fedqmix`: as `QMIX`, with a replica for each UAV.
 
@@ -30,7 +57,7 @@ class FedQMIX(QMIX):
     """
 
     def __init__(self, setup: Setup) -> None:
-        super().__init__(setup, replicas=setup.mission.uavs)
+        super().__init__(setup, numbers=range(setup.mission.uavs))
 
     @override
     def _train(self, episodes: int) -> tuple[dict[str, float], Weights]:
