@@ -124,14 +124,14 @@ def test_a_piece_that_kills_every_worker_ends_in_one_message(executors, place, t
 
 
 def test_a_worker_that_takes_too_much_memory_is_ended(executors):
-    limit = Resources(memory_bytes=300 * 2**20)
+    limit = Resources(memory_bytes=2**30)
     job = Job("hungry", grow, limit, halve=lambda megabytes: (megabytes // 2, megabytes - megabytes // 2),
               join=lambda first, second: first + second)
-    with pytest.warns(UserWarning, match=r"took more than 0\.3 GiB of memory"):
-        assert executors("local").run(job, [300, 20]) == [30, 2]
-    with pytest.raises(RunFailed, match=r"half a piece.*A worker may take 0\.3 GiB"), warnings.catch_warnings():
+    with pytest.warns(UserWarning, match=r"took more than 1\.0 GiB of memory"):
+        assert executors("local").run(job, [1300, 20]) == [130, 2]
+    with pytest.raises(RunFailed, match=r"half a piece.*A worker may take 1\.0 GiB"), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        executors("local").run(job, [2000])
+        executors("local").run(job, [4000])
 
 
 def test_more_memory_than_there_is_ends_in_one_message():
