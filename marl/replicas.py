@@ -11,9 +11,10 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from marl.checkpoint import Damaged
-from marl.threads import die_with_parent, keep_memory, limit_threads
+from marl.threads import keep_memory, limit_threads
 from marl.training import Trainer
 from radiotwin.errors import RunFailed
+from radiotwin.processes import die_with_parent
 from radiotwin.signals import kept_from_children
 from radiotwin.threads import usable_cores
 

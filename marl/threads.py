@@ -1,8 +1,6 @@
 """Threads, memory and device of a process that trains."""
 
 import ctypes
-import os
-import signal
 import sys
 
 import scipy.linalg  # noqa: F401  compiled code uses its BLAS, limited only once it is loaded
@@ -30,20 +28,6 @@ def keep_memory() -> None:
         mmap_threshold, trim_threshold = -3, -1  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD of malloc.h
         ctypes.CDLL(None).mallopt(mmap_threshold, 32 << 20)
         ctypes.CDLL(None).mallopt(trim_threshold, 512 << 20)
-
-
-def die_with_parent(parent: int) -> None:
-    """Have this process end when the one that started it is killed, even in a long computation.
-
-    Only Linux can.
-
-    Args:
-        parent: its number; it may have died already.
-    """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(1, int(signal.SIGKILL))  # PR_SET_PDEATHSIG of sys/prctl.h
-        if os.getppid() != parent:
-            os._exit(1)
 
 
 def torch_device(wanted: str) -> str:

@@ -9,9 +9,10 @@ import pandas as pd
 from radiotwin.channel import channel_named
 from radiotwin.channel.published import MAX_FACTOR, PublishedLaw
 from radiotwin.errors import BadInput
+from radiotwin.execution import Executor, Job, Resources
 from radiotwin.inference.gaussian import mean_if_detected
 from radiotwin.measurements import Measurements
-from radiotwin.progress import progress
+from radiotwin.pieces import with_pieces
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin, fit_twin
@@ -20,6 +21,7 @@ from radiotwin.twin import Twin, fit_twin
 DEFAULT_MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "regression_kriging")
 # Published laws that `radiotwin compare` adds: nothing is fitted, so they cost only the search.
 PUBLISHED_MODELS = ("tr36777_uma", "tr36777_umi", "al_hourani_urban", "p1411", "cost231_wi")
+WORKER_BYTES = 3 * 2**30  # of a process that fits a model
 CLASSES = ("all", "LoS", "NLoS")  # of links, as the tables name them
 
 
@@ -135,7 +137,8 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene,
                    truth: RadioMap | None = None, *, seed: int = 0,
                    models: tuple[str, ...] = DEFAULT_MODELS,
                    twins: dict[str, Twin] | None = None,
-                   maps: dict[str, RadioMap] | None = None) -> Comparison:
+                   maps: dict[str, RadioMap] | None = None,
+                   executor: Executor | None = None) -> Comparison:
     """Fit every model to the same links and judge all of them on the same others.
 
     Args:
@@ -148,6 +151,7 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene,
         models: names, as for `fit_twin`.
         twins: fitted already, judged beside the models, by the name that they get in the tables.
         maps: made already, judged on the truth map.
+        executor: where the models are fitted; None: in this process.
 
     Returns:
         errors of all of them
@@ -159,11 +163,9 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene,
     _check(test, scene, truth, twins or {})
     for twin in (twins or {}).values():
         twin.require_map(scene)  # refuses before the others are fitted, which takes long
-    fitted = {}
-    with progress("comparing models", total=len(models)) as advance:
-        for model in models:
-            fitted[model] = fit_twin(train, scene, model=model, seed=seed)
-            advance(1)
+    job = Job("comparing models", with_pieces(_FitModel(train, scene, seed)),
+              Resources(WORKER_BYTES, False))
+    fitted = dict(zip(models, (executor or Executor()).run(job, models), strict=True))
     fitted |= twins or {}
     true_m = true_positions(scene, train)
     los = _los(scene, true_m, test)
@@ -187,6 +189,18 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene,
         assert truth is not None  # a map can be judged on nothing else
         scores += score_map(name, candidate, truth)
     return Comparison(pd.DataFrame(scores), pd.DataFrame(locations), fitted, predictions)
+
+
+@dataclass(frozen=True)
+class _FitModel:
+    """Fits models, by their names; arguments as of `fit_twin`."""
+
+    train: Measurements
+    scene: Scene
+    seed: int
+
+    def __call__(self, model: str) -> Twin:
+        return fit_twin(self.train, self.scene, model=model, seed=self.seed)
 
 
 def _check(test: Measurements, scene: Scene, truth: RadioMap | None,

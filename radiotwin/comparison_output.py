@@ -21,6 +21,7 @@ from radiotwin.compare import (
     split_flights,
 )
 from radiotwin.errors import BadInput
+from radiotwin.execution import Executor
 from radiotwin.files import atomic_path
 from radiotwin.measurements import Measurements
 from radiotwin.radiomap import RadioMap
@@ -74,7 +75,7 @@ class ComparisonRecord(Record):
 
 def compare_held_out(measurements: Measurements, scene: Scene, truth: RadioMap | None = None, *,
                      held_out: int = 1, raytrace: bool = False, also: Sequence[Path | str] = (),
-                     seed: int = 0) -> Comparison:
+                     seed: int = 0, executor: Executor | None = None) -> Comparison:
     """Compare all channel models on the last flights, which none of them is fitted to.
 
     Published laws that hold at the scene's frequency are among them, fitted to nothing.
@@ -87,6 +88,7 @@ def compare_held_out(measurements: Measurements, scene: Scene, truth: RadioMap |
         raytrace: compare the model `raytrace`, too; takes minutes.
         also: folders of twins and, with a truth, files of radio maps, to compare with the models.
         seed: of all fits.
+        executor: where the models are fitted; None: in this process.
 
     Raises:
         BadInput: too few flights, or what `judge_also` and `compare_models` refuse.
@@ -96,7 +98,7 @@ def compare_held_out(measurements: Measurements, scene: Scene, truth: RadioMap |
     models = (*DEFAULT_MODELS, *published_models(scene.config.radio.frequency_hz),
               *["raytrace"] * raytrace)
     return compare_models(train, test, scene, truth, seed=seed, models=models, twins=twins,
-                          maps=maps)
+                          maps=maps, executor=executor)
 
 
 def judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],

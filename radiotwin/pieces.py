@@ -21,7 +21,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from radiotwin.interruption import note_finished
 
 Piece = tuple[dict[str, np.ndarray], Any]
 """Arrays by name, and what JSON can hold."""
+P = TypeVar("P")
 T = TypeVar("T")
 
 MIN_SECONDS = 0.05  # a part that took less is made again sooner than it is written
@@ -198,6 +199,28 @@ def keep_pieces(folder: Path | None = None) -> Iterator[PieceStore]:
         _stores.remove(store)
 
 
+def with_pieces(function: Callable[[P], T]) -> Callable[[P], T]:
+    """Return a function that keeps parts where this process does, in other processes, too."""
+    return _Keeping(function, _stores[-1].folder) if _stores else function
+
+
+@dataclass(frozen=True)
+class _Keeping(Generic[P, T]):
+    function: Callable[[P], T]
+    folder: Path
+
+    def __call__(self, piece: P) -> T:
+        if _stores:
+            return self.function(piece)
+        with keep_pieces(self.folder):
+            return self.function(piece)
+
+
+def keeps() -> bool:
+    """Return whether parts are kept now: inside `keep_pieces`."""
+    return bool(_stores)
+
+
 def kept(kind: str, inputs: tuple, make: Callable[[], T], pack: Callable[[T], Piece | None],
          unpack: Callable[[dict[str, np.ndarray], Any], T]) -> T:
     """Return the result of a function, from an earlier run where there is one.
@@ -216,15 +239,61 @@ def kept_with_name(kind: str, inputs: tuple, make: Callable[[], T],
                    pack: Callable[[T], Piece | None],
                    unpack: Callable[[dict[str, np.ndarray], Any], T]) -> tuple[T, str]:
     """Return the result of a function as `kept`, and the hash of its inputs; "" without one."""
-    if not _stores:
+    parts: KeptParts[None, T] = KeptParts(kind, lambda _: inputs, pack, unpack)
+    name = parts.name(None)
+    if not name:
         return make(), ""
-    store = _stores[-1]
-    try:
-        name = f"{kind}-{content_hash((kind, *versions(), *inputs))}"
-    except Unhashable:
-        return make(), ""
-    found = store.get(name, unpack)
+    found = parts.find(name)
     if found is not None:
+        return found[0], name
+    started = time.perf_counter()
+    with noted_warnings() as messages:
+        value = make()
+    parts.keep(name, value, messages, time.perf_counter() - started)
+    return value, name
+
+
+@dataclass(frozen=True, eq=False)
+class KeptParts(Generic[P, T]):
+    """Parts of one kind in the store in use, by the pieces of work that they are of.
+
+    Attributes:
+        kind: as of `kept`.
+        inputs: piece -> all that decides its part; what `content_hash` knows, else it is not kept.
+        pack, unpack: as of `kept`.
+    """
+
+    kind: str
+    inputs: Callable[[P], tuple]
+    pack: Callable[[T], Piece | None]
+    unpack: Callable[[dict[str, np.ndarray], Any], T]
+
+    def name(self, piece: P) -> str:
+        """Return the name of a part; "" where nothing is kept, or its inputs have no hash."""
+        if not _stores:
+            return ""
+        try:
+            return f"{self.kind}-{content_hash((self.kind, *versions(), *self.inputs(piece)))}"
+        except Unhashable:
+            return ""
+
+    def get(self, piece: P) -> tuple[T] | None:
+        """Return a part in a tuple, with its warnings shown; None where there is none."""
+        name = self.name(piece)
+        return self.find(name) if name else None
+
+    def put(self, piece: P, value: T, messages: list[str], seconds: float) -> None:
+        """Keep a part that was made, with the warnings that were shown, and the time it took."""
+        name = self.name(piece)
+        if name:
+            self.keep(name, value, messages, seconds)
+
+    def find(self, name: str) -> tuple[T] | None:
+        """Return the part of a name as `get` does."""
+        store = _stores[-1]
+        found = store.get(name, self.unpack)
+        if found is None:
+            return None
         value, messages = found
         if name not in store._own:
             store.earlier += 1
@@ -233,18 +302,17 @@ def kept_with_name(kind: str, inputs: tuple, make: Callable[[], T],
             if message not in store.shown:
                 store.shown.add(message)
                 warnings.warn(message, stacklevel=1)
-        return value, name
-    started = time.perf_counter()
-    with _warnings_noted() as messages:
-        value = make()
-    seconds = time.perf_counter() - started
-    store.shown.update(messages)
-    store.made += 1
-    if seconds >= MIN_SECONDS:
-        piece = pack(value)
-        if piece is not None:
-            store.put(name, piece, messages)
-    return value, name
+        return (value,)
+
+    def keep(self, name: str, value: T, messages: list[str], seconds: float) -> None:
+        """Keep the part of a name as `put` does."""
+        store = _stores[-1]
+        store.shown.update(messages)
+        store.made += 1
+        if seconds >= MIN_SECONDS:
+            packed = self.pack(value)
+            if packed is not None:
+                store.put(name, packed, messages)
 
 
 @cache
@@ -265,7 +333,7 @@ def versions() -> tuple[str, ...]:
 
 
 @contextmanager
-def _warnings_noted() -> Iterator[list[str]]:
+def noted_warnings() -> Iterator[list[str]]:
     """Yield a list that gets the texts of the warnings that are shown meanwhile."""
     # `warnings.catch_warnings` would forget which ones were shown before.
     show, messages = warnings.showwarning, list[str]()

@@ -17,10 +17,15 @@ def usable_cores() -> int:
     return os.cpu_count() or 1
 
 
+def allowed_cores() -> int:
+    """Return the number of cores that this process may use: no more than OMP_NUM_THREADS."""
+    limit = os.environ.get("OMP_NUM_THREADS", "")
+    return min(usable_cores(), max(int(limit), 1) if limit.isdigit() else usable_cores())
+
+
 def thread_count() -> int:
     """Return how many threads may run: the process's cores, no more than OMP_NUM_THREADS."""
-    limit = os.environ.get("OMP_NUM_THREADS", "")
-    return min(usable_cores(), MOST, max(int(limit), 1) if limit.isdigit() else MOST)
+    return min(allowed_cores(), MOST)
 
 
 def in_threads(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:

@@ -64,8 +64,8 @@ def run(name: str, seeds: int, only: str | None, resume: bool, jobs: int, out: P
     if absent:
         raise BadInput(f"no scene {', '.join(absent)}: docs/results.md says where they are from; "
                        "--only chooses rows without them")
-    for row in runner.run_rows(name, todo, out, jobs):
-        say(f"{name} {row['name']} seed {row['seed']}: {row['cpu_s']:.0f} CPU s")
+    runner.run_rows(name, todo, out, jobs, lambda row: say(
+        f"{name} {row['name']} seed {row['seed']}: {row['cpu_s']:.0f} CPU s"))
 
 
 def write_report(name: str, out: Path, required: bool) -> None:

@@ -1,14 +1,12 @@
 """Run studies and keep their rows: one JSON file a study, the source of its table and figures."""
 
 import json
-import multiprocessing
 import platform
 import re
 import resource
 import subprocess
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -19,6 +17,7 @@ from matplotlib.figure import Figure
 
 import radiotwin
 from radiotwin.errors import BadInput
+from radiotwin.execution import Job, open_executor
 from radiotwin.files import atomic_path
 
 SCHEMA, RECORDS = "radiotwin.study/1", Path(__file__).parents[1] / "docs" / "results"
@@ -30,6 +29,7 @@ MODULES = {"models": "models", "curve": "learning", "federation": "learning", "t
            "impossible": "impossible", "accuracy": "tracer",
            "campus": "campus", "readings": "campus_learning",
            "away": "campus_learning", "terms": "campus_terms",
+           "workers": "execution", "scheduler": "execution",
            "maps": "wrong_maps", "foreign": "foreign", "calibration": "calibration"}
 """Name of a study -> its module in this package."""
 Run = Callable[[int, dict], dict]
@@ -112,20 +112,41 @@ def missing_rows(name: str, seeds: int, only: str | None, out: Path) -> Todo:
     return [each for each in wanted if each[:2] not in done]
 
 
-def run_rows(name: str, todo: Todo, out: Path, jobs: int) -> Iterator[dict]:
-    """Run rows in `jobs` processes (1: this one); yield each as soon as the file holds it."""
-    rows, run = read_rows(name, out), load_study(name).run
-    pool = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"))
-    try:
-        finished = (make_row(name, run, *each) for each in todo) if jobs == 1 else (
-            done.result() for done in as_completed(
-                [pool.submit(make_row, name, run, *each) for each in todo]))
-        for row in finished:
-            rows.append(row)
-            write_rows(name, rows, out)
-            yield row
-    finally:
-        pool.shutdown(cancel_futures=True)
+def run_rows(name: str, todo: Todo, out: Path, jobs: int,
+             show: Callable[[dict], None] = lambda row: None) -> None:
+    """Run rows in `jobs` processes (1: this one); show each as soon as the file holds it."""
+    job = Job(name, _Rows(name, load_study(name).run))
+    with open_executor(str(jobs), say=lambda text: None) as executor:
+        executor.run(job, todo, _RecordFile(name, out, read_rows(name, out), show))
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Runs rows of a study."""
+
+    name: str
+    run: Run
+
+    def __call__(self, row: tuple[str, int, dict]) -> dict:
+        return make_row(self.name, self.run, *row)
+
+
+@dataclass(frozen=True)
+class _RecordFile:
+    """The file of a study, as the cache of a job: what it holds already is not asked for."""
+
+    name: str
+    out: Path
+    rows: list[dict]
+    show: Callable[[dict], None]
+
+    def get(self, piece: object) -> None:
+        return None
+
+    def put(self, piece: object, row: dict, messages: list[str], seconds: float) -> None:
+        self.rows.append(row)
+        write_rows(self.name, self.rows, self.out)
+        self.show(row)
 
 
 def make_row(study: str, run: Run, name: str, seed: int, settings: dict) -> dict:

@@ -167,3 +167,20 @@ def test_a_killed_comparison_goes_on_with_the_models_that_were_fitted(small_scen
     with pieces.keep_pieces() as store:
         assert tables() == whole
     assert store.made == 0
+
+
+def test_models_that_are_fitted_in_other_processes_are_the_same_to_the_bit(small_scene, truth, flown, tmp_path):
+    from radiotwin import pieces
+    from tests.execution.jobs import two_workers
+
+    train, test = split_flights(flown, 1)
+    models = ("log_distance", "segmented_nn", "regression_kriging")
+
+    def tables(executor=None):
+        found = compare_models(train, test, small_scene, truth, seed=0, models=models, executor=executor)
+        return found.scores.to_csv(), found.locations.to_csv(), found.predictions.to_csv()
+
+    whole = tables()
+    with two_workers("local", one_is_killed=False) as (executor, _), pieces.keep_pieces(tmp_path):
+        assert tables(executor) == whole
+    assert list(tmp_path.glob("positions-*"))  # kept there, for a command that is killed

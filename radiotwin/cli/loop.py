@@ -6,10 +6,12 @@ from typing import Annotated, Any
 import typer
 
 from radiotwin.cli.options import (
+    Cluster,
     DeviceTable,
     MeasurementFile,
     OptionalScene,
     Shift,
+    Workers,
     in_frame_of,
 )
 from radiotwin.console import notice, print_rows, say
@@ -41,6 +43,8 @@ def close_loop(
     shift: Shift = None,
     seed: Annotated[int, typer.Option(
         min=0, help="Seed of folds, fits and permutations.")] = 0,
+    workers: Workers = "auto",
+    cluster: Cluster = None,
 ) -> None:
     """Find the effects that a model lacks.
 
@@ -48,6 +52,7 @@ def close_loop(
     """
     from radiotwin.closeloop.corrected_scene import check_corrected_target, write_corrected_scene
     from radiotwin.closeloop.run import close_loop as run
+    from radiotwin.execution import open_executor
     from radiotwin.measurements import read_measurements
     from radiotwin.pieces import keep_pieces
     from radiotwin.progress import progress
@@ -68,10 +73,11 @@ def close_loop(
     if base == "raytrace":
         notice(f"the twin will follow paths, {NOT_BY_PATHS}")
     inputs = {"measurements": str(measurements), "scene": scene and str(scene)}
-    with keep_pieces() as pieces, progress("closing the loop", total=None) as advance:
+    with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor, \
+            progress("closing the loop", total=None) as advance:
         loop = run(data, world, base, seed,
                    lambda text: advance(1, "; ".join(filter(None, [text, pieces.progress]))),
-                   hold_out)
+                   hold_out, executor=executor)
         advance(1, "other models, and the combination of all")
         report = write_closeloop_folder(loop, world, out, inputs=inputs,
                                         title=f"Close-loop report of {measurements.name}")

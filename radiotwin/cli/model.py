@@ -7,12 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from radiotwin.cli.options import (
+    Cluster,
     DeviceTable,
     FitSeed,
     MeasurementFile,
     OnlyDevices,
     SceneOption,
     Shift,
+    Workers,
     in_frame_of,
     split_names,
 )
@@ -49,11 +51,14 @@ def fit(
         "--allow-indoor", help="Unknown devices may be inside buildings.")] = False,
     shift: Shift = None,
     seed: FitSeed = 0,
+    workers: Workers = "auto",
+    cluster: Cluster = None,
 ) -> None:
     """Fit a twin: the channel and the unknown devices.
 
     The channel is learnt from the anchors; then the unknown devices are located with it.
     """
+    from radiotwin.execution import open_executor
     from radiotwin.measurements import read_measurements
     from radiotwin.pieces import keep_pieces
     from radiotwin.scene import Scene
@@ -63,9 +68,9 @@ def fit(
     data, world = read_measurements(measurements, devices), Scene.load(scene)
     data = in_frame_of(world, data, shift)
     earlier = Twin.load(start) if start else None
-    with keep_pieces() as pieces:
+    with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
         twin = fit_twin(data, world, model=model, seed=seed, start=earlier,
-                        allow_indoor=allow_indoor)
+                        allow_indoor=allow_indoor, executor=executor)
     notice(pieces.progress)
     twin.save(out)
     print_rows(f"Twin {out} ({model})",
@@ -148,6 +153,8 @@ def compare(
              "repeated.")] = None,
     shift: Shift = None,
     seed: FitSeed = 0,
+    workers: Workers = "auto",
+    cluster: Cluster = None,
 ) -> None:
     """Compare all channel models on held-out flights.
 
@@ -156,6 +163,7 @@ def compare(
     """
     from radiotwin.compare import split_flights
     from radiotwin.comparison_output import compare_held_out
+    from radiotwin.execution import open_executor
     from radiotwin.files import require_writable
     from radiotwin.measurements import read_measurements
     from radiotwin.pieces import keep_pieces
@@ -168,9 +176,9 @@ def compare(
     data = in_frame_of(world, read_measurements(measurements, devices), shift)
     split_flights(data, held_out)  # refuses before a map is read
     truth_map = read_truth(world, truth) if truth else None
-    with keep_pieces() as pieces:
+    with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
         comparison = compare_held_out(data, world, truth_map, held_out=held_out, raytrace=raytrace,
-                                      also=also or [], seed=seed)
+                                      also=also or [], seed=seed, executor=executor)
     notice(pieces.progress)
     write_comparison_folder(comparison, world, out, truth_map)
     print_comparison(comparison)

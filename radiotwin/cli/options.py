@@ -40,6 +40,14 @@ Combining = Annotated[str, typer.Option(
 RaySeed = Annotated[int, typer.Option(min=0, help="Seed of the rays.")]
 FitSeed = Annotated[int, typer.Option(min=0, help="Seed of the fits and the search.")]
 
+Workers = Annotated[str, typer.Option(
+    metavar="auto|N", help="Processes that share the work; 1 is this one. auto: as many as there "
+                           "are cores and memory, where it takes long enough. The result is the "
+                           "same to the bit.")]
+Cluster = Annotated[str | None, typer.Option(
+    metavar="auto|ADDRESS", help="Run on Ray: auto starts a cluster on this machine and ends it "
+                                 "again, ADDRESS (HOST:PORT) joins one. Needs radiotwin[ray].")]
+
 
 def split_names(text: str | None) -> list[str] | None:
     """Split a list of names.

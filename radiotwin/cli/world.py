@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from radiotwin.cli.options import (
+    Cluster,
     Combining,
     OnlyDevices,
     PointsFile,
@@ -13,6 +14,7 @@ from radiotwin.cli.options import (
     RaySeed,
     SceneFolder,
     TargetDb,
+    Workers,
     split_names,
 )
 from radiotwin.console import notice, print_rows, say
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 
     from radiotwin.scene import Scene
     from radiotwin.trace import SolverSettings
+
+MAX_BUSY = 1.3  # times the time of an idle machine, from which on a plan says so
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -44,19 +48,28 @@ def trace(
     combining: Combining = "power",
     devices: OnlyDevices = None,
     seed: RaySeed = 1,
+    workers: Workers = "auto",
+    cluster: Cluster = None,
+    plan: Annotated[bool, typer.Option(
+        "--plan", help="Only estimate time and memory, from a few batches.")] = False,
 ) -> None:
     """Ray-trace the truth with Sionna RT.
 
     A killed run is resumed, a finished one is reused.
     """
+    from radiotwin.execution import open_executor
     from radiotwin.scene import Scene
     from radiotwin.trace import trace_map, truth_path
 
     scene, names = Scene.load(folder), split_names(devices)
     settings = _settings(scene, scene.lattice.positions_m, names, quality, target_db, solver=solver,
                          combining=combining, seed=seed)
+    if plan:
+        _print_plan(scene, settings, names)
+        return
     out = out or truth_path(scene, names)
-    facts = trace_map(scene, settings, out, names).dataset.attrs
+    with open_executor(workers, cluster, notice) as executor:
+        facts = trace_map(scene, settings, out, names, executor).dataset.attrs
     say(f"wrote {out}: {facts['links']} links, {facts['links_detected']} detected, "
         f"{facts['links_below_sensitivity']} below sensitivity, {facts['links_without_path']} "
         f"without a path, {facts['links_inside_building']} inside buildings"
@@ -64,6 +77,25 @@ def trace(
     if "noise_floor_db" in facts:
         say(f"numerical noise: {facts['noise_floor_db']:.2f} dB RMS against ten times the rays; "
             f"nine links in ten are within {facts['noise_floor_p90_db']:.2f} dB")
+
+
+def _print_plan(scene: "Scene", settings: "SolverSettings", devices: list[str] | None) -> None:
+    from radiotwin.trace.plan import plan_trace
+
+    plan = plan_trace(scene, settings, devices)
+    say(f"{plan.links:,} links in {plan.batches:,} batches, {plan.finished:,} of them finished; "
+        f"{plan.batch_s:.2f} s a batch on one core (nine in ten within {plan.batch_p90_s:.2f} s), "
+        f"after {plan.start_s:.0f} s to start")
+    say(f"memory: a worker took {plan.peak_bytes / 2**30:.1f} GiB, and may take "
+        f"{plan.memory_bytes / 2**30:.1f} GiB; this machine has room for {plan.workers}")
+    if plan.busy > MAX_BUSY:
+        say(f"this machine is busy: the batches took {plan.busy:.1f} times as long as on a core of "
+            "their own")
+    print_rows("What is left, each worker on a core of its own",
+               {"workers": "right", "minutes": "right", "memory [GiB]": "right", "": "left"},
+               [[count, seconds / 60, memory / 2**30,
+                 "this machine" if count == plan.workers else ""]
+                for count, seconds, memory in plan.rows()])
 
 
 def gains(
@@ -77,11 +109,14 @@ def gains(
     quality: Quality = None,
     target_db: TargetDb = None,
     seed: RaySeed = 1,
+    workers: Workers = "auto",
+    cluster: Cluster = None,
 ) -> None:
     """Ray-trace gains at any points.
 
     An empty gain has a reason, such as no path.
     """
+    from radiotwin.execution import open_executor
     from radiotwin.pieces import keep_pieces
     from radiotwin.scene import Scene
     from radiotwin.trace import read_points, trace_points
@@ -89,8 +124,8 @@ def gains(
     scene, names = Scene.load(folder), split_names(devices)
     points_m = read_points(points, scene.config.origin)
     settings = _settings(scene, points_m, names, quality, target_db, combining=combining, seed=seed)
-    with keep_pieces() as pieces:
-        table = trace_points(scene, points_m, settings, out, names)
+    with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
+        table = trace_points(scene, points_m, settings, out, names, executor)
     notice(pieces.progress)
     reasons = table.loc[table["reason"] != "", "reason"].value_counts()
     say(f"wrote {out}: {len(table)} links, {len(table) - reasons.sum()} with a gain"

@@ -11,6 +11,7 @@ from typing_extensions import override
 
 from radiotwin.channel.log_distance import LogDistance
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
+from radiotwin.execution import Executor
 from radiotwin.links import LinkData
 from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import fit_known, fit_links, reliable_m
@@ -90,10 +91,10 @@ class RaytraceBase(Base):
     name = "raytrace"
     max_radius_m = LOST_M
 
-    def __init__(self, law: TwinBase) -> None:
+    def __init__(self, law: TwinBase, executor: Executor) -> None:
         assert law.scene is not None
         self._law, self._scene = law, law.scene
-        self._relocation = relocation_from(law.scene, MAX_RADIUS_M)
+        self._relocation = relocation_from(law.scene, MAX_RADIUS_M, executor=executor)
 
     @override
     def fit(self, links: LinkData) -> Twin:
@@ -103,10 +104,11 @@ class RaytraceBase(Base):
 BASES = (TwinBase.name, RaytraceBase.name, LogDistanceBase.name)
 
 
-def make_bases(scene: Scene | None, seed: int) -> dict[str, Base]:
+def make_bases(scene: Scene | None, seed: int, executor: Executor | None = None
+               ) -> dict[str, Base]:
     """Return every kind of base that a scene allows, by name."""
     twin = TwinBase(scene, seed)
     bases: dict[str, Base] = {twin.name: twin, LogDistanceBase.name: LogDistanceBase(scene, seed)}
     if scene is not None:
-        bases[RaytraceBase.name] = RaytraceBase(twin)
+        bases[RaytraceBase.name] = RaytraceBase(twin, executor or Executor())
     return bases

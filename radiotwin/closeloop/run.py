@@ -32,6 +32,7 @@ from radiotwin.effects.params import Parameter
 from radiotwin.effects.registry import catalogue
 from radiotwin.effects.unexplained_trend import UnexplainedTrend
 from radiotwin.errors import BadInput
+from radiotwin.execution import Executor
 from radiotwin.links import LinkData, prepare_links, residual_variables
 from radiotwin.links.limits import limits_to_explain
 from radiotwin.measurements import Measurements
@@ -153,7 +154,8 @@ def significant(dependences: list[ResidualDependence],
 
 def close_loop(measurements: Measurements, scene: Scene | None = None, base: str = "auto",
                seed: int = 0, on_progress: Callable[[str], None] = lambda _: None,
-               hold_out: str = "auto", criteria: SelectionCriteria | None = None) -> Loop:
+               hold_out: str = "auto", criteria: SelectionCriteria | None = None,
+               executor: Executor | None = None) -> Loop:
     """Find what a base model lacks.
 
     Args:
@@ -164,6 +166,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         on_progress: called with what is being done.
         hold_out: which links are held out together, see `make_folds`.
         criteria: thresholds; None: the defaults.
+        executor: where effects are fitted, inside `keep_pieces`; None: in this process.
 
     Returns:
         what was found, with the error before and after on links that took no part.
@@ -183,7 +186,8 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     names = [base]
     if base == "auto":
         names = ["log-distance"] if scene is None else ["twin", "raytrace"]
-    bases = make_bases(scene, seed)
+    executor = executor or Executor()
+    bases = make_bases(scene, seed, executor)
     models, parts = {}, training_parts(links, folds)
     for name in names:
         on_progress(f"fitting the base {name}")
@@ -192,7 +196,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     before = models[best]
     on_progress("looking at the residual")
     dependences_before = _dependences(before, seed)
-    selection = SelectionResult(before, criteria)
+    selection = SelectionResult(before, criteria, executor=executor)
     effects = [effect() for effect in catalogue()]
     select_faults(selection, effects, links, bases[best], seed, on_progress)
     forward_selection(selection, [effect for effect in effects if not effect.within_flights], seed,

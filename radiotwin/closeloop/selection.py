@@ -27,7 +27,8 @@ from radiotwin.closeloop.scoring import (
 from radiotwin.effects.base import Effect
 from radiotwin.effects.correlated_shadowing import NAME as SHADOWING
 from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
-from radiotwin.effects.fitting import with_exact_levels
+from radiotwin.effects.fitting import prepare_additions, with_exact_levels
+from radiotwin.execution import Executor
 from radiotwin.links import evidence_blocks
 from radiotwin.links.sites import site_of
 
@@ -44,6 +45,7 @@ class SelectionResult:
         steps: what each step's residual says, the first step first; the last is of what is left.
         explained: the model before any last resort.
         looked_at: the model that was looked at last, and the hypotheses about what it lacks.
+        executor: where candidates are fitted.
     """
 
     model: CrossValidatedModel
@@ -53,6 +55,7 @@ class SelectionResult:
     steps: list[Step] = field(default_factory=list)
     explained: CrossValidatedModel | None = None
     looked_at: tuple[CrossValidatedModel, Hypotheses] | None = None
+    executor: Executor = field(default_factory=Executor)
 
     @property
     def is_full(self) -> bool:
@@ -131,11 +134,12 @@ def _score_all(result: SelectionResult, available: list[Effect], block: np.ndarr
     """Score every available effect in one step; return those that pass."""
     step = len(result.model.whole.effects)
     candidates: list[Candidate] = []
-    for effect in available:
+    here = [each.effect for each in result.model.whole.effects]
+    tried = [effect for effect in available
+             if effect.repeatable or not any(each is effect for each in here)]
+    prepare_additions([result.model.whole], result.model.fits[:1], tried, result.executor)
+    for effect in tried:
         on_progress(f"step {step + 1}: {effect.name}")
-        here = [each.effect for each in result.model.whole.effects]
-        if not effect.repeatable and any(each is effect for each in here):
-            continue
         candidate = fit_candidate(result.model, effect, step, result.criteria, hypotheses)
         if isinstance(candidate, CandidateScore):
             result.scores.append(candidate)
@@ -150,9 +154,11 @@ def _score_all(result: SelectionResult, available: list[Effect], block: np.ndarr
             on_progress(f"step {step + 1}: {effect.name}, held out")
             # One more of a kind needs no correction: that there is such a thing has been shown.
             more = any(each.effect is effect for each in result.model.whole.effects)
-            tried = 1 if more else len(available)
-            score, extended = score_candidate(result.model, candidate, block, tried, step, seed,
-                                              result.criteria)
+            prepare_additions(result.model.folds, result.model.fits[1:], [effect], result.executor,
+                              candidate.whole.effects[-1].params)
+            corrected_for = 1 if more else len(available)
+            score, extended = score_candidate(result.model, candidate, block, corrected_for, step,
+                                              seed, result.criteria)
         else:
             why = (f"{better.score.name} gains more on held-out links than this on those that it "
                    f"is fitted to ({candidate.gain:.0f} nats)")

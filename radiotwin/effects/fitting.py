@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,10 +15,11 @@ from radiotwin.effects.arrays import subsample
 from radiotwin.effects.base import Effect
 from radiotwin.effects.fold_model import AppliedEffect, FoldModel, response
 from radiotwin.effects.params import NEAR_SHARE, Variation
+from radiotwin.execution import Executor, Job, Resources
 from radiotwin.inference import censored_regression
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.links import LinkData
-from radiotwin.pieces import Piece, kept
+from radiotwin.pieces import KeptParts, Piece, keeps, kept
 
 EVALUATIONS = 25  # of the objective for each number, in one descent
 DESCENTS = 2  # a simplex that has collapsed too early starts anew
@@ -29,6 +30,7 @@ MAX_EXACT_DESCENTS = 3  # the objective is rough, as paths open and close: a sim
 MAX_PROPOSALS = 2  # of one effect that are fitted
 MIN_GAIN_NATS = 5.0  # that a proposal must gain to be refined
 OUTSIDE_NATS = 10.0  # penalty of a step outside the bounds
+WORKER_BYTES = 2 * 2**30  # of a process that fits effects
 EXTREMES_DB = (-200.0, 100.0)  # levels at which whatever a receiver does to them shows
 
 
@@ -57,6 +59,46 @@ def add_effect(model: FoldModel, effect: Effect, result: FitResult,
 
     return kept("effect", (model, effect, result, like),
                 lambda: _best_addition(model, effect, result, like), _write_addition, read)
+
+
+def prepare_additions(models: Sequence[FoldModel], results: Sequence[FitResult],
+                      effects: Sequence[Effect], executor: Executor, like: Any = None) -> None:
+    """Compute what `add_effect` will be asked, on the workers of an executor.
+
+    The results are among the finished parts (`radiotwin.pieces`), from where `add_effect` has
+    them, equal to the bit. Where no parts are kept, nothing is done.
+
+    Args:
+        models: k models.
+        results: their fits.
+        effects: to be added to each of them.
+        executor: where it runs.
+        like: as of `add_effect`.
+    """
+    if not executor.is_worth_it or not keeps():
+        return
+    pieces = [(model, effect) for model in range(len(models)) for effect in range(len(effects))]
+    parts: KeptParts[tuple[int, int], Piece | None] = KeptParts(
+        "effect", lambda piece: (models[piece[0]], effects[piece[1]], results[piece[0]], like),
+        lambda found: found, lambda arrays, content: (arrays, content))
+    function = _Addition(list(models), list(results), list(effects), like)
+    job: Job[tuple[int, int], Piece | None] = Job("fitting effects", function,
+                                                  Resources(WORKER_BYTES, False))
+    executor.run_ahead(job, pieces, parts)
+
+
+@dataclass(frozen=True)
+class _Addition:
+    """Adds effects to models, by the number of each; arguments as of `prepare_additions`."""
+
+    models: list[FoldModel]
+    results: list[FitResult]
+    effects: list[Effect]
+    like: Any
+
+    def __call__(self, piece: tuple[int, int]) -> Piece | None:
+        model, effect = self.models[piece[0]], self.effects[piece[1]]
+        return _write_addition(_best_addition(model, effect, self.results[piece[0]], self.like))
 
 
 def _write_addition(found: tuple[FoldModel, FitResult] | None) -> Piece | None:

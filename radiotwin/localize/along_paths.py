@@ -21,10 +21,12 @@ from scipy.special import stdtrit
 from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.residual_view import ResidualView
+from radiotwin.execution import Executor, Job, Resources
 from radiotwin.inference.censored_regression import CensoredRegression, FitResult
 from radiotwin.links import LinkData
 from radiotwin.localize.estimate import TwinDevice, read_device
-from radiotwin.pieces import Piece, kept_with_name
+from radiotwin.localize.followed import Followed, add_followed, followed_since
+from radiotwin.pieces import KeptParts, Piece, keeps, kept_with_name
 from radiotwin.progress import progress
 from radiotwin.scene.citymap import CityMap
 from radiotwin.threads import in_threads
@@ -42,6 +44,7 @@ AROUND_M = (14.0, 7.0)  # rings about where a descent has ended, in case it was 
 DOF = 4.0
 MAX_MISFIT = 4.0  # square of how many times the errors of other devices
 CREDIBLE = 0.9
+WORKER_BYTES = 2 * 2**30  # of a process that searches
 
 
 @dataclass(eq=False)
@@ -56,15 +59,16 @@ class Relocation:
         positions: where each device was found before, which is worth trying with other links, too.
         powers: map -> position -> hash of the other end's position -> power.
         history: hash of all searches so far, which decide what is remembered.
+        executor: where devices are searched for side by side, inside `keep_pieces`.
     """
 
     bounds: tuple[float, float, float, float]
     max_radius_m: float
     thresholds: dict[str, np.uint64] = field(default_factory=dict)
     positions: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
-    powers: WeakKeyDictionary[CityMap, dict[tuple[float, ...], dict[int, float]]] = field(
-        default_factory=WeakKeyDictionary)
+    powers: WeakKeyDictionary[CityMap, Followed] = field(default_factory=WeakKeyDictionary)
     history: str = ""
+    executor: Executor = field(default_factory=Executor)
 
     def relocate(self, links: LinkData, devices: list[TwinDevice],
                  channel: ImagePaths) -> list[TwinDevice]:
@@ -85,21 +89,43 @@ class Relocation:
         models = [FoldModel.build(links, each, DOF, device_m=device_m)
                   for each in (channel.law, channel)]
         fits = [model.fit() for model in models]
+        searches: dict[int, _Question] = {}
+        for number, device in enumerate(devices):
+            if device.role != "unknown":
+                continue
+            rows = self._rows(links, number)
+            heard = np.isfinite(links.level_db[rows]).sum()
+            if device.credible_radius_m <= self.max_radius_m and heard >= MIN_HEARD:
+                by_law, by_paths = (_Likelihood(model, fit, rows, number)
+                                    for model, fit in zip(models, fits, strict=True))
+                before = self.positions.setdefault(device.device, [])
+                searches[number] = _Search(by_law, by_paths, self), device, before
+        self._search_ahead(list(searches.values()))
         found = list(devices)
-        with progress("looking for devices along paths", total=unknown) as advance:
-            for number, device in enumerate(devices):
-                if device.role != "unknown":
-                    continue
-                rows = self._rows(links, number)
-                heard = np.isfinite(links.level_db[rows]).sum()
-                if device.credible_radius_m <= self.max_radius_m and heard >= MIN_HEARD:
-                    by_law, by_paths = (_Likelihood(model, fit, rows, number)
-                                        for model, fit in zip(models, fits, strict=True))
-                    before = self.positions.setdefault(device.device, [])
-                    found[number] = self._search(_Search(by_law, by_paths, self), device, before)
-                    before.append((found[number].x_m, found[number].y_m))
+        with progress("looking for devices along paths", total=len(searches)) as advance:
+            for number, (search, device, before) in searches.items():
+                found[number] = self._search(search, device, before)
+                before.append((found[number].x_m, found[number].y_m))
                 advance()
         return found
+
+    def _search_ahead(self, searches: list[_Question]) -> None:
+        """Search on the executor's workers; `_search` finds the results among the kept parts."""
+        if not self.executor.is_worth_it or not keeps() or len(searches) < 2:
+            return
+        inputs: list[tuple] = []
+        parts: KeptParts[int, Piece] = KeptParts("position", inputs.__getitem__,
+                                                 lambda found: found, lambda *piece: piece)
+        history = self.history
+        for search, device, before in searches:
+            inputs.append((history, self.bounds, search.by_law, search.by_paths, device, before))
+            history = parts.name(len(inputs) - 1)
+        self.executor.run_ahead(Job("looking for devices along paths", _Searches(searches),
+                                    Resources(WORKER_BYTES, False)), range(len(searches)), parts)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what was followed, and where: another process follows what it needs."""
+        return self.__dict__ | {"powers": WeakKeyDictionary(), "executor": Executor()}
 
     def _search(self, search: _Search, device: TwinDevice,
                 before: list[tuple[float, float]]) -> TwinDevice:
@@ -110,11 +136,11 @@ class Relocation:
         known = {position_m: len(powers) for position_m, powers in followed.items()}
 
         def write(found: TwinDevice) -> Piece:
-            return _followed_since(known, followed), asdict(found)
+            return followed_since(known, followed), asdict(found)
 
         def read(arrays: dict[str, np.ndarray], content: Any) -> TwinDevice:
             found = read_device(content)
-            _add_followed(arrays, followed)
+            add_followed(arrays, followed)
             return found
 
         inputs = self.history, self.bounds, search.by_law, search.by_paths, device, before
@@ -320,29 +346,22 @@ class _Search:
         return float(from_best_m[order][min(held, len(order) - 1)] + STEPS_M[-1])
 
 
-def _followed_since(known: dict[tuple[float, ...], int],
-                    followed: dict[tuple[float, ...], dict[int, float]]) -> dict[str, np.ndarray]:
-    """Return positions (p, 3), numbers (p,) of ends, and hashes and powers of those, new ones."""
-    new = {position_m: list(powers.items())[known.get(position_m, 0):]
-           for position_m, powers in followed.items() if len(powers) > known.get(position_m, 0)}
-    ends = [end for powers in new.values() for end in powers]
-    return {"position_m": np.array(list(new)).reshape(-1, 3),
-            "count": np.array([len(powers) for powers in new.values()], dtype=int),
-            "hash": np.array([key for key, _ in ends], dtype=np.uint64),
-            "power": np.array([power for _, power in ends], dtype=float)}
+_Question = tuple[_Search, TwinDevice, list[tuple[float, float]]]  # where, which, known positions
 
 
-def _add_followed(arrays: dict[str, np.ndarray],
-                  followed: dict[tuple[float, ...], dict[int, float]]) -> None:
-    """Add what `_followed_since` returned."""
-    ends = list(zip(arrays["hash"].tolist(), arrays["power"].tolist(), strict=True))
-    if arrays["count"].sum() != len(ends):
-        raise ValueError("other counts")
-    last = np.cumsum(arrays["count"]).tolist()
-    for position_m, end, count in zip(arrays["position_m"].tolist(), last,
-                                      arrays["count"].tolist(), strict=True):
-        if count:
-            followed.setdefault(tuple(position_m), {}).update(ends[end - count:end])
+@dataclass(frozen=True)
+class _Searches:
+    """Searches by their number, each as if it were the only one."""
+
+    searches: list[_Question]
+
+    def __call__(self, number: int) -> Piece:
+        search, device, before = self.searches[number]
+        alone = replace(search.relocation, powers=WeakKeyDictionary())
+        found = replace(search, relocation=alone, tried={}).from_law(device, before)
+        city = search.by_law.model.links.city
+        assert city is not None
+        return followed_since({}, alone.powers.get(city, {})), asdict(found)
 
 
 def _apart(positions_m: np.ndarray, apart_m: float, maximum: int) -> list[np.ndarray]:

@@ -66,6 +66,10 @@ class CityMap:
                                  triangles[:, 2] - triangles[:, 0])
         self._top_m = float(self.vertices[:, 2].max()) + 1.0
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle what the map is made of; Embree's scene is made again."""
+        return CityMap, (self.vertices, self.faces, self.materials, self.material, self.vegetation)
+
     @classmethod
     def from_xml(cls, xml_path: Path | str, vegetation: Vegetation | None = None) -> "CityMap":
         """Read the meshes that a scene folder's `city.xml` names, and what they are made of.

@@ -1,12 +1,10 @@
 """Gains averaged over the cells of a lattice, by Sionna RT's radio map solver."""
 
-from pathlib import Path
-
 import numpy as np
 
 from radiotwin.scene.lattice import Lattice
 from radiotwin.trace.settings import SolverSettings
-from radiotwin.trace.sionna_scene import import_sionna, load_city
+from radiotwin.trace.sionna_scene import City, import_sionna, load_city
 from radiotwin.trace.solver import power_to_db
 
 
@@ -18,7 +16,7 @@ class CellGains:
     gain at a point. So the border of a shadow is blurred, and a link in it has no sharp LoS.
 
     Args:
-        xml_path: `city.xml` of a scene folder; None for free space.
+        city: `city.xml` of a scene folder, or what `read_city` returns; None for free space.
         frequency_hz: Frequency [Hz].
         settings: Settings with solver `map`.
         lattice: Positions.
@@ -28,11 +26,11 @@ class CellGains:
         RunFailed: No usable libLLVM.
     """
 
-    def __init__(self, xml_path: Path | str | None, frequency_hz: float, settings: SolverSettings,
+    def __init__(self, city: City, frequency_hz: float, settings: SolverSettings,
                  lattice: Lattice) -> None:
         self.settings = settings
         self.lattice = lattice
-        self._city = load_city(xml_path, frequency_hz)
+        self._city = load_city(city, frequency_hz)
         rt = import_sionna()
         self._solver = rt.RadioMapSolver()
         self._transmitter = rt.Transmitter("device", position=[0.0, 0.0, 0.0])

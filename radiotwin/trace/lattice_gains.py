@@ -1,23 +1,16 @@
 """Gains over a scene's lattice, solved in parts, each kept on disk as soon as it is solved."""
 
-from collections.abc import Callable
-
 import numpy as np
 
-from radiotwin.errors import BadInput
-from radiotwin.progress import progress
+from radiotwin.execution import Executor
 from radiotwin.scene import Scene
 from radiotwin.trace.batches import BatchStore
-from radiotwin.trace.cell_gains import CellGains
+from radiotwin.trace.link_job import KeptBatches, Links, link_job
 from radiotwin.trace.settings import FINER, SolverSettings
-from radiotwin.trace.solver import PathGains
-
-# Solves one device (index), positions (n, 3) [m] and reports its progress
-_Solve = Callable[[int, np.ndarray, Callable[..., None]], np.ndarray]
 
 
-def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int]
-                  ) -> np.ndarray:
+def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
+                  executor: Executor) -> np.ndarray:
     """Return the gains of every lattice position; only what the store lacks is solved.
 
     Args:
@@ -25,6 +18,7 @@ def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, ind
         settings: Settings of the solver.
         store: Store of this scene and these settings.
         index: Indices into `scene.config.devices`.
+        executor: Where it runs.
 
     Returns:
         (devices, positions) gain [dB], NaN where there is no path.
@@ -33,20 +27,12 @@ def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, ind
         BadInput: The scene cannot be read, or the store not written.
         RunFailed: No usable libLLVM.
     """
-    if settings.solver == "paths":
-        step, label = settings.batch_receivers, "batch"
-    else:
-        step, label = _plane(scene), "altitude"
-    total = len(scene.lattice.positions_m)
-    parts = [np.arange(start, min(start + step, total)) for start in range(0, total, step)]
-    work = [(f"device-{device:03d}-{label}-{number:05d}", device, part)
-            for device in index for number, part in enumerate(parts)]
-    gains = _solve(scene, settings, store, work, "tracing")
-    return np.concatenate(gains).reshape(len(index), total)
+    pieces = lattice_pieces(scene, settings, index)
+    return _solve(scene, settings, store, pieces, executor, "tracing").reshape(len(index), -1)
 
 
-def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int]
-                ) -> tuple[slice, np.ndarray, np.ndarray]:
+def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
+                executor: Executor) -> tuple[slice, np.ndarray, np.ndarray]:
     """Solve a sample of links with ten times the rays, in the same memory.
 
     The sample is 1 % of the positions (at least 8; drawn by the settings' seed) for all devices.
@@ -58,6 +44,7 @@ def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index
         settings: Settings of the solver.
         store: Store of this scene and these settings.
         index: Indices into `scene.config.devices`.
+        executor: Where it runs.
 
     Returns:
         Rows and columns in the result of `solve_lattice`, and their gains (rows, columns) [dB].
@@ -74,9 +61,10 @@ def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index
         rows = slice(0, len(index))
     else:
         columns, rows = np.arange(_plane(scene)), slice(0, 1)
-    work = [(f"device-{device:03d}-finer", device, columns) for device in index[rows]]
-    gains = _solve(scene, settings.finer(FINER), store, work, "numerical noise")
-    return rows, columns, np.stack(gains)
+    finer = settings.finer(FINER)
+    pieces = lattice_pieces(scene, finer, index[rows], columns, "finer")
+    gain_db = _solve(scene, finer, store, pieces, executor, "numerical noise")
+    return rows, columns, gain_db.reshape(-1, len(columns))
 
 
 def _plane(scene: Scene) -> int:
@@ -84,36 +72,28 @@ def _plane(scene: Scene) -> int:
     return len(scene.lattice.y_m) * len(scene.lattice.x_m)
 
 
-def _solve(scene: Scene, settings: SolverSettings, store: BatchStore,
-           work: list[tuple[str, int, np.ndarray]], description: str) -> list[np.ndarray]:
-    """Return the gains of each (name in the store, device, indices of positions)."""
-    known = {name: store.get(name, len(part)) for name, _, part in work}
-    missing = [(name, device, part) for name, device, part in work if known[name] is None]
-    if missing:
-        solve = _open(scene, settings)
-        with progress(description, total=sum(len(part) for _, _, part in missing)) as advance:
-            for name, device, part in missing:
-                gain_db = solve(device, scene.lattice.positions_m[part], advance)
-                store.put(name, gain_db)
-                known[name] = gain_db
-    return [gain_db for gain_db in known.values() if gain_db is not None]
+def lattice_pieces(scene: Scene, settings: SolverSettings, index: list[int],
+                   columns: np.ndarray | None = None, label: str = "") -> list[Links]:
+    """Return the pieces that a map is traced in.
+
+    Args:
+        scene: City, devices and lattice.
+        settings: Settings of the solver.
+        index: Indices into `scene.config.devices`.
+        columns: Indices of positions; None: all.
+        label: Of their names; empty: that of a map's own.
+    """
+    step = settings.batch_receivers if settings.solver == "paths" else _plane(scene)
+    label = label or ("batch" if settings.solver == "paths" else "altitude")
+    points_m = scene.lattice.positions_m if columns is None else scene.lattice.positions_m[columns]
+    return [Links(f"device-{device:03d}-{label}-{start // step:05d}", scene.device_m[device],
+                  points_m[start:start + step],
+                  (scene.device_antennas[device], scene.uav_antenna), settings.batch_receivers)
+            for device in index for start in range(0, len(points_m), step)]
 
 
-def _open(scene: Scene, settings: SolverSettings) -> _Solve:
-    frequency_hz = scene.config.radio.frequency_hz
-    if settings.solver == "paths":
-        paths = PathGains(scene.xml_path, frequency_hz, settings)
-        return lambda device, points_m, advance: paths.gains(
-            scene.device_m[device], points_m,
-            (scene.device_antennas[device], scene.uav_antenna), advance)
-    if any(antenna is not None for antenna in (*scene.device_antennas, scene.uav_antenna)):
-        raise BadInput(f"{scene.folder / 'scene.toml'} declares antennas, which the solver 'map' "
-                       "does not know; use the solver 'paths'")
-    cells = CellGains(scene.xml_path, frequency_hz, settings, scene.lattice)
-
-    def solve_cells(device: int, points_m: np.ndarray, advance: Callable[..., None]) -> np.ndarray:
-        gain_db = cells.solve(scene.device_m[device], points_m[0, 2])
-        advance(len(gain_db))
-        return gain_db
-
-    return solve_cells
+def _solve(scene: Scene, settings: SolverSettings, store: BatchStore, pieces: list[Links],
+           executor: Executor, description: str) -> np.ndarray:
+    """Return the gains of all pieces, one after the other [dB]."""
+    job = link_job(scene, settings, description)
+    return np.concatenate(executor.run(job, pieces, KeptBatches(store)))

@@ -1,6 +1,6 @@
 """Gains at any points in space."""
 
-from functools import cached_property, partial
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +12,21 @@ from radiotwin.antennas import Antenna
 from radiotwin.budgets import ROWS
 from radiotwin.cells import read_cells, write_csv
 from radiotwin.errors import BadInput
+from radiotwin.execution import Executor
 from radiotwin.files import atomic_path, require_writable
 from radiotwin.geodesy import to_local
-from radiotwin.pieces import kept
-from radiotwin.progress import progress
+from radiotwin.pieces import KeptParts
 from radiotwin.scene import Scene
 from radiotwin.tables import MAX_COORDINATE_M, Origin
+from radiotwin.trace.link_job import Links, link_job
 from radiotwin.trace.run import device_indices
 from radiotwin.trace.settings import SolverSettings
-from radiotwin.trace.solver import IMPOSSIBLE_DB, Antennas, PathGains
+from radiotwin.trace.solver import IMPOSSIBLE_DB
 
 
 def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settings: SolverSettings,
-                antennas: list[Antenna | None] | None = None) -> np.ndarray:
+                antennas: list[Antenna | None] | None = None,
+                executor: Executor | None = None) -> np.ndarray:
     """Trace the gains between positions; receivers have the antenna of the scene's UAVs.
 
     Within `keep_pieces` each finished batch is kept.
@@ -35,6 +37,7 @@ def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settin
         points_m: (n, 3) positions of receivers [m].
         settings: Settings with solver `paths`.
         antennas: Antennas of the k transmitters; None: isotropic.
+        executor: Where it runs; None: in this process.
 
     Returns:
         (k, n) gain [dB]; NaN where there is no path, infinite where the tracer found more power
@@ -47,47 +50,29 @@ def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settin
     if settings.solver != "paths":
         raise BadInput(f"the solver {settings.solver!r} averages over lattice cells; points need "
                        "the solver 'paths'")
-    gain_db = np.full((len(device_m), len(points_m)), np.nan)
     step = settings.batch_receivers
-    parts = [slice(start, start + step) for start in range(0, len(points_m), step)]
-    decided_by = scene.content_hash(), settings.attributes()
-    solver = _LateSolver(scene, settings)
-    with progress("tracing", total=gain_db.size) as advance:
-        for row, (one_m, antenna) in enumerate(zip(device_m, antennas or [None] * len(device_m))):
-            ends = antenna, scene.uav_antenna
-            for part in parts:
-                batch_m = points_m[part]
-                gain_db[row, part] = kept(
-                    "gains", (*decided_by, one_m, batch_m, ends),
-                    partial(solver.solve, one_m, batch_m, ends),
-                    lambda found: ({"gain_db": found}, len(found)), _read_gains)
-                advance(len(batch_m))
-    return gain_db
+    pieces = [Links("", one_m, points_m[start:start + step], (antenna, scene.uav_antenna), step)
+              for one_m, antenna in zip(device_m, antennas or [None] * len(device_m))
+              for start in range(0, len(points_m), step)]
+    decided_by = scene.content_hash()
+
+    def inputs(piece: Links) -> tuple:
+        own = replace(settings, batch_receivers=piece.batch_receivers)
+        return (decided_by, own.attributes(), piece.device_m, piece.points_m, piece.antennas)
+
+    gains = (executor or Executor()).run(
+        link_job(scene, settings, "tracing"), pieces,
+        KeptParts("gains", inputs, lambda found: ({"gain_db": found}, len(found)), _read_gains))
+    return np.concatenate([np.zeros(0), *gains]).reshape(len(device_m), len(points_m))
 
 
 def _read_gains(arrays: dict[str, np.ndarray], count: Any) -> np.ndarray:
     return arrays["gain_db"].reshape(count)
 
 
-class _LateSolver:
-    """A solver that is made when it is first needed: that takes seconds."""
-
-    def __init__(self, scene: Scene, settings: SolverSettings) -> None:
-        self._scene, self._settings = scene, settings
-
-    @cached_property
-    def _solver(self) -> PathGains:
-        return PathGains(self._scene.xml_path, self._scene.config.radio.frequency_hz,
-                         self._settings)
-
-    def solve(self, device_m: np.ndarray, points_m: np.ndarray, ends: Antennas) -> np.ndarray:
-        """Return the gains (n,) from a device to points (n, 3) [dB]."""
-        return self._solver.solve(device_m, points_m, ends)
-
-
 def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | None = None,
-                 out_path: Path | str | None = None, devices: list[str] | None = None
-                 ) -> pd.DataFrame:
+                 out_path: Path | str | None = None, devices: list[str] | None = None,
+                 executor: Executor | None = None) -> pd.DataFrame:
     """Trace the gains from a scene's devices to any points.
 
     Args:
@@ -96,6 +81,7 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | 
         settings: Settings with solver `paths`; None: those of quality `default`.
         out_path: CSV file (.csv or .csv.gz); None writes nothing.
         devices: Names; None: all devices of the scene.
+        executor: Where it runs; None: in this process.
 
     Returns:
         One row per link: device, x_m, y_m, z_m, gain_db (NaN: not detected), los, and reason:
@@ -120,7 +106,8 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | 
     inside = scene.city.inside(points_m)
     wavelength_m = speed_of_light / scene.config.radio.frequency_hz
     antennas = [scene.device_antennas[device] for device in index]
-    gain_db = trace_gains(scene, scene.device_m[index], points_m, settings, antennas)
+    gain_db = trace_gains(scene, scene.device_m[index], points_m, settings, antennas,
+                          executor)
     tables = []
     for row, device in enumerate(index):
         device_m = scene.device_m[device]

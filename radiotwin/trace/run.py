@@ -10,6 +10,7 @@ import numpy as np
 
 from radiotwin.budgets import MAP_VALUES
 from radiotwin.errors import BadInput
+from radiotwin.execution import Executor
 from radiotwin.files import require_writable
 from radiotwin.inputs import require_within
 from radiotwin.radiomap import RadioMap
@@ -34,7 +35,8 @@ def truth_path(scene: Scene, devices: list[str] | None = None) -> Path:
 
 
 def trace_map(scene: Scene, settings: SolverSettings | None = None,
-              out_path: Path | str | None = None, devices: list[str] | None = None) -> RadioMap:
+              out_path: Path | str | None = None, devices: list[str] | None = None,
+              executor: Executor | None = None) -> RadioMap:
     """Trace the radio map of a scene's lattice and write it.
 
     Each finished batch is kept in the scene's `cache/trace-<hash>`, named by the hash of all that
@@ -46,6 +48,7 @@ def trace_map(scene: Scene, settings: SolverSettings | None = None,
         settings: Settings of the solver; None: those of quality `default`.
         out_path: NetCDF file to write; None: `truth_path`.
         devices: Names, in the map's order; None: all devices of the scene.
+        executor: Where it runs; None: in this process. The map is the same to the bit.
 
     Returns:
         The map: gain [dB], NaN where there is no path, the gain is below the receiver's
@@ -64,17 +67,15 @@ def trace_map(scene: Scene, settings: SolverSettings | None = None,
                      f"{scene.folder}: lattice positions times devices")
     require_writable(out_path)
     names = [scene.config.devices[i].device for i in index]
-    key = _key(scene, settings)
-    cache = require_within(scene.folder, scene.folder / "cache", str(scene.folder))
-    store = BatchStore(cache, key)
-    require_within(scene.folder, store.folder, str(scene.folder))
+    store = open_store(scene, settings)
     finished = _finished(Path(out_path), store.hash, names)
     if finished is not None:
         placed = finished.placed(scene.config.origin)  # the origin does not change the gains
         if placed.dataset.attrs != finished.dataset.attrs:
             placed.write(out_path)
         return placed
-    raw_db = solve_lattice(scene, settings, store, index)
+    executor = executor or Executor()
+    raw_db = solve_lattice(scene, settings, store, index, executor)
 
     positions_m, device_m = scene.lattice.positions_m, scene.device_m[index]
     los = np.stack([scene.city.line_of_sight(one_m[None], positions_m) for one_m in device_m])
@@ -99,13 +100,13 @@ def trace_map(scene: Scene, settings: SolverSettings | None = None,
                     settings.solver, settings.combining, chosen(direct_dbi), chosen(peak_dbi)))
     limit_db = scene.config.gain_limit_db
     gain_db, counts = _censor(raw_db, inside, impossible, limit_db)
-    rows, columns, finer_db = solve_finer(scene, settings, store, index)
+    rows, columns, finer_db = solve_finer(scene, settings, store, index, executor)
     outside = ~inside[columns]
     finer_db[(finer_db < limit_db) | (finer_db == IMPOSSIBLE_DB)] = np.nan
     figures |= noise_figures(gain_db[rows, columns][:, outside].ravel(),
                              finer_db[:, outside].ravel())
     attributes = {"source": "raytrace", "frequency_hz": frequency_hz, "gain_limit_db": limit_db,
-                  "scene": scene.config.name, "scene_hash": key["scene"],
+                  "scene": scene.config.name, "scene_hash": scene.content_hash(),
                   "trace_hash": store.hash, **settings.attributes(), **counts, **figures,
                   **library_versions(), "radiotwin_version": version("radiotwin")}
     radio_map = RadioMap.build(names, scene.lattice, gain_db, los, attributes=attributes)
@@ -164,6 +165,18 @@ def device_indices(scene: Scene, devices: list[str] | None) -> list[int]:
             raise BadInput(f"device {name!r} is not in {scene.folder / 'scene.toml'}; it has "
                            f"{', '.join(list(names)[:20])}" + ", …" * (len(names) > 20))
     return [names[name] for name in dict.fromkeys(devices or names)]
+
+
+def open_store(scene: Scene, settings: SolverSettings) -> BatchStore:
+    """Return the store of the batches of a scene's map with these settings, in its folder.
+
+    Raises:
+        BadInput: The folder lies outside the scene's, or cannot be written.
+    """
+    cache = require_within(scene.folder, scene.folder / "cache", str(scene.folder))
+    store = BatchStore(cache, _key(scene, settings))
+    require_within(scene.folder, store.folder, str(scene.folder))
+    return store
 
 
 def _key(scene: Scene, settings: SolverSettings) -> dict[str, Any]:

@@ -27,6 +27,7 @@ QUALITIES: dict[str, dict[str, int]] = {
 }
 
 FINER = 10  # factor of rays, for the estimate of the numerical noise
+MEMORY_MARGIN = 1.5  # of the memory that a call takes, for what is left of the calls before
 # Entries of the table in which Sionna RT looks up whether a candidate path is new. Two candidates
 # with one entry are taken for one, and a path is dropped: at Sionna's 10^6 about 8 % of the
 # candidates of 60 receivers, and which ones depends on the other receivers in the call. A prime, as
@@ -102,6 +103,13 @@ class SolverSettings:
         """Return the same settings with `factor` times the rays, in the same memory."""
         return replace(self, samples_per_src=factor * self.samples_per_src,
                        batch_receivers=max(1, self.batch_receivers // factor))
+
+    def memory_bytes(self) -> int:
+        """Return the most that a process which solves batches may take; 0: not known (`map`)."""
+        if self.solver == "map":
+            return 0
+        rays = self.max_depth * self.samples_per_src * self.batch_receivers
+        return int(MEMORY_MARGIN * (2**29 + 36 * rays))
 
     def attributes(self) -> dict[str, Any]:
         """Return all that decides a gain, as attributes of a NetCDF file (without booleans)."""

@@ -2,7 +2,7 @@
 
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -13,10 +13,13 @@ from radiotwin.errors import BadInput
 from radiotwin.files import scratch_folder
 from radiotwin.scene.materials import permittivity, ranges_text
 from radiotwin.scene.reader import read_city
-from radiotwin.scene.writer import write_city
+from radiotwin.scene.writer import CityShape, write_city
 from radiotwin.signals import deferred
+from radiotwin.threads import allowed_cores
 
 log = logging.getLogger(__name__)
+City = Path | str | Sequence[CityShape] | None
+"""`city.xml` of a scene folder, or what `read_city` returns; None for free space."""
 
 
 def library_versions() -> dict[str, str]:
@@ -36,9 +39,11 @@ def import_sionna() -> Any:
     """
     llvm.prepare()
     with deferred():  # their compiled parts abort where Python raises while they are loaded
+        import drjit
         import mitsuba
         import sionna.rt
 
+    drjit.set_thread_count(allowed_cores())
     own = mitsuba.FileResolver()
     own.clear()
     own.append(os.path.dirname(os.path.realpath(mitsuba.__file__)))
@@ -46,7 +51,7 @@ def import_sionna() -> Any:
     return sionna.rt
 
 
-def load_city(xml_path: Path | str | None, frequency_hz: float) -> Any:
+def load_city(city: City, frequency_hz: float) -> Any:
     """Load a city at a frequency, with one vertically polarised isotropic antenna at every end.
 
     Mitsuba's parser, which can load other files and plugins, gets a copy that is written from what
@@ -54,7 +59,7 @@ def load_city(xml_path: Path | str | None, frequency_hz: float) -> Any:
     held at its nearest end, with a warning.
 
     Args:
-        xml_path: `city.xml` of a scene folder; None for free space.
+        city: `city.xml` of a scene folder, or what `read_city` returns; None for free space.
         frequency_hz: Frequency [Hz].
 
     Returns:
@@ -65,26 +70,28 @@ def load_city(xml_path: Path | str | None, frequency_hz: float) -> Any:
         RunFailed: No usable libLLVM.
     """
     rt = import_sionna()
-    city = rt.load_scene(None) if xml_path is None else _load_copy(rt, Path(xml_path))
-    for material in city.radio_materials.values():
+    scene = rt.load_scene(None) if city is None else _load_copy(rt, city)
+    for material in scene.radio_materials.values():
         if isinstance(material, rt.ITURadioMaterial):
             _hold_in_range(material, frequency_hz)
-    city.frequency = frequency_hz
-    city.tx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
-    city.rx_array = city.tx_array
-    return city
+    scene.frequency = frequency_hz
+    scene.tx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    scene.rx_array = scene.tx_array
+    return scene
 
 
-def _load_copy(rt: Any, xml_path: Path) -> Any:
-    shapes = read_city(xml_path)
+def _load_copy(rt: Any, city: Path | str | Sequence[CityShape]) -> Any:
+    shapes = read_city(city) if isinstance(city, Path | str) else city
     with scratch_folder() as folder:
         write_city(folder, shapes)
         try:
             return rt.load_scene(str(folder / "city.xml"))
         except (RuntimeError, ValueError, TypeError, LookupError, AttributeError, OSError,
                 SyntaxError) as error:
-            raise BadInput(f"{xml_path}: Sionna RT cannot read it ({str(error).strip()}); "
-                           "`radiotwin build-scene --check` lists what is wrong with it") from None
+            name = "the city" if shapes is city else city
+            raise BadInput(f"{name}: Sionna RT cannot read it "
+                           f"({str(error).strip()}); `radiotwin build-scene --check` lists what is "
+                           "wrong with it") from None
 
 
 def _hold_in_range(material: Any, frequency_hz: float) -> None:

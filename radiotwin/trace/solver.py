@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from scipy.constants import speed_of_light
 from radiotwin.antennas import Antenna
 from radiotwin.trace.distinct import distinct_paths
 from radiotwin.trace.settings import DIFFRACTION_PROBABILITY, TABLE_SIZE, SolverSettings
-from radiotwin.trace.sionna_scene import candidate_search, import_sionna, load_city
+from radiotwin.trace.sionna_scene import City, candidate_search, import_sionna, load_city
 
 # Dr.Jit keeps freed memory for the next call, which needs the same sizes again but for the paths.
 # Freed after every call, 40 % of the time goes into allocating it again; never, it may pile up.
@@ -32,7 +31,7 @@ class PathGains:
     are compiled once; and memory is bounded.
 
     Args:
-        xml_path: `city.xml` of a scene folder; None for free space.
+        city: `city.xml` of a scene folder, or what `read_city` returns; None for free space.
         frequency_hz: Frequency [Hz].
         settings: Settings with solver `paths`.
 
@@ -41,11 +40,10 @@ class PathGains:
         RunFailed: No usable libLLVM.
     """
 
-    def __init__(self, xml_path: Path | str | None, frequency_hz: float, settings: SolverSettings
-                 ) -> None:
+    def __init__(self, city: City, frequency_hz: float, settings: SolverSettings) -> None:
         self.settings = settings
         self._calls = 0
-        self._city = load_city(xml_path, frequency_hz)
+        self._city = load_city(city, frequency_hz)
         rt = import_sionna()
         self._solver = rt.PathSolver(deterministic=True)
         self._transmitter = rt.Transmitter("device", position=[0.0, 0.0, 0.0])

@@ -10,6 +10,7 @@ from radiotwin.channel import channel_named
 from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.channel.path_kriging import PathKriging
 from radiotwin.errors import BadInput
+from radiotwin.execution import Executor
 from radiotwin.links import join_links, prepare_links
 from radiotwin.localize import LocalizeSettings
 from radiotwin.measurements import Measurements
@@ -28,7 +29,8 @@ HEIGHT_NEEDED = ("with a 3D map every position needs one. Fill it in, in metres 
 
 
 def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmented_nn",
-             seed: int = 0, start: Twin | None = None, allow_indoor: bool = False) -> Twin:
+             seed: int = 0, start: Twin | None = None, allow_indoor: bool = False,
+             executor: Executor | None = None) -> Twin:
     """Learn the channel from the anchors' links, then locate the unknown devices with it.
 
     A published law (`radiotwin.channel.published`) is taken as it stands and needs no anchor.
@@ -42,6 +44,8 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
         seed: of the channel's and the search's random numbers.
         start: an earlier twin; the search also starts from its positions.
         allow_indoor: whether unknown devices may be inside buildings.
+        executor: where a model that follows paths searches for devices, inside `keep_pieces`;
+            None: in this process.
 
     Returns:
         the twin; positions of devices that could not be located are NaN.
@@ -64,7 +68,7 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
         links = prepare_links(measurements, scene)
         _warn(links.notes)
         fit = fit_along_paths if channel is ImagePaths else fit_over_wrong_map
-        twin = fit(links, scene, seed, start)
+        twin = fit(links, scene, seed, start, executor)
         twin.provenance.update(flights=flights, seed=seed)
         return twin
     _check_heights(measurements)

@@ -12,6 +12,7 @@ from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.fold_model import FoldModel
+from radiotwin.execution import Executor
 from radiotwin.links import LinkData
 from radiotwin.localize import (
     Relocation,
@@ -28,14 +29,15 @@ LOST_M = 40.0  # radius from which on a device's position says nothing about the
 SURE_M = 15.0  # radius of a device of an earlier twin that is not searched for everywhere again
 
 
-def fit_along_paths(links: LinkData, scene: Scene, seed: int, start: Twin | None) -> Twin:
+def fit_along_paths(links: LinkData, scene: Scene, seed: int, start: Twin | None,
+                    executor: Executor | None = None) -> Twin:
     """Return a twin that follows paths, with what they do not tell learnt.
 
     That is a level for each class of line of sight, the diffuse power, and the errors' sizes. Warns
     where paths explain the levels worse than the law does.
     """
     law = fit_links(links, scene, SegmentedLogDistance, seed)
-    twin = fit_paths(links, scene, law, relocation_from(scene, np.inf, start))
+    twin = fit_paths(links, scene, law, relocation_from(scene, np.inf, start, executor))
     device_m, law_m = reliable_m(twin.devices, LOST_M), reliable_m(law.devices, LOST_M)
     dof = best_dof(links, twin.channel, device_m)
     by_paths = FoldModel.build(links, twin.channel, dof, device_m=device_m)
@@ -86,7 +88,8 @@ def fit_paths(links: LinkData, scene: Scene, law: Twin, relocation: Relocation) 
     return Twin(channel, devices, law.level, links.usual_limit_db, provenance(links, scene))
 
 
-def relocation_from(scene: Scene, max_radius_m: float, start: Twin | None = None) -> Relocation:
+def relocation_from(scene: Scene, max_radius_m: float, start: Twin | None = None,
+                    executor: Executor | None = None) -> Relocation:
     """Return a search along paths.
 
     Args:
@@ -94,11 +97,13 @@ def relocation_from(scene: Scene, max_radius_m: float, start: Twin | None = None
         max_radius_m: of a device's circle by the law [m], beyond which it is not searched for.
         start: an earlier twin; devices that it is sure of are searched for around its position, and
             the law's, only.
+        executor: where it searches for several devices at once; None: one after the other here.
     """
     sure = [device for device in start.devices if device.role == "unknown" and device.located
             and device.credible_radius_m <= SURE_M] if start else []
     positions = {device.device: [(device.x_m, device.y_m)] for device in sure}
-    return Relocation(scene.config.extent.bounds, max_radius_m, positions=positions)
+    return Relocation(scene.config.extent.bounds, max_radius_m, positions=positions,
+                      executor=executor or Executor())
 
 
 def best_dof(links: LinkData, channel: ChannelModel, device_m: np.ndarray) -> float:

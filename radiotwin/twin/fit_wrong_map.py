@@ -13,6 +13,7 @@ from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.channel.map_error import Found, estimate_other_errors
 from radiotwin.channel.map_shift import NO_SHIFT, Shift, estimate_shift
 from radiotwin.channel.path_kriging import PathKriging
+from radiotwin.execution import Executor
 from radiotwin.links import LinkData
 from radiotwin.localize import Relocation
 from radiotwin.localize.along_paths import CREDIBLE, MAX_DEVICES
@@ -31,7 +32,8 @@ MAX_COPIES = 4  # anchors that are located as if they were unknown
 PRIOR_DEVICES = 2  # that the radii of the likelihood are worth, beside what those show
 
 
-def fit_over_wrong_map(links: LinkData, scene: Scene, seed: int, start: Twin | None) -> Twin:
+def fit_over_wrong_map(links: LinkData, scene: Scene, seed: int, start: Twin | None,
+                       executor: Executor | None = None) -> Twin:
     """Return a twin that allows for errors of its map.
 
     Devices are located along paths, on a map moved to where the anchors' links want it. Errors of
@@ -43,11 +45,12 @@ def fit_over_wrong_map(links: LinkData, scene: Scene, seed: int, start: Twin | N
         scene: the map's.
         seed: of the channel, and of the maps' errors.
         start: an earlier twin, as of `fit_twin`.
+        executor: as of `fit_twin`.
     """
     shift_m = _shift(links, seed)
     on_map = _moved(links, shift_m)
     with_copies = _with_copies(on_map)
-    by_paths = fit_along_paths(with_copies, scene, seed, start)
+    by_paths = fit_along_paths(with_copies, scene, seed, start, executor)
     assert isinstance(by_paths.channel, ImagePaths)
     unsure = _calibrated(by_paths.devices, on_map)
     found = _found(on_map, unsure, shift_m, seed)

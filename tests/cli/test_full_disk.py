@@ -197,7 +197,7 @@ def test_gains(run, disk, inputs, monkeypatch):
 def traced(monkeypatch):
     """A tracer that takes no time."""
     monkeypatch.setattr("radiotwin.trace.run.solve_lattice",
-                        lambda scene, settings, store, index: np.full((len(index), scene.blocked.size), -80.0))
+                        lambda scene, settings, store, index, *_: np.full((len(index), scene.blocked.size), -80.0))
     monkeypatch.setattr("radiotwin.trace.run.solve_finer", lambda *_: (
         np.zeros((1, 1), int), np.arange(1), np.full((1, 1), -80.0)))
     monkeypatch.setattr("radiotwin.trace.run.check_gains", lambda *_: {})

@@ -48,7 +48,7 @@ def test_gains(run, folder, asked, monkeypatch):
 
 def test_trace(run, folder, asked, monkeypatch):
     monkeypatch.setattr("radiotwin.trace.run.solve_lattice",
-                        lambda scene, settings, store, index: np.full((len(index), scene.blocked.size), -80.0))
+                        lambda scene, settings, store, index, *_: np.full((len(index), scene.blocked.size), -80.0))
     monkeypatch.setattr("radiotwin.trace.run.solve_finer", lambda *_: (
         np.zeros((1, 1), int), np.arange(1), np.full((1, 1), -80.0)))
     monkeypatch.setattr("radiotwin.trace.run.check_gains", lambda *_: {"links": 1})

@@ -9,7 +9,9 @@ from radiotwin import pieces
 from radiotwin.closeloop.result_file import make_report
 from radiotwin.closeloop.run import close_loop
 from radiotwin.effects import fitting
+from radiotwin.effects.registry import catalogue
 from radiotwin.pieces import PieceStore, keep_pieces
+from tests.execution.jobs import needs_ray, two_workers
 
 
 class Killed(BaseException):
@@ -48,8 +50,8 @@ def measured(open_ground):
     return every.select(every.table["device"].isin(every.devices["device"][:3]).to_numpy())
 
 
-def everything(measured, scene=None, base="log-distance"):
-    loop = close_loop(measured, scene, base)
+def everything(measured, scene=None, base="log-distance", executor=None):
+    loop = close_loop(measured, scene, base, executor=executor)
     return json.dumps(make_report(loop), sort_keys=True), loop.after.held_out_mean_db.tobytes(), \
         loop.before.held_out_mean_db.tobytes()
 
@@ -103,3 +105,17 @@ def test_a_killed_loop_over_a_city_ends_equal_to_the_bit(family, kill_after):
                 assert everything(given.measurements, given.scene, "auto") == whole
             except Killed:
                 continue
+
+
+@pytest.mark.parametrize("place", [pytest.param("local", marks=pytest.mark.slow),
+                                   pytest.param("ray", marks=[pytest.mark.slow, needs_ray])])
+def test_workers_of_which_one_is_killed_end_equal_to_the_bit(measured, searches, monkeypatch, place):
+    few = [each for each in catalogue() if each.name in ("receiver_gain_offset", "receiver_drift", "device_gain_offset")]
+    monkeypatch.setattr("radiotwin.closeloop.run.catalogue", lambda: few)
+    monkeypatch.setattr(pieces, "MIN_SECONDS", 0.0)
+    whole, total = everything(measured), len(searches)
+    searches.clear()
+    with keep_pieces() as store, two_workers(place) as (executor, killed):
+        assert everything(measured, executor=executor) == whole
+    assert killed
+    assert store.made and len(searches) < total / 3  # the others were done elsewhere

@@ -2,14 +2,17 @@
 
 import numpy as np
 import pandas as pd
+import pytest
 
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.links import prepare_links
 from radiotwin.localize import along_paths
 from radiotwin.measurements import Measurements
+from radiotwin.pieces import keep_pieces
 from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import fit_links
 from radiotwin.twin.fit_paths import fit_paths, relocation_from
+from tests.execution.jobs import two_workers
 from tests.worlds import RBM
 
 
@@ -68,3 +71,21 @@ def test_as_many_threads_as_there_are_find_the_same_to_the_bit(narrow_street, mo
         twins.append(fit_paths(links, Scene.load(RBM), law, relocation_from(scene, 100.0)))
     assert twins[0].devices == twins[1].devices
     assert found(twins[0], narrow_street.name)[0].tolist() != found(law, narrow_street.name)[0].tolist()
+
+
+@pytest.mark.slow
+def test_devices_that_are_searched_for_side_by_side_are_at_the_same_place_to_the_bit(narrow_street, monkeypatch, tmp_path):
+    scene = narrow_street.scene
+    devices = narrow_street.measured.devices.copy()
+    more = devices["role"].ne("unknown") & (devices.index == devices.index[devices["role"].ne("unknown")][0])
+    devices.loc[more, ["x_m", "y_m"]], devices.loc[more, "role"] = np.nan, "unknown"  # a second one
+    links = prepare_links(Measurements(narrow_street.measured.table, devices), scene)
+    links = links.select(links.flight == 0)
+    law = fit_links(links, scene, SegmentedLogDistance, 0)
+    whole = fit_paths(links, Scene.load(RBM), law, relocation_from(scene, np.inf)).devices
+    assert sum(device.role == "unknown" for device in whole) >= 2
+    with keep_pieces(tmp_path), two_workers("local", one_is_killed=False) as (executor, _):
+        # What the workers have found is all that there is: this process searches for none.
+        monkeypatch.setattr(along_paths._Search, "from_law", lambda *_: pytest.fail("searched for here"))
+        found = fit_paths(links, Scene.load(RBM), law, relocation_from(scene, np.inf, executor=executor)).devices
+    assert found == whole

@@ -28,6 +28,7 @@ def law(monkeypatch, small_scene):
         impossible_m: ClassVar[list] = []  # receivers of links that stay above what their paths carry
 
         def __init__(self, xml_path, frequency_hz, settings):
+            self.settings = settings
             self.step = settings.batch_receivers
             self.wavelength_m = 299_792_458.0 / frequency_hz
 
@@ -46,6 +47,5 @@ def law(monkeypatch, small_scene):
             return np.concatenate([self.solve(device_m, points_m[part], antennas)
                                    for part in self.batches(len(points_m))])
 
-    monkeypatch.setattr("radiotwin.trace.lattice_gains.PathGains", Law)
-    monkeypatch.setattr("radiotwin.trace.points.PathGains", Law)
+    monkeypatch.setattr("radiotwin.trace.link_job.PathGains", Law)
     return Law

@@ -1,0 +1,72 @@
+"""This process and its machine: memory, and the end together with the process that started it."""
+
+import ctypes
+import os
+import signal
+import sys
+import threading
+import time
+from contextlib import suppress
+from pathlib import Path
+
+PARENT_CHECK_S = 1.0
+
+
+def die_with_parent(parent: int) -> None:
+    """Have this process end when the one that started it is killed.
+
+    On Linux the kernel sees to it, even in a long computation; elsewhere a thread looks once a
+    second (on Windows nothing does).
+
+    Args:
+        parent: its number; it may have died already.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(1, int(signal.SIGKILL))  # PR_SET_PDEATHSIG of sys/prctl.h
+        if os.getppid() != parent:
+            os._exit(1)
+    elif os.name == "posix":
+        threading.Thread(target=_watch, args=(parent,), daemon=True).start()
+
+
+def _watch(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(PARENT_CHECK_S)
+    os._exit(1)
+
+
+def free_memory_bytes() -> int | None:
+    """Return the memory that can be taken without swapping; None where it is not known.
+
+    The least of what the machine has and of what the control group of this process may still take.
+    """
+    found = [_machine_bytes(), _group_bytes()]
+    return min((each for each in found if each is not None), default=None)
+
+
+def _machine_bytes() -> int | None:
+    with suppress(OSError, ValueError, IndexError):
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return 1024 * int(line.split()[1])
+    with suppress(OSError, ValueError, AttributeError):  # macOS: all there is
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return None
+
+
+def _group_bytes() -> int | None:
+    """Return what a container may still take: control groups of version 2, then 1."""
+    for limit, used in (("memory.max", "memory.current"),
+                        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes")):
+        with suppress(OSError, ValueError):  # "max" is no number
+            folder = Path("/sys/fs/cgroup")
+            return int((folder / limit).read_text()) - int((folder / used).read_text())
+    return None
+
+
+def resident_bytes(pid: int) -> int:
+    """Return the memory of a process; 0 where that is not known, or the process has ended."""
+    with suppress(OSError, ValueError, IndexError, AttributeError):
+        pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE")
+    return 0
