@@ -180,6 +180,10 @@ def _check(scene: Scene, radio_map: RadioMap, assignment: str) -> None:
             not np.allclose(radio_map.lattice.positions_m, lattice.positions_m):
         raise BadInput(f"the radio map's lattice {radio_map.gain_db.shape[1:]} (z, y, x) is not "
                        f"that of {path} {lattice.shape}; make the map for this scene")
+    if lattice.ground_m is not None:
+        raise BadInput(f'{path}: [lattice] above = "ground" lets UAVs climb with the terrain, '
+                       'which a mission does not know; give above = "datum", and altitudes above '
+                       "all hills that they fly over")
     for uav in config.uavs:
         if not 1 <= uav.battery / HOVER_COST <= MAX_HOVERS:
             raise BadInput(f"{path}: uav {uav.uav!r}: battery = {uav.battery:g}; a mission allows "

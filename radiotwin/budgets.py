@@ -107,6 +107,9 @@ OUTLINE_CORNERS = Budget("OUTLINE_CORNERS", 20_000, "corners", "one building of 
 VEGETATION_CORNERS = Budget("VEGETATION_CORNERS", 50_000, "corners", "all vegetation of a scene")
 VEGETATION_MEETINGS = Budget("VEGETATION_MEETINGS", 200_000, "meetings of its outlines",
                              "all vegetation of a scene")
+TERRAIN_PIXELS = Budget("TERRAIN_PIXELS", 500_000_000, "pixels", "a terrain raster, of the scene")
+TERRAIN_BLOCK_BYTES = Budget("TERRAIN_BLOCK_BYTES", 512 * 2**20, "bytes",
+                             "one block of a terrain raster")
 CROSSINGS = Budget("CROSSINGS", 2_000, "crossings of outlines with themselves", "a map")
 OVERLAPS = Budget("OVERLAPS", 20_000, "pairs of buildings that overlap", "a map")
 PART_PAIRS = Budget("PART_PAIRS", 2_000_000, "pairs of a part and a building around it", "a map")

@@ -38,8 +38,8 @@ def build_scene(
     extent_m: tuple[float, float, float, float] | None = None, scale: float | None = None,
     up: str | None = None, default_height_m: float | None = None,
     height_column: str | None = None, ground_column: str | None = None,
-    material_table: MaterialTable | Path | str | None = None, overpass: bool = False,
-    check_only: bool = False,
+    material_table: MaterialTable | Path | str | None = None,
+    terrain: Path | str | None = None, overpass: bool = False, check_only: bool = False,
 ) -> BuildReport:
     """Build a scene folder from a map or a city model, and report on it.
 
@@ -69,6 +69,7 @@ def build_scene(
             `floors:storeys`; None: the columns that are known by name.
         ground_column: of a map: column of the ground's elevation, which is subtracted.
         material_table: of a map: materials of its tags, or the file that declares them.
+        terrain: of a map: GeoTIFF of the ground's heights; None: flat ground.
         overpass: download the map `source`, an .osm file that does not exist yet, for `bbox`.
         check_only: write nothing, and return errors in the report instead of raising them.
 
@@ -86,13 +87,14 @@ def build_scene(
     of_cities = _given(scale=scale, up=up)
     of_maps = _given(default_height_m=default_height_m, height_column=height_column,
                      ground_column=ground_column, material_table=material_table,
-                     overpass=overpass or None)
+                     terrain=terrain, overpass=overpass or None)
     text = str(source)
     if map_suffix(source):
         _refuse(of_cities, f"{source} is a map")
         table = _material_table(material_table, materials or {})
         options = MapOptions(bbox, default_height_m, table,
-                             _height_column(height_column, ground_column))
+                             _height_column(height_column, ground_column),
+                             None if terrain is None else Path(terrain))
         options.check()
         if overpass:
             _download(source, bbox)

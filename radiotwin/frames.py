@@ -1,10 +1,12 @@
 """The frame of tables of positions: `frame.toml` beside them says where on the earth it lies."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import pandas as pd
 import tomli_w
 from pydantic import ConfigDict, Field, ValidationError, model_validator
 
@@ -13,6 +15,7 @@ from radiotwin.geodesy import local_crs, to_geographic, to_local
 from radiotwin.inputs import is_within, read_toml
 from radiotwin.tables import Origin, Table
 
+GroundHeight = Callable[[np.ndarray, np.ndarray], np.ndarray]
 FRAME_FILE = "frame.toml"
 SAME_DEG, SAME_ALTITUDE_M = 1e-9, 1e-3  # of one place, after rounding: 0.1 mm on the ground
 
@@ -123,3 +126,45 @@ def _rise_m(one: Origin, other: Origin) -> float:
     if not (one.altitude_m and other.altitude_m):
         return 0.0
     return one.altitude_m - other.altitude_m
+
+
+def above_datum(table: pd.DataFrame, what: str, position: list[str],
+                ground_height_m: GroundHeight | None) -> pd.DataFrame:
+    """Return a table with the heights that it gives above the ground above the datum.
+
+    Args:
+        table: with columns of positions, and one named as that of the height, `above_ground_m` for
+            `z_m`; a row has one of both heights, or none.
+        what: it holds, for messages.
+        position: its columns of x, y and z.
+        ground_height_m: returns the heights (n,) of the ground at x and y (n,) [m]; None: it is at
+            z = 0.
+
+    Raises:
+        BadInput: a row has both heights, or one above the ground of an unknown position.
+    """
+    column = position[2].replace("z_m", "above_ground_m")
+    if column not in table:
+        return table
+    (x_m, y_m, z_m), above_m = table[position].to_numpy(dtype=float).T, table[column].to_numpy()
+    given = np.isfinite(above_m)
+    twice = np.flatnonzero(given & np.isfinite(z_m))
+    if len(twice):
+        raise BadInput(f"{what}, row {twice[0] + 2}: {position[2]} (above the datum) and {column} "
+                       "are both given; leave one of them empty")
+    nowhere = np.flatnonzero(given & ~np.isfinite(x_m + y_m))
+    if len(nowhere) and ground_height_m is not None:
+        raise BadInput(f"{what}, row {nowhere[0] + 2}: {column} needs a known position; a device "
+                       f"to be found is searched at one height above the datum: give {position[2]}")
+    ground_m = np.zeros(len(table))
+    if ground_height_m is not None:
+        ground_m[given] = ground_height_m(x_m[given], y_m[given])
+    return table.drop(columns=column).assign(**{position[2]: np.where(given, ground_m + above_m,
+                                                                      z_m)})
+
+
+def moved_positions(table: pd.DataFrame, columns: list[str],
+                    position_m: Callable[[np.ndarray], np.ndarray]) -> pd.DataFrame:
+    """Return a table with its columns of positions converted by a function of (n, 3) [m]."""
+    moved_m = position_m(table[columns].to_numpy(dtype=float))
+    return table.assign(**dict(zip(columns, moved_m.T)))

@@ -20,6 +20,7 @@ DIMS = ("device", "z", "y", "x")
 SCHEMA = "radiotwin.radiomap/1"
 CONVENTIONS = "CF-1.11"  # https://cfconventions.org
 GRID_MAPPING = "crs"
+GROUND = "ground_m"  # coordinate of a map whose altitudes are above the ground
 GAIN_RANGE_DB = (-1_000.0, 200.0)  # far beyond any link: what is outside is an error
 MAX_SIGMA_DB = 1_000.0
 BLOCK_VALUES = 200_000  # of a variable that are in memory at once
@@ -30,6 +31,7 @@ ATTRIBUTES: dict[str, dict[str, str]] = {
     "x": {"units": "m", "long_name": "east"},
     "y": {"units": "m", "long_name": "north"},
     "z": {"units": "m", "long_name": "height above the ground datum"},
+    GROUND: {"units": "m", "long_name": "height of the ground above the datum; z is above it"},
     "gain_db": {"units": "dB", "long_name": "channel gain (NaN: not detected)"},
     "sigma_db": {"units": "dB", "long_name": "standard deviation of the gain"},
     "los": {"long_name": "line of sight by the 3D map"},
@@ -80,8 +82,7 @@ class MapStream:
         with progress("mapping", total=len(self.devices) * len(parts)) as advance:
             for row, device in enumerate(self.devices):
                 for z, y, x in parts:
-                    lattice = Lattice(self.lattice.x_m[x], self.lattice.y_m[y], self.lattice.z_m[z])
-                    values = self.make(device, lattice)
+                    values = self.make(device, self.lattice.part(z, y, x))
                     _check_values(device, values)
                     yield MapBlock((slice(row, row + 1), z, y, x),
                                    {name: values[name][None] for name in self.variables})
@@ -118,6 +119,10 @@ def header(devices: list[str], lattice: Lattice, attributes: dict[str, Any] | No
                          attrs={"schema": SCHEMA, **(attributes or {})})
     for axis in "zyx":
         dataset[axis].attrs.update(ATTRIBUTES[axis])
+    if lattice.ground_m is not None:
+        dataset["z"].attrs["long_name"] = "height above the ground"
+        dataset = dataset.assign_coords({GROUND: (("y", "x"), lattice.ground_m,
+                                                  ATTRIBUTES[GROUND])})
     return dataset
 
 
@@ -177,7 +182,8 @@ def write_blocks(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[
         options["chunks"] = (1, 1, *cells)
     start = BytesIO()
     with_cf(top).to_netcdf(start, engine="h5netcdf",
-                           encoding={axis: {"_FillValue": None} for axis in "xyz"})
+                           encoding={axis: {"_FillValue": None} for axis in ("x", "y", "z", GROUND)
+                                     if axis in top})
     with atomic_file(path, hide_errors=True) as file:
         file.write(start.getbuffer())
         with h5netcdf.File(file, "r+", rdcc_nbytes=_CACHE_BYTES) as opened:

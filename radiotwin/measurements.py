@@ -21,8 +21,11 @@ from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 from radiotwin.frames import (
     FRAME_FILE,
+    GroundHeight,
+    above_datum,
     between_frames,
     is_same_frame,
+    moved_positions,
     place,
     read_frame,
     write_frame,
@@ -40,9 +43,9 @@ if TYPE_CHECKING:
 
 # Columns of the two files, as in docs/conventions.md.
 REQUIRED = ["flight", "receiver", "receiver_x_m", "receiver_y_m", "receiver_z_m", "device"]
-OPTIONAL = ["time_s", "heading_deg", "pitch_deg", "roll_deg", "quality"]
+OPTIONAL = ["time_s", "heading_deg", "pitch_deg", "roll_deg", "quality", "receiver_above_ground_m"]
 DEVICE_REQUIRED = ["device", "x_m", "y_m", "z_m", "role"]
-DEVICE_OPTIONAL = ["frequency_hz", "tx_power_dbm", "azimuth_deg", "tilt_deg"]
+DEVICE_OPTIONAL = ["frequency_hz", "tx_power_dbm", "azimuth_deg", "tilt_deg", "above_ground_m"]
 ROLES = ("anchor", "unknown")
 _RECEIVER_POSITION = ["receiver_x_m", "receiver_y_m", "receiver_z_m"]
 _DEVICE_POSITION = ["x_m", "y_m", "z_m"]
@@ -117,8 +120,16 @@ class Measurements:
             position_m: converts (n, 3) positions [m] to that frame; NaN where unknown.
             origin: of that frame.
         """
-        return Measurements(_moved(self.table, _RECEIVER_POSITION, position_m),
-                            _moved(self.devices, _DEVICE_POSITION, position_m), origin)
+        return Measurements(moved_positions(self.table, _RECEIVER_POSITION, position_m),
+                            moved_positions(self.devices, _DEVICE_POSITION, position_m), origin)
+
+    def on_ground(self, ground_height_m: GroundHeight | None) -> "Measurements":
+        """Return the same links with all heights above the datum; see `above_datum`."""
+        if "receiver_above_ground_m" not in self.table and "above_ground_m" not in self.devices:
+            return self
+        return Measurements(
+            above_datum(self.table, "measurements", _RECEIVER_POSITION, ground_height_m),
+            above_datum(self.devices, "devices", _DEVICE_POSITION, ground_height_m), self.origin)
 
     def in_frame(self, origin: Origin) -> "Measurements":
         """Return the same links in the frame about another origin, converted exactly.
@@ -323,8 +334,8 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
                        "correct the name")
     origin, of_devices = read_frame(path.parent), read_frame(devices_path.parent)
     if origin is not None and of_devices is not None and not is_same_frame(origin, of_devices):
-        devices = _moved(devices, _DEVICE_POSITION,
-                         lambda position_m: between_frames(position_m, of_devices, origin))
+        devices = moved_positions(devices, _DEVICE_POSITION,
+                                  lambda position_m: between_frames(position_m, of_devices, origin))
     _check_spread(path, table, devices_path, devices)
     return Measurements(table, devices, origin)
 
@@ -362,12 +373,6 @@ def read_devices(path: Path | str) -> pd.DataFrame:
         raise BadInput(f"{path}: row {row + 2}: anchor {devices['device'][row]!r} has no x_m, y_m; "
                        "fill them in or give it the role unknown")
     return devices
-
-
-def _moved(table: pd.DataFrame, columns: list[str],
-           position_m: Callable[[np.ndarray], np.ndarray]) -> pd.DataFrame:
-    moved_m = position_m(table[columns].to_numpy(dtype=float))
-    return table.assign(**dict(zip(columns, moved_m.T)))
 
 
 def _check_spread(path: Path, table: pd.DataFrame, devices_path: Path,

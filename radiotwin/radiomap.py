@@ -20,6 +20,7 @@ from radiotwin.map_file import (
     ATTRIBUTES,
     DIMS,
     GAIN_RANGE_DB,
+    GROUND,
     MAX_SIGMA_DB,
     MapBlock,
     MapStream,
@@ -111,8 +112,10 @@ class RadioMap:
                 check_hdf5(file, path)
                 with xr.open_dataset(file, engine="h5netcdf") as opened:
                     problem = _form_problem(opened)
-                    names = [*(name for name in _VARIABLES if name in opened), *DIMS]
-                    dataset = opened if problem else opened[names].load()
+                    names = [*(name for name in _VARIABLES if name in opened), *DIMS,
+                             *([GROUND] if GROUND in opened.variables else [])]
+                    dataset = opened if problem else opened[names].load().set_coords(
+                        [name for name in names if name == GROUND])
             except BadInput:
                 raise
             except Exception as error:  # h5py raises OSError, KeyError or ValueError, by the damage
@@ -272,7 +275,9 @@ class RadioMap:
     @property
     def lattice(self) -> Lattice:
         """Positions of the map."""
-        return Lattice(*(self.dataset[axis].values.astype(float) for axis in "xyz"))
+        x_m, y_m, z_m = (self.dataset[axis].values.astype(float) for axis in "xyz")
+        ground_m = self.dataset[GROUND].values.astype(float) if GROUND in self.dataset else None
+        return Lattice(x_m, y_m, z_m, ground_m)
 
     @property
     def gain_db(self) -> np.ndarray:
@@ -302,6 +307,9 @@ def _form_problem(dataset: xr.Dataset) -> str | None:
             return f"the coordinate {axis} is missing or empty"
         budget = DEVICES if axis == "device" else MAP_AXIS
         budget.check(dataset.sizes[axis], f"axis {axis} of the radio map")
+    if GROUND in dataset.variables and (
+            dataset[GROUND].dims != ("y", "x") or dataset[GROUND].dtype.kind not in "iuf"):
+        return f"{GROUND} is not numbers with the dims ('y', 'x')"
     for name in _NUMBERS:
         value = dataset.attrs.get(name, 0.0)
         if not isinstance(value, int | float | np.number) or not math.isfinite(value):
@@ -323,6 +331,8 @@ def _value_problem(dataset: xr.Dataset) -> str | None:
                 len(values) > 1 and np.diff(values).min() < MIN_STEP_M):
             return (f"the coordinate {axis} must lie within {MAX_COORDINATE_M:,.0f} m of 0, with "
                     f"steps of at least {MIN_STEP_M:g} m")
+    if GROUND in dataset and not (np.abs(dataset[GROUND].values) <= MAX_COORDINATE_M).all():
+        return f"{GROUND} must hold finite heights within {MAX_COORDINATE_M:,.0f} m of 0"
     names = dataset["device"].values.astype(str)
     unique, count = np.unique(names, return_counts=True)
     if len(unique) < len(names):

@@ -1,10 +1,11 @@
 """Reading and writing of measurements: what is accepted, and how the rest is refused."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from radiotwin.errors import BadInput
-from radiotwin.measurements import read_measurements
+from radiotwin.measurements import Measurements, read_measurements
 
 DEVICES = "device,x_m,y_m,z_m,role\na,10,20,1.5,anchor\nb,,,1.5,unknown\n"
 HEADER = "time_s,flight,receiver,receiver_x_m,receiver_y_m,receiver_z_m,device,gain_db\n"
@@ -234,3 +235,20 @@ def test_a_table_of_devices_that_nobody_named_is_in_its_folder(write, tmp_path):
     with pytest.raises(BadInput, match="link out of its folder; name the table .* --devices"):
         read_measurements(path)
     assert len(read_measurements(path, tmp_path / "work" / "devices.csv").devices) == 2
+
+
+def test_heights_above_the_ground():
+    table = pd.DataFrame({"flight": "f", "receiver": "r", "receiver_x_m": [10.0, 20.0], "receiver_y_m": 0.0,
+                          "receiver_z_m": [np.nan, 70.0], "receiver_above_ground_m": [5.0, np.nan], "device": "d",
+                          "gain_db": -80.0})
+    devices = pd.DataFrame({"device": ["d", "e"], "x_m": [30.0, np.nan], "y_m": [0.0, np.nan], "z_m": [np.nan, 9.0],
+                            "role": ["anchor", "unknown"], "above_ground_m": [2.0, np.nan]})
+    data = Measurements(table, devices)
+    on_slope = data.on_ground(lambda x_m, y_m: 0.5 * x_m)
+    assert on_slope.receiver_m[:, 2].tolist() == [10, 70] and on_slope.device_m[:, 2].tolist() == [17, 9]
+    assert "above_ground_m" not in on_slope.devices
+    assert data.on_ground(None).receiver_m[:, 2].tolist() == [5, 70]
+    with pytest.raises(BadInput, match=r"row 2: receiver_z_m \(above the datum\) and receiver_above_ground_m are both"):
+        Measurements(table.assign(receiver_z_m=1.0), devices).on_ground(None)
+    with pytest.raises(BadInput, match="devices, row 3: above_ground_m needs a known position"):
+        Measurements(table, devices.assign(above_ground_m=2.0, z_m=np.nan)).on_ground(lambda x_m, y_m: x_m)

@@ -5,7 +5,7 @@ has two branches, with line of sight and without. A 3D map decides which one hol
 they are mixed by the law's probability of line of sight.
 
 Recommendations are written for a fixed station and a terminal. Here either end may be the higher
-one, and paths are reciprocal: the laws know a higher and a lower end, heights above z = 0.
+one, and paths are reciprocal: the laws know a higher and a lower end, heights above the ground.
 """
 
 from __future__ import annotations
@@ -179,8 +179,11 @@ class PublishedLaw(ChannelModel):
 
 
 def ends_m(links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-    """Return the heights (n,) of the higher and of the lower end of links [m]."""
+    """Return the heights (n,) above the ground of the higher and of the lower end of links [m]."""
     heights_m = links.device_m[:, 2], links.receiver_m[:, 2]
+    if links.city is not None and links.city.terrain is not None:
+        heights_m = (heights_m[0] - links.city.ground_height_m(*links.device_m[:, :2].T),
+                     heights_m[1] - links.city.ground_height_m(*links.receiver_m[:, :2].T))
     return np.maximum(*heights_m), np.minimum(*heights_m)
 
 
@@ -196,10 +199,10 @@ def free_space_db(distance_m: np.ndarray, frequency_hz: float) -> np.ndarray:
 
 
 def mean_roof_m(city: CityMap) -> float:
-    """Return the mean height of a map's roofs over the area they cover [m]; 0 without any."""
+    """Return the mean height of a map's roofs above the ground below [m]; 0 without any."""
     low_m, high_m = city.vertices[:, :2].min(axis=0), city.vertices[:, :2].max(axis=0)
     share = (np.arange(GRID) + 0.5) / GRID
     x_m, y_m = (low + share * (high - low) for low, high in zip(low_m, high_m, strict=True))
-    height_m = city.height_at(*np.meshgrid(x_m, y_m))
+    height_m = city.height_at(*np.meshgrid(x_m, y_m)) - city.ground_height_m(*np.meshgrid(x_m, y_m))
     roofs_m = height_m[height_m > MIN_ROOF_M]
     return float(roofs_m.mean()) if len(roofs_m) else 0.0

@@ -103,7 +103,7 @@ def in_frame_of(scene: "Scene | None", measurements: "Measurements",
         if shift_m is not None:
             raise BadInput("--shift moves measurements into the frame of a scene, and none is "
                            "given; add --scene, or leave it out")
-        return measurements
+        return measurements.on_ground(None)
     return in_scene_frame(measurements, scene,
                           None if shift_m is None else (shift_m[0], shift_m[1]))
 

@@ -63,6 +63,9 @@ def build_scene(
     material_table: Annotated[Path | None, typer.Option(
         metavar="FILE.toml", help="Materials of a map's tags, where they differ from the standard "
                                   "table.")] = None,
+    terrain: Annotated[Path | None, typer.Option(
+        metavar="FILE.tif", help="Heights of a map's ground, a GeoTIFF; buildings stand on it "
+                                 "[flat ground].")] = None,
     overpass: Annotated[bool, typer.Option(
         "--overpass", help="Download CITY, an .osm file that does not exist yet, for --bbox first; "
                            "needs a network.")] = False,
@@ -96,7 +99,7 @@ def build_scene(
                    origin=parse_origin(origin), scale=scale, up=up,
                    default_height_m=height_default, height_column=height_column,
                    ground_column=ground_column, material_table=material_table,
-                   overpass=overpass, step_m=step,
+                   terrain=terrain, overpass=overpass, step_m=step,
                    altitudes_m=None if altitudes is None else
                    parse_numbers("--altitudes", altitudes),
                    extent_m=None if extent is None else parse_bounds("--extent", extent),
@@ -150,7 +153,7 @@ def export(
         raise BadInput(f"--to {to!r} is unknown; allowed is ns3")
     world = Scene.load(scene)
     model = RadioMap.load(source) if source.suffix == ".nc" else Twin.load(source)
-    pairs = export_ns3(model, world, read_points(points, world.config.origin), out,
+    pairs = export_ns3(model, world, read_points(points, world.config.origin, world.city), out,
                        devices=split_names(devices))
     say(f"wrote {out / 'nodes.csv'}, {out / 'losses.csv'}: {pairs:,} pairs of a device and a point")
 

@@ -122,7 +122,7 @@ def gains(
     from radiotwin.trace import read_points, trace_points
 
     scene, names = Scene.load(folder), split_names(devices)
-    points_m = read_points(points, scene.config.origin)
+    points_m = read_points(points, scene.config.origin, scene.city)
     settings = _settings(scene, points_m, names, quality, target_db, combining=combining, seed=seed)
     with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
         table = trace_points(scene, points_m, settings, out, names, executor)
@@ -153,10 +153,13 @@ def paths(
     from radiotwin.trace import read_points
 
     scene = Scene.load(folder)
-    points_m = read_points(points, scene.config.origin)
+    points_m = read_points(points, scene.config.origin, scene.city)
     found = list_paths(scene, points_m, out, split_names(devices),
                        None if velocity is None else _speeds(velocity), bandwidth_hz)
     reasons = found["reason"].to_series().value_counts()
+    if scene.city.terrain is not None:
+        say("the ground is a terrain: paths reflect off its triangles and diffract where it folds "
+            "by more than 6 degrees; links behind rounded hills have fewer paths than in reality")
     say(f"wrote {out}: {found.sizes['path']} paths of {found.sizes['link']} links"
         + "".join(f", {count} {reason}" for reason, count in reasons.items() if reason))
 

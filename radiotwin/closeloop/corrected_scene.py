@@ -83,8 +83,9 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
                        *((x_m, y_m, uav.altitude_m) for uav in config.uavs
                          for x_m, y_m in ((uav.start_x_m, uav.start_y_m),
                                           (uav.terminal_x_m, uav.terminal_y_m)))])
-    boxes = [_pulled_back(Box(*each.params.box), free_m.reshape(-1, 3)) for each in effects
-             if isinstance(each.effect, MissingObstacle)]
+    boxes = [_pulled_back(Box(*each.params.box), free_m.reshape(-1, 3) - [
+                 0.0, 0.0, float(scene.city.ground_height_m(*each.params.box[:2]))])
+             for each in effects if isinstance(each.effect, MissingObstacle)]
     changes = [f"a box of {box.length_m:.0f} x {box.width_m:.0f} m, {box.height_m:.0f} m high, "
                f"stands at ({box.x_m:.0f}, {box.y_m:.0f}) m" for box in boxes]
     changes += ["the building at ({:.0f}, {:.0f}) m, {:.0f} m high, is taken out".format(
@@ -188,7 +189,8 @@ def _box_shapes(scene: Scene, boxes: list[Box], taken: set[str]) -> list[CitySha
     shapes = []
     for box in boxes:
         turned = trimesh.transformations.rotation_matrix(np.radians(box.turn_deg), (0, 0, 1))
-        turned[:3, 3] = box.x_m, box.y_m, 0.5 * (bottom_m + box.height_m)
-        mesh = trimesh.creation.box((box.length_m, box.width_m, box.height_m - bottom_m), turned)
+        top_m = float(scene.city.ground_height_m(box.x_m, box.y_m)) + box.height_m
+        turned[:3, 3] = box.x_m, box.y_m, 0.5 * (bottom_m + top_m)
+        mesh = trimesh.creation.box((box.length_m, box.width_m, top_m - bottom_m), turned)
         shapes.append(CityShape(unique_name("found_box", taken), mesh, material))
     return shapes

@@ -22,7 +22,7 @@ class CoverageGrid:
         x_m: (nx,) middles of the cells, ascending [m].
         y_m: (ny,) likewise [m].
         step_m: side of a cell [m].
-        height_m: of the receivers above the ground; of a radio map, above the datum [m].
+        height_m: of the receivers above the ground; of a radio map, as its altitudes [m].
         above_ground: whether it is above the ground.
     """
 
@@ -67,7 +67,8 @@ class CoverageGrid:
             BadInput: there are too many.
         """
         COVERAGE_CELLS.check(len(lattice.x_m) * len(lattice.y_m), "the radio map's positions")
-        return cls(lattice.x_m, lattice.y_m, lattice.step_m, float(lattice.z_m[0]), False)
+        return cls(lattice.x_m, lattice.y_m, lattice.step_m, float(lattice.z_m[0]),
+                   lattice.ground_m is not None)
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -105,12 +106,17 @@ class CoverageGrid:
             y_m: (n,) to the north [m].
             ground: as of `receivers_m`.
         """
-        bottom_m = ground.height_at(x_m, y_m) if ground is not None and self.above_ground else 0.0
+        bottom_m: np.ndarray | float = 0.0
+        if ground is not None and self.above_ground:
+            on = ground.height_at if ground.terrain is None else ground.ground_height_m
+            bottom_m = on(x_m, y_m)
         return np.column_stack([x_m, y_m, np.broadcast_to(bottom_m + self.height_m, x_m.shape)])
 
 
 def ground_of(city: CityMap) -> CityMap | None:
     """Return the map of the ground alone; None where there is none, or it is flat at the datum."""
+    if city.terrain is not None:
+        return city.without(~city.terrain)
     ground = Surfaces([(city.vertices, city.faces)]).ground_faces()
     corners_m = city.vertices[city.faces[ground]]
     if not ground.any() or np.abs(corners_m[..., 2]).max() <= GROUND_M:

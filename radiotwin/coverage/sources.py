@@ -315,4 +315,4 @@ def map_grid(radio_map: RadioMap, altitude_m: float) -> Lattice:
                          for axis in (lattice.x_m, lattice.y_m)):
         raise BadInput("the radio map's positions are not equally far apart, so that shares of "
                        "an area cannot be told; make a map with one step")
-    return Lattice(lattice.x_m, lattice.y_m, np.array([altitude_m]))
+    return Lattice(lattice.x_m, lattice.y_m, np.array([altitude_m]), lattice.ground_m)

@@ -1,6 +1,6 @@
 """Small helpers that many effects share."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -38,6 +38,37 @@ def city_of(links: LinkData, effect: str) -> CityMap:
         raise BadInput(f"the effect {effect} needs a 3D map, and none is given; give it with "
                        "--scene")
     return links.city
+
+
+def ends_above(links: LinkData, place_m: Sequence[float],
+               rows: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends (n, 3) of links, heights above the ground below one place [m].
+
+    Args:
+        links: with a 3D map or without, where the ground is at z = 0.
+        place_m: x and y [m].
+        rows: of the links.
+    """
+    ends_m = links.device_m[links.device[rows]], links.receiver_m[rows]
+    if links.city is None or links.city.terrain is None:
+        return ends_m
+    base_m = [0.0, 0.0, float(links.city.ground_height_m(*place_m))]
+    return ends_m[0] - base_m, ends_m[1] - base_m
+
+
+def ends_above_ground(links: LinkData, rows: np.ndarray | slice = slice(None)
+                      ) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends (n, 3) of links, each with its height above the ground below it [m].
+
+    Args:
+        links: with a 3D map or without, where the ground is at z = 0.
+        rows: of the links.
+    """
+    ends_m = links.device_m[links.device[rows]].copy(), links.receiver_m[rows].copy()
+    if links.city is not None and links.city.terrain is not None:
+        for end_m in ends_m:
+            end_m[:, 2] -= links.city.ground_height_m(*end_m[:, :2].T)
+    return ends_m
 
 
 def subsample(rows: np.ndarray, maximum: int) -> np.ndarray:

@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field
 from typing_extensions import override
 
+from radiotwin.effects.arrays import ends_above, ends_above_ground
 from radiotwin.effects.base import GainEffect
 from radiotwin.effects.boxes import (
     CELL_M,
@@ -68,7 +69,7 @@ class Foliage(GainEffect):
     def propose(self, view: ResidualView) -> list[Params]:
         links = view.links
         nats = obstruction_nats(view.residual_db, view.scale_db, LOSSES_DB) / view.design_effect
-        centres_m, total = back_project(links.device_m[links.device], links.receiver_m, nats)
+        centres_m, total = back_project(*ends_above_ground(links), nats)
         allowed = [i for i, height_m in enumerate(HEIGHTS_M)
                    if MIN_HEIGHT_M <= height_m <= MAX_PROPOSED_HEIGHT_M]
         ceiling_db = (max_loss_db(links.frequency_hz) if np.isfinite(links.frequency_hz)
@@ -81,7 +82,7 @@ class Foliage(GainEffect):
 
     @override
     def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
-        crossing = cross(params.box, links.device_m[links.device], links.receiver_m)
+        crossing = cross(params.box, *ends_above(links, params.box[:2]))
         specific_db_m, max_db = params.law
         return -max_db * (1 - np.exp(-crossing.inside_m * specific_db_m / max_db))
 

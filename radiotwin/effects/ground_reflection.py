@@ -6,6 +6,8 @@ from the device's image, R Fresnel's coefficient for vertical polarisation over 
 (ITU-R P.2040-4, Table 3), ψ the angle between ray and ground, and the exponential for a surface of
 roughness σ (Ament 1953, 'Toward a theory of reflection by a rough surface', Proc. IRE 41). Heights
 that are known to σ only blur the fringes by the same factor, on average.
+
+On a terrain the plane is that which touches it where the ray bounces.
 """
 
 import numpy as np
@@ -25,6 +27,7 @@ from radiotwin.effects.params import (
 )
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
+from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import permittivity
 
 MIN_LINKS = 100  # with line of sight
@@ -38,6 +41,9 @@ HEIGHTS = np.arange(-32, 33) / 8
 MAX_HEIGHT_M = 0.5  # of the ground, above or below the declared one
 MAX_STRENGTH = 2.0  # of metal at steep angles, relative to medium dry ground
 MIN_END_HEIGHT_M = 0.1  # of both ends above the ground
+SLOPE_M = 5.0  # to each side of the bounce, that the slope of a terrain is taken over
+BOUNCE_ROUNDS = 8  # in which the point of a bounce on a terrain is found
+OFF_GROUND_M = 1.0  # of the point in the plane, where the terrain is too curved for one
 BOUNCE_M = 0.2  # height of the bounce in its lines of sight, which the ground would block
 DEEPEST_DB = -30.0  # fringe that is ever measured
 
@@ -96,9 +102,10 @@ class GroundReflection(GainEffect):
     @override
     def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
         offset_db = np.zeros(len(links))
-        rows = np.flatnonzero(self._bounces.get(links, None, lambda: _has_bounce(links)))
+        clear, device_m, receiver_m = self._bounces.get(links, None, lambda: _bounces(links))
+        rows = np.flatnonzero(clear)
         offset_db[rows] = two_ray_db(
-            links.device_m[links.device[rows]], links.receiver_m[rows], links.frequency_hz,
+            device_m[rows], receiver_m[rows], links.frequency_hz,
             params.strength, params.roughness_m, params.ground_m)
         return offset_db
 
@@ -124,8 +131,68 @@ class GroundReflection(GainEffect):
                                                        of.high, strict=True)}
 
 
+def _bounces(links: LinkData) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return whether (n,) links have both rays, and their ends (n, 3) above a plane z = 0 [m]."""
+    device_m = links.device_m[links.device]
+    if links.city is not None and links.city.terrain is not None:
+        return bounces_on_terrain(links.city, device_m, links.receiver_m, links.los)
+    return _has_bounce(links), device_m, links.receiver_m
+
+
+def bounces_on_terrain(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
+                       los: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Find where rays between n pairs of ends bounce off a terrain.
+
+    The plane that touches the terrain at a point reflects at another one; there the next plane
+    touches it, until both are one.
+
+    Args:
+        city: 3D map with a terrain.
+        device_m: (n, 3) first ends [m].
+        receiver_m: (n, 3) second ends [m].
+        los: (n,) bool, links with line of sight; others have no bounce.
+
+    Returns:
+        (n,) bool, whether there is a bounce that nothing blocks; and both ends (n, 3) as the plane
+        of the bounce sees them: z above it, the first one at x = y = 0, the second one at y = 0.
+    """
+    height_m = [np.maximum(end_m[:, 2] - city.ground_height_m(*end_m[:, :2].T), MIN_END_HEIGHT_M)
+                for end_m in (device_m, receiver_m)]
+    share = height_m[0] / (height_m[0] + height_m[1])
+    at_m = device_m + share[:, None] * (receiver_m - device_m)
+    for _ in range(BOUNCE_ROUNDS):
+        touch_m = np.column_stack([at_m[:, :2], city.ground_height_m(*at_m[:, :2].T)])
+        normal = _slope_normals(city, touch_m)
+        above_m = [np.einsum("ij,ij->i", end_m - touch_m, normal)
+                   for end_m in (device_m, receiver_m)]
+        whole_m = np.maximum(above_m[0] + above_m[1], MIN_END_HEIGHT_M)
+        share = np.clip(above_m[0] / whole_m, 0.0, 1.0)
+        feet_m = [end_m - height[:, None] * normal
+                  for end_m, height in zip((device_m, receiver_m), above_m)]
+        at_m = feet_m[0] + share[:, None] * (feet_m[1] - feet_m[0])
+    off_m = np.abs(at_m[:, 2] - city.ground_height_m(*at_m[:, :2].T))
+    clear = los & (off_m < OFF_GROUND_M) & (np.minimum(*above_m) >= MIN_END_HEIGHT_M)
+    raised_m = at_m + (BOUNCE_M + off_m)[:, None] * [0.0, 0.0, 1.0]
+    clear[clear] = (city.line_of_sight(device_m[clear], raised_m[clear])
+                    & city.line_of_sight(raised_m[clear], receiver_m[clear]))
+    flat_m, none = np.linalg.norm(feet_m[1] - feet_m[0], axis=1), np.zeros(len(device_m))
+    return (clear, np.column_stack([none, none, above_m[0]]),
+            np.column_stack([flat_m, none, above_m[1]]))
+
+
+def _slope_normals(city: CityMap, points_m: np.ndarray) -> np.ndarray:
+    """Return the upward unit normals (n, 3) of a terrain, over `SLOPE_M` to each side."""
+    rise = []
+    for aside_m in SLOPE_M * np.eye(2):
+        forth, back = points_m[:, :2] + aside_m, points_m[:, :2] - aside_m
+        rise.append((city.ground_height_m(*forth.T) - city.ground_height_m(*back.T))
+                    / (2 * SLOPE_M))
+    normal = np.column_stack([-rise[0], -rise[1], np.ones(len(points_m))])
+    return normal / np.linalg.norm(normal, axis=1, keepdims=True)
+
+
 def _has_bounce(links: LinkData) -> np.ndarray:
-    """Return whether (n,) links have both the direct ray and the one off the ground."""
+    """Return whether (n,) links have both the direct ray and the one off flat ground."""
     clear = links.los.copy()
     if links.city is not None:
         a_m, b_m = links.device_m[links.device[clear]], links.receiver_m[clear]

@@ -75,7 +75,7 @@ class Interference(ReceiverEffect):
         axes = (np.arange(a, b, step_m) for a, b in zip(low, high))
         positions_m = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
         if links.city is not None:
-            height_m = np.full(len(positions_m), HEIGHT_M)
+            height_m = HEIGHT_M + links.city.ground_height_m(*positions_m.T)
             positions_m = positions_m[~links.city.inside(np.column_stack([positions_m, height_m]))]
         levels_db = np.nanquantile(links.level_db, QUANTILES)
         rows = subsample(np.arange(len(links)), MAX_LINKS)
@@ -144,18 +144,19 @@ class Interference(ReceiverEffect):
 
 
 def interference_db(receiver_m: np.ndarray, position_m: Sequence[float] | np.ndarray,
-                    level_db: float) -> np.ndarray:
+                    level_db: float, ground_m: float = 0.0) -> np.ndarray:
     """Return the level of an emitter at receivers.
 
     Args:
         receiver_m: (n, 3) [m].
         position_m: x and y of the emitter [m].
         level_db: at `REFERENCE_M` [dB].
+        ground_m: height of the ground below the emitter [m].
 
     Returns:
         (n,) [dB].
     """
-    distance_m = np.linalg.norm(receiver_m - [*position_m, HEIGHT_M], axis=1)
+    distance_m = np.linalg.norm(receiver_m - [*position_m, ground_m + HEIGHT_M], axis=1)
     return level_db - 20 * np.log10(np.maximum(distance_m, 1.0) / REFERENCE_M)
 
 
@@ -167,10 +168,11 @@ def _hidden_loss_db(links: LinkData) -> float | None:
 def _arriving_db(links: LinkData, position_m: Sequence[float] | np.ndarray, level_db: float,
                  hidden_loss_db: float | None) -> np.ndarray:
     """Return the level (n,) of an emitter at the receivers, behind buildings less [dB]."""
-    arriving_db = interference_db(links.receiver_m, position_m, level_db)
+    ground_m = 0.0 if links.city is None else float(links.city.ground_height_m(*position_m))
+    arriving_db = interference_db(links.receiver_m, position_m, level_db, ground_m)
     if hidden_loss_db is None or links.city is None:
         return arriving_db
-    seen = links.city.line_of_sight(np.array([*position_m, HEIGHT_M]), links.receiver_m)
+    seen = links.city.line_of_sight(np.array([*position_m, ground_m + HEIGHT_M]), links.receiver_m)
     return np.where(seen, arriving_db, arriving_db - hidden_loss_db)
 
 

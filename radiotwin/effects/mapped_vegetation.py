@@ -89,8 +89,11 @@ class MappedVegetation(GainEffect):
 
     def _through_m(self, links: LinkData, kind: str) -> np.ndarray:
         def measure() -> np.ndarray:
-            vegetation = city_of(links, self.name).vegetation.of_kind(kind)
+            city = city_of(links, self.name)
+            vegetation = city.vegetation.of_kind(kind)
             if not len(vegetation):
                 return np.zeros(len(links))
-            return vegetation.metres_through(links.device_m[links.device], links.receiver_m)
+            return vegetation.metres_through(links.device_m[links.device], links.receiver_m,
+                                             city.ground_height_m if city.terrain is not None
+                                             else None)
         return self._through.get(links, kind, measure)

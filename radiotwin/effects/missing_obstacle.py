@@ -13,7 +13,7 @@ from pydantic import Field
 from scipy.constants import speed_of_light
 from typing_extensions import override
 
-from radiotwin.effects.arrays import city_of
+from radiotwin.effects.arrays import city_of, ends_above, ends_above_ground
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.boxes import (
     CELL_M,
@@ -80,7 +80,7 @@ class MissingObstacle(GainEffect):
             return []
         nats = obstruction_nats(view.residual_db[rows], view.scale_db[rows],
                                 LOSSES_DB) / view.design_effect
-        centres_m, total = back_project(links.device_m[links.device[rows]], links.receiver_m[rows],
+        centres_m, total = back_project(*ends_above_ground(links, rows),
                                         nats)
         side_m = 1.5 * CELL_M
         return [self.Params(box=Box(x_m, y_m, side_m, side_m, HEIGHTS_M[height], 0.0))
@@ -99,7 +99,7 @@ class MissingObstacle(GainEffect):
             offset_db[rows] = level_at(with_box, True) - level_at(mine, True)
             return Term.of_offset(offset_db)
         rows = np.flatnonzero(links.los)
-        crossing = cross(params.box, links.device_m[links.device[rows]], links.receiver_m[rows])
+        crossing = cross(params.box, *ends_above(links, params.box[:2], rows))
         crosses = np.isfinite(crossing.left_m)
         if crosses.any():
             rows = rows[crosses]
@@ -181,9 +181,12 @@ def _with_box(city: CityMap, box: Box) -> CityMap:
     import trimesh  # slow to load, and needed for exact levels only
 
     pose = trimesh.transformations.rotation_matrix(np.radians(box.turn_deg), (0, 0, 1))
-    pose[:3, 3] = box.x_m, box.y_m, 0.5 * box.height_m
-    mesh = trimesh.creation.box((box.length_m, box.width_m, box.height_m), pose)
+    base_m = float(city.ground_height_m(box.x_m, box.y_m))
+    depth_m = 0.0 if city.terrain is None else max(box.length_m, box.width_m)  # into a slope
+    pose[:3, 3] = box.x_m, box.y_m, base_m + 0.5 * (box.height_m - depth_m)
+    mesh = trimesh.creation.box((box.length_m, box.width_m, box.height_m + depth_m), pose)
     material = np.concatenate([city.material, np.full(len(mesh.faces), len(city.materials))])
     return CityMap(np.vstack([city.vertices, mesh.vertices]),
                    np.vstack([city.faces, mesh.faces + len(city.vertices)]),
-                   (*city.materials, CONCRETE), material)
+                   (*city.materials, CONCRETE), material, terrain=None if city.terrain is None
+                   else np.concatenate([city.terrain, np.zeros(len(mesh.faces), dtype=bool)]))

@@ -99,7 +99,10 @@ class RemovedObstacle(GainEffect):
 
 
 def only_blocker(links: LinkData) -> np.ndarray:
-    """Return (n,) the building that alone blocks each link; -1 where none or more than one does."""
+    """Return (n,) the building that alone blocks each link; -1 where none or more than one does.
+
+    Terrain is no building.
+    """
     assert links.city is not None
     label = buildings(links.city)[0]
     alone = np.full(len(links), -1)
@@ -107,6 +110,8 @@ def only_blocker(links: LinkData) -> np.ndarray:
     a_m, b_m = links.device_m[links.device[rows]], links.receiver_m[rows]
     near, far = links.city.first_face(a_m, b_m), links.city.first_face(b_m, a_m)
     same = (near >= 0) & (far >= 0) & (label[near] == label[far])
+    if links.city.terrain is not None:
+        same &= ~links.city.terrain[near]
     alone[rows[same]] = label[near[same]]
     return alone
 

@@ -1,6 +1,7 @@
 """Radio maps in the file formats of other programs, chosen by the file name."""
 
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,6 @@ from radiotwin.export.tables import write_csv, write_netcdf, write_numpy
 from radiotwin.map_file import MapStream
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
-from radiotwin.scene.lattice import Lattice
 
 EXPORTERS: dict[str, Callable[[RadioMap, Scene, Path], None]] = {
     ".nc": write_netcdf, ".csv": write_csv, ".npz": write_numpy, ".tif": write_geotiff,
@@ -96,7 +96,7 @@ def select(radio_map: RadioMap | MapStream, devices: list[str] | None,
             raise BadInput(f"altitude {altitude_m:g} m is not in the map; it has "
                            f"{_some(heights)} m")
     if altitudes_m:
-        lattice = Lattice(lattice.x_m, lattice.y_m, np.array(sorted(set(altitudes_m))))
+        lattice = replace(lattice, z_m=np.array(sorted(set(altitudes_m))))
     return radio_map.selected(list(dict.fromkeys(devices or names)), lattice)
 
 

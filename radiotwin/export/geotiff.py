@@ -42,6 +42,7 @@ def write_geotiff(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> 
                        "--altitudes, or write .nc or .csv")
     levels, height, width = lattice.shape
     place = georeference(lattice.x_m, lattice.y_m, step_m, scene.config.origin)
+    above = "" if lattice.ground_m is None else " above the ground"
     attributes = {name: str(value) for name, value in radio_map.header.attrs.items()}
     is_large = len(names) * height * width > _WHOLE_VALUES
     # GDAL hides errors of a full disk: it writes to memory, and we to the disk.
@@ -58,7 +59,7 @@ def write_geotiff(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> 
             file.update_tags(**attributes)
             file.units = ["dB"] * len(names)
             for number, (device, altitude_m) in enumerate(names, start=1):
-                file.set_band_description(number, f"{device} at {altitude_m:g} m")
+                file.set_band_description(number, f"{device} at {altitude_m:g} m{above}")
                 file.update_tags(number, device=device, z_m=f"{altitude_m:g}")
         with atomic_file(path) as out:
             out.write(memory.getbuffer())

@@ -79,7 +79,8 @@ def write_kmz(radio_map: RadioMap, scene: Scene, path: Path) -> None:
         pixels[..., 3] = np.where(np.isfinite(gain_db), OPACITY, 0)
         return enlarged_png(pixels)
 
-    overlays = [Overlay(device, f"{device} at {altitude_m:g} m", row == level == 0,
+    above = "" if lattice.ground_m is None else " above the ground"
+    overlays = [Overlay(device, f"{device} at {altitude_m:g} m{above}", row == level == 0,
                         partial(draw, row, level))
                 for row, device in enumerate(radio_map.devices)
                 for level, altitude_m in enumerate(lattice.z_m)]

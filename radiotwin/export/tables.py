@@ -54,6 +54,8 @@ def _rows(block: MapBlock, devices: list[str], lattice: Lattice) -> pd.DataFrame
     z_m, y_m, x_m = np.meshgrid(lattice.z_m[z], lattice.y_m[y], lattice.x_m[x], indexing="ij")
     names = np.repeat(np.array(devices[row], dtype=object), z_m.size)
     columns = {"device": names, "x_m": x_m.ravel(), "y_m": y_m.ravel(), "z_m": z_m.ravel()}
+    if lattice.ground_m is not None:
+        columns |= {"z_m": (z_m + lattice.ground_m[y, x]).ravel(), "above_ground_m": z_m.ravel()}
     return pd.DataFrame(columns | {name: values.astype(bool if name == "los" else np.float32,
                                                        copy=False).ravel()
                                    for name, values in block.values.items()})
@@ -62,7 +64,8 @@ def _rows(block: MapBlock, devices: list[str], lattice: Lattice) -> pd.DataFrame
 def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:
     """Write NumPy arrays, which `numpy.load` reads without pickling.
 
-    Arrays: gain_db, los and sigma_db (device, z, y, x), device, z_m, y_m, x_m.
+    Arrays: gain_db, los and sigma_db (device, z, y, x), device, z_m, y_m, x_m; and ground_m (y, x)
+    where z_m is above the ground.
 
     Args:
         radio_map: map to write.
@@ -72,6 +75,8 @@ def write_numpy(radio_map: RadioMap, scene: Scene, path: Path) -> None:
     lattice, dataset = radio_map.lattice, radio_map.dataset
     arrays = {"device": np.array(radio_map.devices), "z_m": lattice.z_m, "y_m": lattice.y_m,
               "x_m": lattice.x_m}
+    if lattice.ground_m is not None:
+        arrays |= {"ground_m": lattice.ground_m}
     arrays |= {name: dataset[name].values for name in radio_map.variables}
     with atomic_file(path) as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]  # no array is called allow_pickle

@@ -37,6 +37,7 @@ from radiotwin.footprints.solids import (
     find_overlaps,
     make_prisms,
 )
+from radiotwin.footprints.terrain import Ground, make_ground, stand_on
 from radiotwin.footprints.vegetation import make_vegetation, vegetation_fact
 from radiotwin.geodesy import to_local
 from radiotwin.inputs import check_input
@@ -62,6 +63,7 @@ READERS: dict[str, Callable[[Path], MapFile]] = {
     ".city.json": read_cityjson, ".city.json.gz": read_cityjson, ".json": read_cityjson,
     ".cityjson": read_cityjson, ".jsonl": read_cityjson, ".gml": read_citygml,
     ".citygml": read_citygml}
+GROUND = "ground"  # name of its shape
 GROUND_MARGIN_M = 100.0  # [m], of the ground plane beyond buildings and extent
 MAX_WIDTH_M = 50e3  # [m], chosen so that a plane and single precision are good enough
 ORIGIN_DECIMALS = 6  # of latitude and longitude [degrees]: a decimetre
@@ -80,12 +82,14 @@ class MapOptions:
             and an error where a table has columns of numbers and none of them is known.
         height_column: column that goes before all known ones; None: the known ones.
         materials: by tag.
+        terrain: GeoTIFF of the ground's heights; None: the ground is flat.
     """
 
     bbox_deg: Bounds | None = None
     default_height_m: float | None = None
     materials: MaterialTable = STANDARD
     height_column: HeightColumn | None = None
+    terrain: Path | None = None
 
     @property
     def height_m(self) -> float:
@@ -171,13 +175,17 @@ def build_scene_from_map(
     if not prisms:
         raise BadInput("\n".join([f"{path}: none of its {len(features)} buildings can be used:",
                                   *(problem.message for problem in problems)]))
-    contacts = find_contacts(prisms)
-    problems += _overlaps(prisms, contacts)
     around = choose_extent(_bounds_m(prisms, origin, map_options.bbox_deg))
     extent = around if options.extent_m is None else make_extent(options.extent_m)
     _check_width(max(np.ptp(extent.bounds[:2]), np.ptp(extent.bounds[2:])), MAX_WIDTH_M)
-    city, shape_of = _city(prisms, contacts, extent.bounds, map_options.materials, problems)
-    table = building_table(prisms, shape_of)
+    ground = make_ground(map_options.terrain, origin, _ground_box(prisms, extent.bounds), GROUND)
+    if ground.config is not None:
+        origin = origin.model_copy(update={"altitude_m": ground.config.datum_m})
+        prisms = stand_on(prisms, ground)
+    contacts = find_contacts(prisms)
+    problems += [*_overlaps(prisms, contacts), *ground.problems]
+    city, shape_of = _city(prisms, contacts, ground, map_options.materials, problems)
+    table = building_table(prisms, shape_of, ground.config is not None)
     counts = height_counts(table)
     vegetation, unusable = make_vegetation(found.vegetation, origin,
                                            _both(around.bounds, extent.bounds))
@@ -185,13 +193,14 @@ def build_scene_from_map(
     declared = Declared(str(source), map_name(source), extent, origin,
                         _provenance(str(source), counts, map_options, options),
                         _facts(table["building"].nunique(), len(set(shape_of.values())), counts,
-                               origin, map_options, vegetation, shells), vegetation)
+                               origin, map_options, vegetation, shells, ground), vegetation,
+                        ground.config)
     return finish_scene(city, declared, out_folder, options, check_only, table)
 
 
 def _facts(
     buildings: int, blocks: int, counts: dict[str, int], origin: Origin, map_options: MapOptions,
-    vegetation: list[VegetationConfig], shells: list[Feature],
+    vegetation: list[VegetationConfig], shells: list[Feature], ground: Ground,
 ) -> tuple[tuple[str, str], ...]:
     """Return lines for the report."""
     heights = ", ".join(
@@ -201,6 +210,7 @@ def _facts(
     return (("buildings", f"{buildings:,} in {blocks:,} blocks"),
             ("heights from", f"{heights} ({map_options.height_m:g} m)"),
             *([("elevations", elevation_fact(shells))] if shells else []),
+            ("ground", ground.fact),
             *([("vegetation", vegetation_fact(vegetation))] if vegetation else []),
             ("origin", f"latitude {origin.latitude_deg}, longitude {origin.longitude_deg}"))
 
@@ -334,18 +344,22 @@ def _overlaps(prisms: list[Prism], contacts: Contacts) -> list[Problem]:
     return problems_of(names, "pair(s) of buildings overlap: their common part is built once")
 
 
-def _city(
-    prisms: list[Prism], contacts: Contacts, extent_m: Bounds, table: MaterialTable,
-    problems: list[Problem],
-) -> tuple[ImportedCity, dict[int, str]]:
-    """Return the city with its ground, and the name of the shape of each prism."""
+def _ground_box(prisms: list[Prism], extent_m: Bounds) -> Bounds:
+    """Return (x_min, x_max, y_min, y_max) of the ground, beyond buildings and extent [m]."""
     bounds = np.array([prism.area.bounds for prism in prisms])
     x0, y0 = np.minimum(bounds[:, :2].min(axis=0), extent_m[::2]) - GROUND_MARGIN_M
     x1, y1 = np.maximum(bounds[:, 2:].max(axis=0), extent_m[1::2]) + GROUND_MARGIN_M
-    corners = np.array([[x0, y0, 0], [x1, y0, 0], [x1, y1, 0], [x0, y1, 0]])
-    names, meshes = ["ground"], [(corners, np.array([[0, 1, 2], [0, 2, 3]]))]
+    return x0, x1, y0, y1
+
+
+def _city(
+    prisms: list[Prism], contacts: Contacts, ground: Ground, table: MaterialTable,
+    problems: list[Problem],
+) -> tuple[ImportedCity, dict[int, str]]:
+    """Return the city with its ground, and the name of the shape of each prism."""
+    names, meshes = [GROUND], [(ground.vertices, ground.faces)]
     materials: list[Material | None] = [itu_material(table.ground)]
-    taken = Names({*RESERVED_NAMES, "ground"})
+    taken = Names({*RESERVED_NAMES, GROUND})
     shape_of: dict[int, str] = {}
     for block in make_blocks(prisms, contacts):
         name = unique_name(safe_name(prisms[block.members[0]].name), taken)

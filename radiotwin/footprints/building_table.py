@@ -8,15 +8,18 @@ import pandas as pd
 from radiotwin.footprints.solids import Prism
 
 
-def building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str]) -> pd.DataFrame:
+def building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str],
+                   on_terrain: bool = False) -> pd.DataFrame:
     """Return the table of buildings, with one row a prism.
 
     Args:
         prisms: of all buildings.
         shape_of: prism -> name of its shape in `city.xml`.
+        on_terrain: whether the ground is not flat.
 
     Returns:
-        Columns building, shape, x_m, y_m (a point inside), area_m2, bottom_m, top_m, height_from,
+        Columns building, shape, x_m, y_m (a point inside), area_m2, on terrain ground_m (the lowest
+        ground under the building), bottom_m and top_m (as ground_m above the datum), height_from,
         unusable (tags that were skipped), material, material_from.
     """
     rows = []
@@ -25,7 +28,9 @@ def building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str]) -> pd.D
         rows.append({
             "building": prism.name, "shape": shape_of.get(index, ""),
             "x_m": round(inside.x, 2), "y_m": round(inside.y, 2),
-            "area_m2": round(prism.area.area, 1), "bottom_m": round(prism.height.bottom_m, 3),
+            "area_m2": round(prism.area.area, 1),
+            **({"ground_m": prism.ground_m} if on_terrain else {}),
+            "bottom_m": round(prism.height.bottom_m, 3),
             "top_m": round(prism.height.top_m, 3), "height_from": prism.height.source,
             "unusable": "; ".join(prism.height.unusable), "material": prism.material.name,
             "material_from": prism.material_from})

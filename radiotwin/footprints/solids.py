@@ -54,6 +54,9 @@ class Prism:
         material: of its surfaces.
         material_from: the tag that the material follows from, or `default`.
         body: its surfaces; None: walls and a roof over its area.
+        site: area of the whole building that it is part of, whose ground its height counts from;
+            None: its own.
+        ground_m: height of that ground above the datum [m].
     """
 
     name: str
@@ -62,6 +65,8 @@ class Prism:
     material: Material
     material_from: str
     body: Body | None = None
+    site: BaseGeometry | None = None
+    ground_m: float = 0.0
 
     def overlaps_in_height(self, other: "Prism") -> bool:
         """Return whether both share some height."""
@@ -90,7 +95,7 @@ def make_prisms(
     wholes = [(feature, area) for feature, area in areas if not feature.is_part]
     parts = [(feature, area) for feature, area in areas if feature.is_part]
     prisms = []
-    for feature, area in _resolve_parts(wholes, parts, defects):
+    for feature, area, site in _resolve_parts(wholes, parts, defects):
         height = height_of(feature.tags, default_height_m, height_column)
         if height.unusable:
             defects.add("height", f"{feature.name}: {', '.join(height.unusable)}")
@@ -101,7 +106,7 @@ def make_prisms(
         if unknown:
             defects.add("material", f"{feature.name}: {unknown}")
         material, material_from = table.material_of(feature.tags)
-        prisms += [Prism(feature.name, polygon, height, material, material_from)
+        prisms += [Prism(feature.name, polygon, height, material, material_from, site=site)
                    for polygon in shapely.get_parts(area)]
     return prisms, defects.problems()
 
@@ -180,8 +185,13 @@ def _touches_itself(polygon: shapely.Polygon) -> bool:
     return len(np.unique(points, axis=0)) < len(points)
 
 
-def _resolve_parts(wholes: list[Area], parts: list[Area], defects: _Defects) -> list[Area]:
-    """Return parts with inherited tags, and buildings without the areas of their parts."""
+def _resolve_parts(
+    wholes: list[Area], parts: list[Area], defects: _Defects
+) -> list[tuple[Feature, shapely.MultiPolygon, shapely.MultiPolygon]]:
+    """Return parts with inherited tags, and buildings without the areas of their parts.
+
+    With each comes the area of the whole building.
+    """
     tree, found = shapely.STRtree([area for _, area in wholes]), 0
     whole_m2 = [area.area for _, area in wholes]
     parts_of: dict[int, list[shapely.MultiPolygon]] = {}
@@ -191,12 +201,14 @@ def _resolve_parts(wholes: list[Area], parts: list[Area], defects: _Defects) -> 
         owners = [int(index) for index in tree.query(inside, predicate="within")]
         found += len(owners)
         PART_PAIRS.check(found, "the map")
+        site = area
         if owners:
             owner = min(owners, key=whole_m2.__getitem__)
             parts_of.setdefault(owner, []).append(area)
-            feature = _inherit(feature, wholes[owner][0])
-        resolved.append((feature, area))
+            feature, site = _inherit(feature, wholes[owner][0]), wholes[owner][1]
+        resolved.append((feature, area, site))
     for index, (feature, area) in enumerate(wholes):
+        site = area
         if index in parts_of:
             rest = _polygons(area.difference(shapely.union_all(parts_of[index])))
             if rest.area <= (1 - MIN_COVERED_SHARE) * area.area:
@@ -204,7 +216,7 @@ def _resolve_parts(wholes: list[Area], parts: list[Area], defects: _Defects) -> 
             defects.add("rest", feature.name)
             area = shapely.MultiPolygon([polygon for polygon in rest.geoms
                                          if polygon.area >= SLIVER_AREA_M2])
-        resolved.append((feature, area))
+        resolved.append((feature, area, site))
     return resolved
 
 

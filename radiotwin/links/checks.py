@@ -16,6 +16,7 @@ CLOSE_M, MIN_POSITIONS = 0.1, 3  # so many positions so close to each other are 
 MAX_NAMED = 5  # names in a message
 MAX_OUTSIDE = 0.5  # share of the links
 GROUND_M, ROOFS = 0.5, 0.95  # above it something is built; share of its corners that are roofs
+BURIED = "its height, or that of the map's ground, is off; z counts from the scene's datum"
 INDOORS = "it was indoors (see building_entry), or its position or the wall is off by metres"
 
 
@@ -116,14 +117,18 @@ def _bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the corners of the map, and the height that nearly all its roofs are below [m]."""
     vertices_m = scene.city.vertices
     built_m = vertices_m[vertices_m[:, 2] > GROUND_M, 2]
+    if scene.city.terrain is not None:
+        built_m = vertices_m[np.unique(scene.city.faces[~scene.city.terrain]), 2]
     roof_m = float(np.quantile(built_m, ROOFS)) if len(built_m) else 0.0
     return vertices_m[:, :2].min(axis=0), vertices_m[:, :2].max(axis=0), roof_m
 
 
 def _off_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
     known = np.isfinite(receiver_m).all(axis=1)
-    inside = np.zeros(len(receiver_m), dtype=bool)
+    inside, below = np.zeros((2, len(receiver_m)), dtype=bool)
     inside[known] = scene.city.inside(receiver_m[known])
+    below[known] = inside[known] & scene.city.below_ground(receiver_m[known])
+    inside &= ~below
     low, high, _ = _bounds_of(scene)
     outside = np.any((receiver_m[:, :2] < low) | (receiver_m[:, :2] > high), axis=1)
     if outside.mean() > MAX_OUTSIDE:
@@ -132,8 +137,9 @@ def _off_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
             f"which goes from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) m: "
             "give measurements and scene in one frame, in metres; "
             "feet and degrees are not converted")
-    return [f"{inside.sum():,} of {len(inside):,} links have their receiver inside a building: "
-            f"{INDOORS}"] if inside.any() else []
+    return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}"
+            for odd, where in ((inside, f"inside a building: {INDOORS}"),
+                               (below, f"below the ground: {BURIED}")) if odd.any()]
 
 
 def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,

@@ -85,6 +85,9 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     declared_z_m = measurements.device_m[:, 2]
     device_m = np.where(measurements.is_anchor[:, None], measurements.device_m, np.nan)
     device_m[:, 2] = np.where(np.isnan(declared_z_m), ASSUMED_HEIGHT_M, declared_z_m)
+    if scene is not None and scene.city.terrain is not None:
+        low = np.isnan(declared_z_m) & measurements.is_anchor
+        device_m[low, 2] += scene.city.ground_height_m(*device_m[low, :2].T)
     notes += check_names(measurements) + check_positions(receiver_m, device_m, scene)
     from_middle_m = np.abs(receiver_m[:, :2] - np.median(receiver_m[:, :2], axis=0)).max(axis=1)
     leave_out(from_middle_m > MAX_EXTENT_M,

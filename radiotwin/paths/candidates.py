@@ -34,7 +34,7 @@ class CandidateSearch:
         facets: of the city.
         edges: of the city.
         surfaces: both, for compiled code.
-        ground: row of the ground in `surfaces.planes`.
+        is_ground: (f + 1,) bool, rows of the ground in `surfaces.planes`.
         facet_edges: edges at each facet.
     """
 
@@ -42,8 +42,11 @@ class CandidateSearch:
         topology = build_topology(city)
         self.facets = extract_facets(city, topology)
         self.edges = extract_edges(city, self.facets, topology)
-        self.surfaces = pack(self.facets, self.edges)
-        self.ground = len(self.facets)
+        self.surfaces = pack(self.facets, self.edges, city.terrain is None)
+        self.is_ground = np.zeros(len(self.facets) + 1, dtype=bool)
+        self.is_ground[-1] = True
+        if city.terrain is not None:
+            self.is_ground[self.facets.of_face[city.terrain]] = True
         self._city, self._depth = city, depth
         self._after = np.empty((0, depth - 1), dtype=int)
         self._first_after, self._end_after = np.full((2, len(self.edges)), -1)

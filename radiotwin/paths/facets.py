@@ -31,7 +31,7 @@ class Facets:
         full: (f,) bool: the facet fills its bounding rectangle.
         first: (f + 1,) first row in `triangle_uv_m` of each facet.
         triangle_uv_m: (t, 6) corners u, v, u, v, u, v of the triangles in the plane [m].
-        of_face: (city faces,) facet of each face of the city; -1: a sliver, or on the ground.
+        of_face: (city faces,) facet of each face of the city; -1: a sliver, or on flat ground.
         material: (f,) row of the city's materials.
     """
 
@@ -52,7 +52,7 @@ class Facets:
 
 
 def extract_facets(city: CityMap, topology: Topology | None = None) -> Facets:
-    """Merge the triangles of a city to facets; faces on the ground plane z = 0 are left out.
+    """Merge the triangles of a city to facets; faces on flat ground, z = 0, are left out.
 
     Args:
         city: 3D map.

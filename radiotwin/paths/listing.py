@@ -123,10 +123,10 @@ def _check(points_m: np.ndarray, velocity: np.ndarray | None, bandwidth_hz: floa
 
 def _reasons(scene: Scene, device: int, points_m: np.ndarray) -> np.ndarray:
     """Return why a device has no link to each point (n,), empty where it may have."""
-    inside = scene.city.inside(points_m)
+    inside, below = scene.city.inside(points_m), scene.city.below_ground(points_m)
     wavelength_m = speed_of_light / scene.config.radio.frequency_hz
     near = np.linalg.norm(points_m - scene.device_m[device], axis=1) < wavelength_m
-    return np.select([inside & (points_m[:, 2] < 0), inside, near],
+    return np.select([inside & below, inside, near],
                      ["below the ground", "inside a building", "within a wavelength"], default="")
 
 

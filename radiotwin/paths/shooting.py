@@ -144,7 +144,9 @@ def _first_facets(
     distance_m, face, cosine = city.first_hits(start_m, end_m)
     facet = np.where(face >= 0, facets.of_face[face], -1)
     facet[(face >= 0) & (cosine >= 0)] = -1
-    # The ground is infinite here; the city's mesh of it may end, or there may be none
+    if city.terrain is not None:
+        return np.stack([distance_m, facet])
+    # Flat ground is infinite here; the city's mesh of it may end, or there may be none
     with np.errstate(divide="ignore", invalid="ignore"):
         fall_m = np.where(direction[:, 2] < 0, -start_m[:, 2] / direction[:, 2], np.inf)
     on_ground = (fall_m > 0) & (fall_m < np.inf) & (distance_m > fall_m - 0.1)

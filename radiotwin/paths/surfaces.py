@@ -1,4 +1,7 @@
-"""Facets and edges in arrays for compiled code; the last facet is the ground, all of z = 0."""
+"""Facets and edges in arrays for compiled code; the last facet is the flat ground, all of z = 0.
+
+On a terrain its triangles are facets like any other, and nothing lies above the last one.
+"""
 
 from typing import NamedTuple
 
@@ -36,13 +39,19 @@ class Surfaces(NamedTuple):
     edges: np.ndarray
 
 
-def pack(facets: Facets, edges: Edges) -> Surfaces:
-    """Put facets, the ground and edges into arrays for compiled code."""
+def pack(facets: Facets, edges: Edges, flat_ground: bool = True) -> Surfaces:
+    """Put facets, the ground and edges into arrays for compiled code.
+
+    Args:
+        facets: of a city.
+        edges: of the city.
+        flat_ground: whether its ground is all of z = 0; else no path meets that plane.
+    """
     planes = np.column_stack([
         facets.normal, facets.offset_m, facets.origin_m, facets.axis_u, facets.axis_v,
         facets.size_m, facets.full, facets.first[:-1], facets.first[1:], facets.material])
-    ground = [0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 1, 0, np.inf, np.inf, 1, 0, 0,
-              GROUND_MATERIAL]
+    ground = [0, 0, 1, 0.0 if flat_ground else np.inf, 0, 0, 0, 1, 0, 0, 0, 1, 0, np.inf, np.inf,
+              1, 0, 0, GROUND_MATERIAL]
     length_m = np.linalg.norm(edges.end_m - edges.start_m, axis=1)
     return Surfaces(
         np.concatenate([planes, [ground]]).astype(float),

@@ -27,7 +27,7 @@ class Topology:
     Attributes:
         vertices_m: (v, 3) welded corners [m].
         triangles: (t, 3) indices of corners, counter-clockwise seen from outside; without slivers
-            and without faces on the ground.
+            and without faces on flat ground.
         source: (t,) face of the city that each triangle is.
         normal: (t, 3) outward unit normals.
         segments: (s, 2) corners, lower index first, one row for each triangle that borders on the
@@ -52,7 +52,7 @@ def build_topology(city: CityMap) -> Topology:
         city: 3D map.
 
     Returns:
-        The topology of all faces but those of the ground, within 5 cm of z = 0.
+        The topology of all faces but those of a flat ground, within 5 cm of z = 0.
 
     Raises:
         BadInput: a corner is not finite.
@@ -62,8 +62,8 @@ def build_topology(city: CityMap) -> Topology:
     vertices_m, index = _weld(city.vertices)
     corners = index[city.faces]
     normal, height_m = _normals_and_heights(vertices_m[corners])
-    on_ground = (np.abs(city.vertices[city.faces][:, :, 2]) < 0.05).all(axis=1)
-    source = np.flatnonzero((height_m > WELD_M) & ~on_ground)
+    on_plane = city.on_ground if city.terrain is None else np.zeros(len(corners), dtype=bool)
+    source = np.flatnonzero((height_m > WELD_M) & ~on_plane)
     triangles, normal = corners[source], normal[source]
     sides = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     unique, inverse = np.unique(sides, axis=0, return_inverse=True)

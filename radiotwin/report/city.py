@@ -28,7 +28,8 @@ def city_mesh(scene: Scene) -> tuple[dict, str]:
     if keep.sum() <= MAX_FACES:
         used, index = np.unique(city.faces[keep], return_inverse=True)
         return _packed(city.vertices[used], index.reshape(-1, 3)), ""
-    height_m, (x_min, x_max, y_min, y_max) = height_grid(scene, BLOCK_CELLS)
+    height_m, (x_min, x_max, y_min, y_max) = height_grid(scene, BLOCK_CELLS,
+                                                              above_datum=True)
     cell_m = max(x_max - x_min, y_max - y_min) / BLOCK_CELLS
     return _packed(*blocks(height_m, x_min, y_min, cell_m)), (
         f"The city has {keep.sum():,} triangles and is drawn as blocks of {cell_m:.1f} m.")

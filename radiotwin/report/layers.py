@@ -29,6 +29,9 @@ def map_layers(run: Run) -> list[dict]:
     """
     step = _thinning(run)
     truth = run.maps.get(TRUTH)
+    if any(radio_map.lattice.ground_m is not None for radio_map in run.maps.values()):
+        run.notes.append("Altitudes of the maps are above the ground; each is drawn as a plane, at "
+                         "that height above z = 0.")
     layers = []
     for name, radio_map in run.maps.items():
         thin = radio_map.dataset.isel(device=slice(_map_devices(run, name)),

@@ -25,6 +25,12 @@ HeightGrid = tuple[np.ndarray, tuple[float, float, float, float]]
 """(ny, nx) heights [m], and x_min, x_max, y_min, y_max [m]."""
 
 
+def _lowest(radio_map: RadioMap) -> str:
+    """Return the lowest altitude of a map for a title."""
+    lattice = radio_map.lattice
+    return f"{lattice.z_m[0]:g} m" + (" above the ground" if lattice.above == "ground" else "")
+
+
 def write_picture(radio_map: RadioMap, scene: Scene, path: Path | str) -> None:
     """Write the gain of all devices at the lowest altitude as a PNG file.
 
@@ -67,7 +73,7 @@ def radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
     source = plain(str(radio_map.dataset.attrs.get("source", "")))
     left_out = len(radio_map.devices) - len(names)
     more = f"; {left_out} more devices" if left_out else ""
-    figure.suptitle(f"{source} at {radio_map.lattice.z_m[0]:g} m (triangle: device; white: not "
+    figure.suptitle(f"{source} at {_lowest(radio_map)} (triangle: device; white: not "
                     f"detected{more})")
     return figure
 
@@ -90,7 +96,7 @@ def model_maps_figure(truth: RadioMap, models: dict[str, RadioMap], scene: Scene
     axes[0, 0].set_title("truth")
     axes[1, 0].set_axis_off()
     axes[1, 0].text(
-        0.02, 0.5, f"device {plain(device)}\nat {truth.lattice.z_m[0]:g} m altitude\n\n"
+        0.02, 0.5, f"device {plain(device)}\nat {_lowest(truth)} altitude\n\n"
         "top: channel gain\nbottom: model − truth\ntriangle: device\nwhite: not detected\n\n"
         "models: mean of\nthe detected levels", transform=axes[1, 0].transAxes, fontsize=11)
     for column, (name, radio_map) in enumerate(models.items(), start=1):

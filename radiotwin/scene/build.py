@@ -42,6 +42,7 @@ from radiotwin.scene.preview import draw_preview
 from radiotwin.scene.problems import Problem
 from radiotwin.scene.report import BuildReport, MaterialUse
 from radiotwin.scene.sources import find_source, scene_name, source_text
+from radiotwin.scene.terrain import TerrainConfig
 from radiotwin.scene.vegetation import VegetationConfig
 from radiotwin.scene.writer import CityShape, write_city
 from radiotwin.tables import MAX_COORDINATE_M, Origin
@@ -190,6 +191,7 @@ class Declared:
         provenance: Entries for `scene.toml`.
         facts: More lines for the report.
         vegetation: Volumes of it.
+        terrain: Ground that is not flat; None: it is, at z = 0.
     """
 
     source: str
@@ -199,6 +201,7 @@ class Declared:
     provenance: dict[str, str]
     facts: tuple[tuple[str, str], ...] = ()
     vegetation: Sequence[VegetationConfig] = ()
+    terrain: TerrainConfig | None = None
 
 
 def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, options: BuildOptions,
@@ -258,11 +261,16 @@ def _plan(city: ImportedCity, declared: Declared, options: BuildOptions) -> _Pla
         bounds, extent = declared.extent.bounds, declared.extent
     buildings, ground = (CityMap(surfaces.vertices, surfaces.faces[faces]) if faces.any() else None
                          for faces in (solid, city.ground))
+    on_terrain = declared.terrain is not None
+    if on_terrain:
+        ground = CityMap(surfaces.vertices, surfaces.faces[city.ground],
+                         terrain=np.ones(np.count_nonzero(city.ground), dtype=bool))
     tops_m, heights_m = building_tops(surfaces, solid, ground)
     highest = int(heights_m.argmax())
-    lattice = LatticeConfig(step_m=options.step_m or choose_step(bounds),
-                            altitudes_m=list(options.altitudes_m or choose_altitudes(
-                                tops_m[heights_m > 0])))
+    lattice = LatticeConfig(
+        step_m=options.step_m or choose_step(bounds), above="ground" if on_terrain else None,
+        altitudes_m=list(options.altitudes_m or choose_altitudes(
+            (heights_m if on_terrain else tops_m)[heights_m > 0])))
     grid = BuiltGrid.over(extent, buildings)
     config = {
         "name": declared.name,
@@ -271,9 +279,11 @@ def _plan(city: ImportedCity, declared: Declared, options: BuildOptions) -> _Pla
         "lattice": lattice,
         "devices": place_devices(options.devices, grid, ground,
                                  np.random.default_rng(options.seed)),
-        "uavs": place_uavs(options.uavs, extent, lattice, buildings),
+        "uavs": place_uavs(options.uavs, extent, lattice, buildings,
+                           ground if on_terrain else None),
         "provenance": declared.provenance,
         "vegetation": list(declared.vegetation),
+        "terrain": declared.terrain,
     }
     if declared.origin is not None:
         config |= {"origin": declared.origin, "crs": local_crs(declared.origin)}
@@ -308,7 +318,8 @@ def _report(city: ImportedCity, shapes: list[CityShape], plan: _Plan, declared: 
         sum(len(shape.mesh.faces) for shape in shapes), config.extent.bounds,
         plan.tallest_m, plan.tallest, plan.built_fraction, tuple(config.lattice.altitudes_m),
         len(config.devices), len(config.uavs), tuple(uses), _by_severity(city.problems),
-        declared.facts, config.lattice.step_m, options.altitudes_m is not None)
+        declared.facts, config.lattice.step_m, options.altitudes_m is not None,
+        config.lattice.above or "datum")
 
 
 def _by_severity(problems: list[Problem]) -> tuple[Problem, ...]:

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from radiotwin.errors import RunFailed
+from radiotwin.errors import BadInput, RunFailed
 from radiotwin.scene.materials import Material
 from radiotwin.scene.reader import read_triangles
 from radiotwin.scene.vegetation import Vegetation
@@ -46,6 +47,7 @@ class CityMap:
         materials: Of the city; by default one, a slab of concrete of `Material`'s thickness.
         material: (f,) row of `materials` of each face; None: all are of the first.
         vegetation: Which no ray meets; None: there is none.
+        terrain: (f,) bool, faces of a ground that is not flat; None: the ground is flat, at z = 0.
     """
 
     never_changes = True
@@ -53,13 +55,16 @@ class CityMap:
     def __init__(self, vertices: np.ndarray, faces: np.ndarray,
                  materials: Sequence[Material] = (CONCRETE,),
                  material: np.ndarray | None = None,
-                 vegetation: Vegetation | None = None) -> None:
+                 vegetation: Vegetation | None = None,
+                 terrain: np.ndarray | None = None) -> None:
         self.vertices = np.asarray(vertices, dtype=float)
         self.faces = np.asarray(faces, dtype=int)
         self.materials = tuple(materials)
         self.material = np.zeros(len(self.faces), dtype=int) if material is None \
             else np.asarray(material, dtype=int)
         self.vegetation = Vegetation.of(()) if vegetation is None else vegetation
+        self.terrain = None if terrain is None or not np.any(terrain) else \
+            np.asarray(terrain, dtype=bool)
         triangles = self.vertices[self.faces]
         self._scene = _embree_scene(triangles)
         self._normals = np.cross(triangles[:, 1] - triangles[:, 0],
@@ -71,45 +76,59 @@ class CityMap:
         return CityMap, (self.vertices, self.faces, self.materials, self.material, self.vegetation)
 
     @classmethod
-    def from_xml(cls, xml_path: Path | str, vegetation: Vegetation | None = None) -> "CityMap":
+    def from_xml(cls, xml_path: Path | str, vegetation: Vegetation | None = None,
+                 terrain: str | None = None) -> "CityMap":
         """Read the meshes that a scene folder's `city.xml` names, and what they are made of.
 
         Args:
             xml_path: The file.
             vegetation: Of the scene.
+            terrain: Name of the shape that is the ground; None: the ground is flat.
 
         Raises:
-            BadInput: No such file, malformed XML, a mesh that cannot be read, or one outside the
-                folder.
+            BadInput: No such file, malformed XML, a mesh that cannot be read, one outside the
+                folder, or no shape of the ground's name.
         """
-        shapes = [(mesh, material or CONCRETE) for mesh, material in read_triangles(xml_path)]
+        read = read_triangles(xml_path)
+        shapes = [(mesh, material or CONCRETE) for mesh, material, _ in read]
+        of_ground = None
+        if terrain is not None:
+            named = [name == terrain for *_, name in read]
+            if not any(named):
+                raise BadInput(f"{xml_path} has no shape {terrain!r}, which scene.toml declares as "
+                               "the ground ([terrain] shape); correct the name")
+            of_ground = np.repeat(named, [len(mesh.faces) for mesh, _ in shapes])
         starts = np.cumsum([0, *(len(mesh.vertices) for mesh, _ in shapes)])
         materials = list(dict.fromkeys(material for _, material in shapes))
         return cls(np.concatenate([mesh.vertices for mesh, _ in shapes]),
                    np.concatenate([mesh.faces + start for (mesh, _), start in zip(shapes, starts)]),
                    materials, np.repeat([materials.index(material) for _, material in shapes],
-                                        [len(mesh.faces) for mesh, _ in shapes]), vegetation)
+                                        [len(mesh.faces) for mesh, _ in shapes]), vegetation,
+                   of_ground)
 
     @cached_property
     def ground_material(self) -> Material:
-        """Material of the ground z = 0: that of most faces there that look up; else concrete."""
+        """Material of the ground: that of most of its faces that look up; else concrete."""
         area_m2 = np.where(self.on_ground & (self._normals[:, 2] > 0), self._normals[:, 2] / 2, 0.0)
         by_material = np.bincount(self.material, weights=area_m2, minlength=len(self.materials))
         return self.materials[int(by_material.argmax())] if by_material.any() else CONCRETE
 
     @cached_property
     def on_ground(self) -> np.ndarray:
-        """(f,) bool: faces within `GROUND_M` of the ground z = 0."""
+        """(f,) bool: faces of the terrain, or of flat ground, within `GROUND_M` of z = 0."""
+        if self.terrain is not None:
+            return self.terrain
         return (np.abs(self.vertices[self.faces][:, :, 2]) < GROUND_M).all(axis=1)
 
     def without(self, faces: np.ndarray) -> "CityMap":
         """Return the map without some faces, (f,) bool."""
         return CityMap(self.vertices, self.faces[~faces], self.materials, self.material[~faces],
-                       self.vegetation)
+                       self.vegetation, None if self.terrain is None else self.terrain[~faces])
 
     def state(self) -> tuple[Any, ...]:
         """Return all that decides the answers of a map, and what paths over it are."""
-        return (self.vertices, self.faces, self.materials, self.material, self.vegetation.state())
+        known = (self.vertices, self.faces, self.materials, self.material, self.vegetation.state())
+        return known if self.terrain is None else (*known, self.terrain)
 
     def line_of_sight(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
         """Return whether no surface lies between points.
@@ -154,8 +173,56 @@ class CityMap:
         height = np.where(face >= 0, self._top_m - distance, 0.0)
         return height.reshape(x_m.shape)
 
+    @cached_property
+    def _ground(self) -> "CityMap":
+        """The terrain alone."""
+        assert self.terrain is not None
+        used, faces = np.unique(self.faces[self.terrain], return_inverse=True)
+        return CityMap(self.vertices[used], faces.reshape(-1, 3))
+
+    def ground_height_m(self, x_m: np.ndarray | float, y_m: np.ndarray | float) -> np.ndarray:
+        """Return the height of the ground above the datum.
+
+        Args:
+            x_m: East coordinates, any shape [m].
+            y_m: North coordinates, same shape [m].
+
+        Returns:
+            Heights of that shape [m]; off the terrain those of its border, of flat ground 0.
+        """
+        x_m, y_m = np.broadcast_arrays(np.asarray(x_m, float), np.asarray(y_m, float))
+        if self.terrain is None:
+            return np.zeros(x_m.shape)
+        return self._terrain_height_m(x_m.ravel(), y_m.ravel()).reshape(x_m.shape)
+
+    def _terrain_height_m(self, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+        """Return the heights (n,) of the terrain [m]."""
+        ground = self._ground
+        low_m, high_m = ground.vertices[:, :2].min(axis=0), ground.vertices[:, :2].max(axis=0)
+        points_m = np.column_stack([x_m, y_m])
+        height_m = np.full(len(points_m), np.nan)
+        # A ray that meets a corner or a side exactly may pass between triangles: a hair beside it
+        for aside_m in (0.0, 0.004, 0.03, 0.2):
+            left = np.flatnonzero(np.isnan(height_m))
+            if not len(left):
+                break
+            above = np.column_stack([
+                np.clip(points_m[left] + aside_m * np.array([0.8, 0.6]), low_m + SKIN_M,
+                        high_m - SKIN_M), np.full(len(left), ground._top_m)])
+            far_m = ground.first_hits(above, above - [0, 0, 1], infinite=True)[0]
+            height_m[left] = np.where(np.isfinite(far_m), ground._top_m - far_m, np.nan)
+        left = np.flatnonzero(np.isnan(height_m))  # in a hole of a terrain that was made elsewhere
+        if len(left):
+            corner = cKDTree(ground.vertices[:, :2]).query(points_m[left])[1]
+            height_m[left] = ground.vertices[corner, 2]
+        return height_m
+
+    def below_ground(self, points_m: np.ndarray) -> np.ndarray:
+        """Return whether points (n, 3) [m] lie below the ground, (n,) bool."""
+        return points_m[:, 2] < self.ground_height_m(*points_m[:, :2].T)
+
     def inside(self, points_m: np.ndarray) -> np.ndarray:
-        """Return whether each point lies within a building.
+        """Return whether each point lies within a building, or below the ground.
 
         A ray is sent straight up: the point is inside if the ray leaves more solids than it enters,
         which holds for overlapping solids and for the open-bottomed shells of most city models.

@@ -23,6 +23,7 @@ from radiotwin.files import atomic_path
 from radiotwin.geodesy import local_crs
 from radiotwin.inputs import read_toml
 from radiotwin.scene.lattice import check_lattice
+from radiotwin.scene.terrain import TerrainConfig
 from radiotwin.scene.vegetation import VegetationConfig
 from radiotwin.tables import MAX_COORDINATE_M, Metres, Number, Origin, Table
 
@@ -98,6 +99,8 @@ class LatticeConfig(Table):
 
     step_m: Number = Field(20.0, ge=1e-6, le=MAX_COORDINATE_M)
     altitudes_m: list[Altitude] = Field(min_length=1)
+    above: Literal["datum", "ground"] | None = Field(None, description=(
+        "of the altitudes, the UAVs', too: z = 0 [datum], or the ground below each position"))
 
     @field_validator("altitudes_m")
     @classmethod
@@ -114,12 +117,20 @@ class DeviceConfig(Table):
     device: Name
     x_m: Metres
     y_m: Metres
-    z_m: Altitude = ANTENNA_HEIGHT_M
+    z_m: Altitude = Field(ANTENNA_HEIGHT_M, description="above the datum z = 0")
+    above_ground_m: Altitude | None = Field(None, description="instead of z_m; becomes z_m when a "
+                                                              "scene is loaded")
     role: Literal["anchor", "unknown"] = "unknown"
     antenna: FileName | None = Field(None, description="file in the scene folder; None: isotropic")
     azimuth_deg: Number | None = Field(None, ge=-360, le=360,
                                        description="clockwise from north [0]")
     tilt_deg: Number | None = Field(None, ge=-90, le=90, description="upwards is positive [0]")
+
+    @model_validator(mode="after")
+    def _one_height(self) -> "DeviceConfig":
+        if self.above_ground_m is not None and "z_m" in self.model_fields_set:
+            raise ValueError("z_m (above the datum) and above_ground_m are both given; give one")
+        return self
 
     @model_validator(mode="after")
     def _isotropic_has_no_direction(self) -> "DeviceConfig":
@@ -164,6 +175,7 @@ class SceneConfig(Table):
     uavs: list[UavConfig] = []
     mission: MissionConfig = MissionConfig()
     vegetation: list[VegetationConfig] = []
+    terrain: TerrainConfig | None = Field(None, description="None: flat ground at z = 0")
     provenance: dict[str, str] = {}
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False,

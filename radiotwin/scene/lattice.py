@@ -28,12 +28,16 @@ class Lattice:
     Attributes:
         x_m: (nx,) east coordinates, ascending [m].
         y_m: (ny,) north coordinates, ascending [m].
-        z_m: (nz,) altitudes above the ground datum, ascending [m].
+        z_m: (nz,) altitudes, ascending [m]: above the ground datum, or with `ground_m` above the
+            ground below each position.
+        ground_m: (ny, nx) height of the ground above the datum [m]; None: altitudes are above the
+            datum.
     """
 
     x_m: np.ndarray
     y_m: np.ndarray
     z_m: np.ndarray
+    ground_m: np.ndarray | None = None
 
     @classmethod
     def over(cls, x_min_m: float, x_max_m: float, y_min_m: float, y_max_m: float, step_m: float,
@@ -57,6 +61,16 @@ class Lattice:
         return cls(x_min_m + step_m * np.arange(nx), y_min_m + step_m * np.arange(ny),
                    np.array(sorted(altitudes_m), dtype=float))
 
+    def part(self, z: slice, y: slice, x: slice) -> "Lattice":
+        """Return the lattice of some of its altitudes, rows and columns."""
+        ground_m = None if self.ground_m is None else self.ground_m[y, x]
+        return Lattice(self.x_m[x], self.y_m[y], self.z_m[z], ground_m)
+
+    @property
+    def above(self) -> str:
+        """What altitudes are above, for people: `ground` or `datum`."""
+        return "datum" if self.ground_m is None else "ground"
+
     @property
     def shape(self) -> tuple[int, int, int]:
         """Number of positions along z, y and x."""
@@ -72,6 +86,8 @@ class Lattice:
     def positions_m(self) -> np.ndarray:
         """(nz * ny * nx, 3) positions, in the order of a (z, y, x) array [m]."""
         z, y, x = np.meshgrid(self.z_m, self.y_m, self.x_m, indexing="ij")
+        if self.ground_m is not None:
+            z = z + self.ground_m
         return np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
 
     def index_of(self, positions_m: np.ndarray) -> np.ndarray:
@@ -86,9 +102,11 @@ class Lattice:
         Raises:
             BadInput: A position is not on the lattice.
         """
-        index = []
-        for axis, values in zip((2, 1, 0), (self.z_m, self.y_m, self.x_m)):
+        index: list[np.ndarray] = []
+        for axis, values in zip((0, 1, 2), (self.x_m, self.y_m, self.z_m)):
             given = positions_m[:, axis]
+            if axis == 2 and self.ground_m is not None:
+                given = given - self.ground_m[index[1], index[0]]
             after = np.searchsorted(values, given).clip(1, max(len(values) - 1, 1))
             before = after - 1
             after = np.minimum(after, len(values) - 1)
@@ -101,4 +119,4 @@ class Lattice:
                     f"position {tuple(position)} m is not on the lattice (axis {'xyz'[axis]}: "
                     f"{values[0]:g} to {values[-1]:g} m, {len(values)} values)")
             index.append(nearest)
-        return np.ravel_multi_index(tuple(index), self.shape)
+        return np.ravel_multi_index(tuple(index[::-1]), self.shape)

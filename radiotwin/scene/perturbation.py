@@ -33,7 +33,8 @@ def building_of_vertex(city: CityMap) -> np.ndarray:
     corners, index = np.unique(np.round(city.vertices / SAME_CORNER_M).astype(np.int64), axis=0,
                                return_inverse=True)
     faces = index.reshape(-1)[city.faces]
-    above = (city.vertices[city.faces][:, :, 2] > _GROUND_M).any(axis=1)
+    above = ~city.terrain if city.terrain is not None else (
+        city.vertices[city.faces][:, :, 2] > _GROUND_M).any(axis=1)
     sides = faces[above][:, [[0, 1], [1, 2]]].reshape(-1, 2)
     graph = coo_matrix((np.ones(len(sides)), sides.T), shape=(len(corners),) * 2)
     label = connected_components(graph, directed=False)[1]
@@ -71,7 +72,10 @@ def perturbed_map(city: CityMap, wall_sd_m: float, height_sd_m: float, seed: int
         low_m, size_m = corners_m[:, :2].min(axis=0), np.ptp(corners_m[:, :2], axis=0)
         share = (corners_m[:, :2] - low_m) / np.maximum(size_m, SAME_CORNER_M)
         corners_m[:, :2] += (1 - share) * walls_m[number, 0] + share * walls_m[number, 1]
+        base_m = 0.0 if city.terrain is None else corners_m[:, 2].min()
+        corners_m[:, 2] -= base_m
         top_m = corners_m[:, 2].max()
         corners_m[:, 2] *= max(1 + heights_m[number] / top_m, MIN_HEIGHT_SHARE)
+        corners_m[:, 2] += base_m
         vertices_m[rows] = corners_m
-    return CityMap(vertices_m, city.faces, city.materials, city.material)
+    return CityMap(vertices_m, city.faces, city.materials, city.material, terrain=city.terrain)

@@ -130,8 +130,14 @@ def building_tops(surfaces: Surfaces, solid: np.ndarray, ground: CityMap | None
     area = np.maximum(np.bincount(surfaces.shape, weight, surfaces.shapes), 1e-12)
     x_m, y_m = (np.bincount(surfaces.shape, weight * surfaces.centres[:, axis], surfaces.shapes)
                 / area for axis in (0, 1))
-    below_m = np.zeros(surfaces.shapes) if ground is None else ground.height_at(x_m, y_m)
+    below_m = np.zeros(surfaces.shapes) if ground is None else _height_m(ground, x_m, y_m)
     return tops_m, np.where(tops_m > 0, np.maximum(tops_m - below_m, 0.0), 0.0)
+
+
+def _height_m(ground: CityMap, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    """Return the heights (n,) of a terrain, or of the ground of a city model [m]."""
+    at = ground.height_at if ground.terrain is None else ground.ground_height_m
+    return at(x_m, y_m)
 
 
 def choose_extent(bounds: tuple[float, float, float, float]) -> Extent:
@@ -231,7 +237,7 @@ def place_devices(count: int, grid: BuiltGrid, ground: CityMap | None, rng: np.r
                     break
         apart_m *= 0.8
     positions = np.round(np.array(chosen), 1).reshape(-1, 2)
-    bottom_m = np.zeros(count) if ground is None else ground.height_at(*positions.T)
+    bottom_m = np.zeros(count) if ground is None else _height_m(ground, *positions.T)
     anchors = _spread_out(positions, min(count, max(3, round(0.3 * count))))
     return [DeviceConfig(device=f"device{number + 1:02d}", x_m=float(x), y_m=float(y),
                          z_m=round(float(bottom) + ANTENNA_HEIGHT_M, 2),
@@ -277,8 +283,8 @@ def _spread_out(positions: np.ndarray, count: int) -> set[int]:
     return set(chosen)
 
 
-def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: CityMap | None
-               ) -> list[UavConfig]:
+def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: CityMap | None,
+               ground: CityMap | None = None) -> list[UavConfig]:
     """Place UAVs at the free lattice position nearest to the middle, at one altitude each.
 
     They end where they start, with a battery for 80 % of the moves along two sides of the extent,
@@ -289,6 +295,7 @@ def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: Ci
         extent: Area of the lattice.
         lattice: Its step and altitudes, which the UAVs take in turn.
         buildings: 3D map of the buildings alone; None: there are none.
+        ground: 3D map of the terrain alone, that the lattice follows; None: it is above the datum.
 
     Raises:
         BadInput: No lattice position is free at an altitude, or too many are asked for.
@@ -305,6 +312,8 @@ def place_uavs(count: int, extent: Extent, lattice: LatticeConfig, buildings: Ci
     places: dict[float, tuple[float, float]] = {}
     for altitude_m in lattice.altitudes_m[:count]:
         points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, altitude_m)])[nearest]
+        if ground is not None:
+            points[:, 2] += ground.ground_height_m(*points[:, :2].T)
         free = np.ones(len(points), dtype=bool)
         if buildings is not None:
             for offset_m in offsets_m:

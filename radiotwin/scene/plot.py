@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,18 +34,29 @@ MARKS = (("anchor", "^", 110, "#d1495b", "anchor"),
 LAYERS = ("buildings", "devices")
 
 
-def height_grid(scene: Scene, cells: int = 1000) -> tuple[np.ndarray, Bounds]:
-    """Sample the heights over the scene's extent.
+def height_grid(scene: Scene, cells: int = 1000,
+                above_datum: bool = False) -> tuple[np.ndarray, Bounds]:
+    """Sample the heights of the map over the scene's extent.
 
     Args:
         scene: Scene with its 3D map.
         cells: Number of cells along the longer side.
+        above_datum: Whether heights are above z = 0, or above the ground.
 
     Returns:
         (ny, nx) heights, south first [m], and (x_min, x_max, y_min, y_max) [m].
     """
     x_m, y_m = _centres(scene, cells)
-    return scene.city.height_at(*np.meshgrid(x_m, y_m)), scene.config.extent.bounds
+    grid_m = np.meshgrid(x_m, y_m)
+    height_m = scene.city.height_at(*grid_m) if above_datum else _built_m(scene, grid_m)
+    return height_m, scene.config.extent.bounds
+
+
+def _built_m(scene: Scene, grid_m: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the heights of the highest surface above the ground at x and y [m]."""
+    height_m = scene.city.height_at(*grid_m)
+    return height_m if scene.city.terrain is None else \
+        height_m - scene.city.ground_height_m(*grid_m)
 
 
 def plot_scene(scene: Scene, ax: Axes | None, geographic: bool | None) -> Axes:
@@ -53,7 +65,7 @@ def plot_scene(scene: Scene, ax: Axes | None, geographic: bool | None) -> Axes:
 
     frame, ax = PlotFrame.choose(scene.config.origin, geographic), new_axes(ax)
     x_m, y_m = _centres(scene, PLOT_CELLS)
-    height_m = scene.city.height_at(*np.meshgrid(x_m, y_m))
+    height_m = _built_m(scene, np.meshgrid(x_m, y_m))
     built = height_m[height_m > MIN_HEIGHT_M]
     top_m = max(float(np.percentile(built, 99.5)), 1.0) if len(built) else 1.0
     ax.set_facecolor(GROUND_COLOUR)
@@ -78,7 +90,7 @@ def draw_outlines(ax: Axes, scene: Scene, frame: PlotFrame) -> None:
     """
     x_m, y_m = _centres(scene, PLOT_CELLS)
     grid_m = np.meshgrid(x_m, y_m)
-    built = scene.city.height_at(*grid_m) > BUILDING_M
+    built = _built_m(scene, grid_m) > BUILDING_M
     if built.any() and not built.all():
         ax.contour(*frame.at(*grid_m), built.astype(float), levels=[0.5], colors="black",
                    linewidths=0.5, alpha=0.6)

@@ -35,8 +35,12 @@ def draw_preview(scene: Scene, path: Path | str) -> None:
     axes = figure.add_subplot()
     image = draw_heights(axes, height_m, bounds)
     draw_vegetation(axes, scene)
+    on_terrain = scene.city.terrain is not None
+    if on_terrain:
+        draw_contours(axes, scene)
     clipped = height_m.max() > image.norm.vmax
-    figure.colorbar(image, ax=axes, label="height [m]", shrink=0.85, pad=0.02,
+    figure.colorbar(image, ax=axes, shrink=0.85, pad=0.02,
+                    label="height above the ground [m]" if on_terrain else "height [m]",
                     extend="max" if clipped else "neither")
     draw_devices(axes, scene)
     if scene.config.devices or scene.config.uavs or scene.config.vegetation:
@@ -44,6 +48,20 @@ def draw_preview(scene: Scene, path: Path | str) -> None:
     axes.set_title(f"{scene.config.name}   ({scene.config.radio.frequency_hz / 1e9:g} GHz)")
     with atomic_path(path) as temporary:
         figure.savefig(temporary, dpi=110, bbox_inches="tight", pad_inches=0.15)
+
+
+def draw_contours(axes: Axes, scene: Scene) -> None:
+    """Draw lines of equal height of a terrain above the datum, with their heights [m].
+
+    Args:
+        axes: Axes in metres.
+        scene: Scene with a terrain.
+    """
+    x_min, x_max, y_min, y_max = scene.config.extent.bounds
+    x_m, y_m = np.meshgrid(np.linspace(x_min, x_max, 200), np.linspace(y_min, y_max, 200))
+    lines = axes.contour(x_m, y_m, scene.city.ground_height_m(x_m, y_m), levels=10,
+                         colors="#8a6d4b", linewidths=0.7, alpha=0.7, zorder=1.2)
+    axes.clabel(lines, fmt="%g m", fontsize=8)
 
 
 def draw_heights(axes: Axes, height_m: np.ndarray, bounds: Bounds) -> AxesImage:

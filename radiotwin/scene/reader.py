@@ -20,14 +20,15 @@ from radiotwin.scene.writer import CityShape
 from radiotwin.tables import MAX_COORDINATE_M
 
 
-def read_triangles(xml_path: Path | str) -> list[tuple[RawMesh, Material | None]]:
+def read_triangles(xml_path: Path | str) -> list[tuple[RawMesh, Material | None, str]]:
     """Read the triangles of every shape, whatever it is made of.
 
     Args:
         xml_path: `city.xml` of a scene folder.
 
     Returns:
-        The mesh and the material of each shape in the file's order; None: no known material.
+        The mesh, the material and the name of each shape in the file's order; None: no known
+        material.
 
     Raises:
         BadInput: No such file, malformed XML, an element or a mesh that cannot be read, or a file
@@ -35,7 +36,8 @@ def read_triangles(xml_path: Path | str) -> list[tuple[RawMesh, Material | None]
     """
     declared = _declared(Path(xml_path))
     materials = map_materials(declared.shapes, declared.materials, {})[0]
-    return list(zip(_meshes(Path(xml_path), declared), materials, strict=True))
+    names = [shape.name.removeprefix("mesh-") for shape in declared.shapes]
+    return list(zip(_meshes(Path(xml_path), declared), materials, names, strict=True))
 
 
 def read_city(xml_path: Path | str) -> list[CityShape]:

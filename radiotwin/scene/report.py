@@ -59,6 +59,7 @@ class BuildReport:
         facts: More lines, as (subject, finding).
         step_m: Step of the lattice [m].
         altitudes_given: Whether the altitudes were asked for.
+        altitudes_above: What the lattice's altitudes are above: `datum` or `ground`.
     """
 
     source: str
@@ -78,6 +79,7 @@ class BuildReport:
     facts: tuple[tuple[str, str], ...] = ()
     step_m: float = 0.0
     altitudes_given: bool = False
+    altitudes_above: str = "datum"
 
     @property
     def tracing_would_fail(self) -> bool:
@@ -115,8 +117,9 @@ def print_report(report: BuildReport, console: Console) -> None:
         facts.add_row("tallest building", tallest)
         facts.add_row("built fraction", f"{report.built_fraction:.1%}")
         altitudes = ", ".join(f"{altitude:g}" for altitude in report.altitudes_m)
+        above = "" if report.altitudes_above == "datum" else f" above the {report.altitudes_above}"
         how = "" if report.altitudes_given else "   (from 10 m above 95 % of the roofs)"
-        facts.add_row("lattice altitudes", f"{altitudes} m{how}")
+        facts.add_row("lattice altitudes", f"{altitudes} m{above}{how}")
         if report.step_m:
             facts.add_row("lattice step", f"{report.step_m:g} m")
         facts.add_row("devices, UAVs", f"{report.devices}, {report.uavs}")

@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -59,7 +59,7 @@ class Scene:
                            "`radiotwin build-scene` makes it")
         for name in ("scene.toml", "city.xml"):
             require_within(folder, folder / name, str(folder))
-        scene = cls(folder, read_config(folder / "scene.toml"))
+        scene = cls(folder, read_config(folder / "scene.toml"))._on_ground()
         scene._check_devices()
         _ = scene.device_antennas, scene.uav_antenna  # report a broken file before any work
         return scene
@@ -160,6 +160,26 @@ class Scene:
             ("altitudes", some(f"{z:g}" for z in config.lattice.altitudes_m) + " m"),
             ("lattice step", f"{config.lattice.step_m:g} m")))
 
+    def _on_ground(self) -> "Scene":
+        """Return the scene with all its devices' heights above the datum.
+
+        A device of which no height is declared stands `ANTENNA_HEIGHT_M` above the ground, too.
+        """
+        if self.config.terrain is None:
+            if all(device.above_ground_m is None for device in self.config.devices):
+                return self
+        above_m = [device.above_ground_m if device.above_ground_m is not None else
+                   None if "z_m" in device.model_fields_set else device.z_m
+                   for device in self.config.devices]
+        ground_m = self.city.ground_height_m(*np.array(
+            [(device.x_m, device.y_m) for device in self.config.devices]).reshape(-1, 2).T)
+        devices = [device if own_m is None else device.model_copy(update={
+                       "z_m": round(float(low_m) + own_m, 3), "above_ground_m": None})
+                   for device, own_m, low_m in zip(self.config.devices, above_m, ground_m)]
+        scene = Scene(self.folder, self.config.model_copy(update={"devices": devices}))
+        scene.__dict__["city"] = self.city
+        return scene
+
     @property
     def xml_path(self) -> Path:
         """Path of `city.xml`."""
@@ -168,13 +188,25 @@ class Scene:
     @cached_property
     def city(self) -> CityMap:
         """3D map of the city, with its vegetation."""
-        return CityMap.from_xml(self.xml_path, Vegetation.of(self.config.vegetation))
+        terrain = self.config.terrain
+        return CityMap.from_xml(self.xml_path, Vegetation.of(self.config.vegetation),
+                                None if terrain is None else terrain.shape)
 
     @cached_property
     def lattice(self) -> Lattice:
         """Positions that UAVs fly on."""
-        lattice = self.config.lattice
-        return Lattice.over(*self.config.extent.bounds, lattice.step_m, lattice.altitudes_m)
+        declared = self.config.lattice
+        lattice = Lattice.over(*self.config.extent.bounds, declared.step_m, declared.altitudes_m)
+        if declared.above != "ground" or self.city.terrain is None:
+            return lattice
+        return replace(lattice, ground_m=self.city.ground_height_m(
+            *np.meshgrid(lattice.x_m, lattice.y_m)))
+
+    def altitude_m(self, x_m: float, y_m: float, declared_m: float) -> float:
+        """Return the height above the datum of an altitude as the lattice declares them [m]."""
+        if self.config.lattice.above != "ground":
+            return declared_m
+        return float(self.city.ground_height_m(x_m, y_m)) + declared_m
 
     @cached_property
     def device_m(self) -> np.ndarray:
@@ -223,24 +255,34 @@ class Scene:
         return read_pattern(self._antenna_path(name))
 
     def _check_devices(self) -> None:
-        """Raise BadInput if a device is inside a building, or a UAV starts or ends in one."""
+        """Raise BadInput if a device or an end of a flight is in a building or the ground."""
         path = self.folder / "scene.toml"
         for device, bad in zip(self.config.devices, self.city.inside(self.device_m)):
+            if bad and self.city.below_ground(np.array([[device.x_m, device.y_m, device.z_m]]))[0]:
+                ground_m = float(self.city.ground_height_m(device.x_m, device.y_m))
+                raise BadInput(
+                    f"{path}: device {device.device!r} at ({device.x_m:g}, {device.y_m:g}, "
+                    f"{device.z_m:g}) m is below the ground, which is {ground_m:.1f} m above the "
+                    "datum there; z_m counts from the datum: raise it, or give above_ground_m "
+                    "instead")
             if bad:
                 top_m = float(self.city.height_at(device.x_m, device.y_m))
                 raise BadInput(
                     f"{path}: device {device.device!r} at ({device.x_m:g}, {device.y_m:g}, "
                     f"{device.z_m:g}) m is inside a building {top_m:.1f} m high; move it, or put "
                     f"it on the roof (z_m > {top_m:.1f})")
-        ends = [(uav, end, (x_m, y_m, uav.altitude_m)) for uav in self.config.uavs
+        ends = [(uav, end, (x_m, y_m, self.altitude_m(x_m, y_m, uav.altitude_m)))
+                for uav in self.config.uavs
                 for end, x_m, y_m in (("start", uav.start_x_m, uav.start_y_m),
                                       ("terminal", uav.terminal_x_m, uav.terminal_y_m))]
         points_m = np.array([point_m for *_, point_m in ends], dtype=float).reshape(-1, 3)
         for (uav, end, (x_m, y_m, z_m)), bad in zip(ends, self.city.inside(points_m)):
             if bad:
+                below = self.city.below_ground(np.array([[x_m, y_m, z_m]]))[0]
                 raise BadInput(
-                    f"{path}: uav {uav.uav!r}: its {end} ({x_m:g}, {y_m:g}, {z_m:g}) m is inside "
-                    "a building; move it or raise altitude_m")
+                    f"{path}: uav {uav.uav!r}: its {end} ({x_m:g}, {y_m:g}, {z_m:g}) m is "
+                    f"{'below the ground' if below else 'inside a building'}; move it or raise "
+                    "altitude_m")
 
     def check_map(self, radio_map: "RadioMap") -> None:
         """Raise BadInput unless a map was made for this scene as it is now, with all its devices.

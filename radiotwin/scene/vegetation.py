@@ -1,6 +1,6 @@
 """Vegetation that a scene declares: prisms from the ground to the tree tops."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,9 @@ from shapely.geometry.base import BaseGeometry
 from radiotwin.budgets import VEGETATION_CORNERS, VEGETATION_MEETINGS
 from radiotwin.tables import Metres, Number, Table
 
+GroundHeight = Callable[[np.ndarray, np.ndarray], np.ndarray]
 KINDS = ("wood", "park", "tree_row")
+SAMPLE_M, SAMPLES_AT_ONCE = 2.0, 1_000_000  # of ways on a terrain
 SIDES_AT_ONCE, WORK_AT_ONCE = 64, 5_000_000  # of outlines; ways by corners: bound the memory
 
 
@@ -97,16 +99,21 @@ class Vegetation:
         own = self.kind == kind
         return Vegetation(self.areas[own], self.height_m[own], self.kind[own])
 
-    def metres_through(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
+    def metres_through(self, a_m: np.ndarray, b_m: np.ndarray,
+                       ground: GroundHeight | None = None) -> np.ndarray:
         """Return the length of each straight way that is in vegetation.
 
         Args:
             a_m: (n, 3) where they begin [m].
             b_m: (n, 3) where they end [m].
+            ground: returns the heights (p,) of a terrain at x and y (p,) [m]; ways are then sampled
+                every `SAMPLE_M`. None: flat, at z = 0.
 
         Returns:
             (n,) [m].
         """
+        if ground is not None:
+            return self._metres_on_terrain(a_m, b_m, ground)
         through_m = np.zeros(len(a_m))
         for height_m in np.unique(self.height_m):
             areas = self.areas[self.height_m == height_m]
@@ -123,6 +130,33 @@ class Vegetation:
                 long_m = np.linalg.norm(low_b_m[part] - low_a_m[part], axis=1)[way]
                 share = np.where(whole_m > 1e-6, flat_m / np.maximum(whole_m, 1e-6), 1.0)
                 np.add.at(through_m, rows[part][way], share * long_m)
+        return through_m
+
+
+    def _metres_on_terrain(self, a_m: np.ndarray, b_m: np.ndarray,
+                           ground: GroundHeight) -> np.ndarray:
+        through_m = np.zeros(len(a_m))
+        if not len(self.areas):
+            return through_m
+        tree = shapely.STRtree(self.areas)
+        length_m = np.linalg.norm(b_m - a_m, axis=1)
+        flat = shapely.linestrings(np.stack([a_m[:, :2], b_m[:, :2]], axis=1))
+        ways = np.unique(tree.query(flat, predicate="intersects")[0])
+        samples = np.maximum(np.ceil(length_m[ways] / SAMPLE_M), 1).astype(int)
+        parts = np.split(np.arange(len(ways)), np.flatnonzero(
+            np.diff(np.cumsum(samples) // SAMPLES_AT_ONCE)) + 1)
+        for part in parts:
+            row = np.repeat(part, samples[part])
+            first = np.cumsum(samples[part]) - samples[part]
+            share = (np.arange(len(row)) - np.repeat(first, samples[part]) + 0.5) / samples[row]
+            way = ways[row]
+            at_m = a_m[way] + share[:, None] * (b_m[way] - a_m[way])
+            above_m = at_m[:, 2] - ground(at_m[:, 0], at_m[:, 1])
+            low = np.flatnonzero((above_m >= 0) & (above_m <= self.height_m.max()))
+            point, area = tree.query(shapely.points(at_m[low, :2]), predicate="intersects")
+            inside = above_m[low[point]] <= self.height_m[area]
+            hit = np.unique(low[point[inside]])  # on the border of two areas: once
+            np.add.at(through_m, way[hit], (length_m[ways] / samples)[row[hit]])
         return through_m
 
 

@@ -17,6 +17,7 @@ from radiotwin.files import atomic_path, require_writable
 from radiotwin.geodesy import to_local
 from radiotwin.pieces import KeptParts
 from radiotwin.scene import Scene
+from radiotwin.scene.citymap import CityMap
 from radiotwin.tables import MAX_COORDINATE_M, Origin
 from radiotwin.trace.link_job import Links, link_job
 from radiotwin.trace.run import device_indices
@@ -103,7 +104,7 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | 
     points_m = np.asarray(points_m, dtype=float).reshape(-1, 3)
     index = device_indices(scene, devices)
     ROWS.check(len(index) * len(points_m), "points times devices")
-    inside = scene.city.inside(points_m)
+    inside, below = scene.city.inside(points_m), scene.city.below_ground(points_m)
     wavelength_m = speed_of_light / scene.config.radio.frequency_hz
     antennas = [scene.device_antennas[device] for device in index]
     gain_db = trace_gains(scene, scene.device_m[index], points_m, settings, antennas,
@@ -113,7 +114,7 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | 
         device_m = scene.device_m[device]
         near = np.linalg.norm(points_m - device_m, axis=1) < wavelength_m
         reason = np.select(
-            [inside & (points_m[:, 2] < 0), inside, near, np.isnan(gain_db[row]),
+            [inside & below, inside, near, np.isnan(gain_db[row]),
              gain_db[row] == IMPOSSIBLE_DB, gain_db[row] < scene.config.gain_limit_db],
             ["below the ground", "inside a building", "within a wavelength", "no path",
              "impossible gain", "below sensitivity"], default="")
@@ -129,13 +130,15 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | 
     return table
 
 
-def read_points(path: Path | str, origin: Origin | None = None) -> np.ndarray:
+def read_points(path: Path | str, origin: Origin | None = None,
+                city: CityMap | None = None) -> np.ndarray:
     """Read points from a CSV file; columns other than those of the position are ignored.
 
     Args:
         path: File with the columns x_m, y_m and z_m, or latitude_deg, longitude_deg and z_m (above
-            the ground datum).
+            the ground datum); above_ground_m may stand for z_m.
         origin: Origin of the local frame, which latitude and longitude need.
+        city: 3D map with the ground; None: the ground is at z = 0.
 
     Returns:
         (n, 3) positions [m].
@@ -147,7 +150,8 @@ def read_points(path: Path | str, origin: Origin | None = None) -> np.ndarray:
     path = Path(path)
     raw = read_cells(path)
     geographic = "x_m" not in raw and "latitude_deg" in raw
-    columns = (["latitude_deg", "longitude_deg", "z_m"] if geographic else ["x_m", "y_m", "z_m"])
+    height = "above_ground_m" if "above_ground_m" in raw and "z_m" not in raw else "z_m"
+    columns = (["latitude_deg", "longitude_deg", height] if geographic else ["x_m", "y_m", height])
     missing = [name for name in columns if name not in raw]
     if missing:
         raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {columns}, it has "
@@ -160,6 +164,8 @@ def read_points(path: Path | str, origin: Origin | None = None) -> np.ndarray:
             raise BadInput(f"{path} gives latitude and longitude, and the scene has no [origin] in "
                            "scene.toml; add one, or give x_m and y_m")
         points[:, :2] = np.column_stack(to_local(origin, points[:, 1], points[:, 0]))
+    if height == "above_ground_m" and city is not None:
+        points[:, 2] += city.ground_height_m(*points[:, :2].T)
     far = ~(np.abs(points) <= MAX_COORDINATE_M).all(axis=1)
     if far.any():
         row = int(np.flatnonzero(far)[0])

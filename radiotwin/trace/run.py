@@ -63,6 +63,10 @@ def trace_map(scene: Scene, settings: SolverSettings | None = None,
     settings = settings or SolverSettings.of_quality()
     out_path = truth_path(scene, devices) if out_path is None else out_path
     index = device_indices(scene, devices)
+    if settings.solver == "map" and scene.lattice.ground_m is not None:
+        raise BadInput("the solver 'map' averages over horizontal cells, and the lattice follows "
+                       "the ground; take the solver 'paths', or above = \"datum\" in [lattice] of "
+                       f"{scene.folder / 'scene.toml'}")
     MAP_VALUES.check(len(index) * math.prod(scene.lattice.shape),
                      f"{scene.folder}: lattice positions times devices")
     require_writable(out_path)
@@ -183,7 +187,8 @@ def _key(scene: Scene, settings: SolverSettings) -> dict[str, Any]:
     lattice = scene.lattice
     return {"scene": scene.content_hash(),
             "lattice": {"x_m": lattice.x_m.tolist(), "y_m": lattice.y_m.tolist(),
-                        "z_m": lattice.z_m.tolist()},
+                        "z_m": lattice.z_m.tolist()}
+            | ({} if lattice.ground_m is None else {"ground_m": lattice.ground_m.tolist()}),
             "settings": settings.attributes(), "libraries": library_versions()}
 
 

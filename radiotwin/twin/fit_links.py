@@ -14,7 +14,7 @@ from radiotwin.channel.base import MIN_DETECTED
 from radiotwin.channel.published import PublishedLaw
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkData, LinkGeometry, link_geometry
-from radiotwin.links.checks import INDOORS
+from radiotwin.links.checks import BURIED, INDOORS
 from radiotwin.localize import (
     DeviceEstimate,
     LocalizeSettings,
@@ -179,12 +179,17 @@ def _check_positions(links: LinkData, scene: Scene) -> None:
                        "need one frame, in metres")
     for index in anchors[scene.city.inside(links.device_m[anchors])]:
         x_m, y_m, z_m = links.device_m[index]
+        below = scene.city.below_ground(links.device_m[[index]])[0]
+        where = "below the ground" if below else "inside a building"
         raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} at "
-                       f"({x_m:g}, {y_m:g}, {z_m:g}) m is inside a building of the scene; correct "
+                       f"({x_m:g}, {y_m:g}, {z_m:g}) m is {where} of the scene; correct "
                        "its position, or the scene's frame")
     receiver_m, corners_m = links.receiver_m[:, :2], scene.city.vertices[:, :2]
     outside = (receiver_m < corners_m.min(axis=0)) | (receiver_m > corners_m.max(axis=0))
-    for odd, where in ((scene.city.inside(links.receiver_m), f"inside a building: {INDOORS}"),
+    inside, below = (scene.city.inside(links.receiver_m),
+                     scene.city.below_ground(links.receiver_m))
+    for odd, where in ((inside & ~below, f"inside a building: {INDOORS}"),
+                       (inside & below, f"below the ground: {BURIED}"),
                        (outside.any(axis=1), "outside the 3D map")):
         if odd.any():
             warnings.warn(f"{odd.sum():,} of {len(odd):,} links have their receiver {where}",

@@ -56,6 +56,11 @@ def with_shadowing(radio_map: RadioMap, twin: Twin, measurements: Measurements, 
                                                    shadowing_length_m=float(found.length_m)))
 
 
+def _nearest(axis_m: np.ndarray, there_m: np.ndarray) -> np.ndarray:
+    """Return the (n,) rows of an axis that are nearest to coordinates (n,) [m]."""
+    return np.abs(axis_m[:, None] - there_m).argmin(axis=0)
+
+
 def fit_shadowing(radio_map: RadioMap, measurements: Measurements, limit_db: float,
                   seed: int) -> Shadowing:
     """Estimate the correlation of a map's errors by maximum likelihood (`ResidualField`).
@@ -68,8 +73,10 @@ def fit_shadowing(radio_map: RadioMap, measurements: Measurements, limit_db: flo
         seed: of the selection of links.
     """
     lattice, rng = radio_map.lattice, np.random.default_rng(seed)
-    axes = zip((lattice.z_m, lattice.y_m, lattice.x_m), measurements.receiver_m.T[::-1])
-    cell = [np.abs(axis_m[:, None] - there_m).argmin(axis=0) for axis_m, there_m in axes]
+    there_m = measurements.receiver_m.T
+    x, y = (_nearest(axis_m, at_m) for axis_m, at_m in zip((lattice.x_m, lattice.y_m), there_m))
+    ground_m = 0.0 if lattice.ground_m is None else lattice.ground_m[y, x]
+    cell = [_nearest(lattice.z_m, there_m[2] - ground_m), y, x]
     rows = []
     for number, device in enumerate(measurements.devices["device"]):
         if device in radio_map.devices:

@@ -129,6 +129,7 @@ def _write_maps(folder: Path) -> None:
     (folder / "town.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
     (folder / "town.osm").write_bytes((Path(__file__).parents[1] / "footprints" / "town.osm").read_bytes())
     import pyogrio  # an extra, in the test extra, too
+    import rasterio
     import shapely
 
     pyogrio.raw.write(folder / "town.gpkg", np.array([shapely.to_wkb(shapely.Polygon(SQUARE))]), [np.array(["12"])],
@@ -147,6 +148,9 @@ def _write_maps(folder: Path) -> None:
         data = box.export(file_type=suffix)
         for name, content in (data if suffix == "gltf" else {f"box.{suffix}": data}).items():
             (folder / name.replace("model", "box")).write_bytes(content)
+    with rasterio.open(folder / "dem.tif", "w", driver="GTiff", width=60, height=60, count=1, dtype="float32",
+                       crs="EPSG:4326", transform=rasterio.Affine(1e-4, 0, 7.9985, 0, -1e-4, 50.0045)) as file:
+        file.write(np.add.outer(np.arange(60.0), np.arange(60.0)).astype("float32") + 300, 1)
     (folder / "city.xml").write_text("""<scene version="2.1.0"><default name="side" value="40"/>
 <bsdf type="itu-radio-material" id="wall"><string name="type" value="concrete"/></bsdf>
 <shape type="cube" id="block"><transform name="to_world"><scale x="$side" y="20" z="10"/>

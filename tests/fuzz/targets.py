@@ -49,6 +49,7 @@ TARGETS = (
     Target("city model", "town.city.json", "radiotwin build-scene town.city.json -o out"),
     Target("city model", "town.gml", "radiotwin build-scene town.gml -o out"),
     *(Target("model", file, f"radiotwin build-scene {file} -o out") for file in ("box.glb", "box.gltf", "box.stl", "roof.obj")),
+    Target("terrain", "dem.tif", "radiotwin build-scene town.geojson --terrain dem.tif -o out"),
     Target("materials", "materials.toml", "radiotwin build-scene town.geojson --material-table materials.toml -o out"),
     Target("antenna", "antennas/pattern.msi", "radiotwin report antennas -o out.html"),
     Target("antenna", "antennas/pattern.csv", "radiotwin report antennas -o out.html"),
