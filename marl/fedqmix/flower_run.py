@@ -20,9 +20,9 @@ from marl.fedqmix.client import Party
 from marl.fedqmix.flower_client import PARTIES
 from marl.fedqmix.flower_server import DONE, FOLDER, WEIGHTS
 from marl.fedqmix.keys import make_certificates, make_node_key
-from marl.threads import die_with_parent
 from radiotwin.console import notice
 from radiotwin.errors import RunFailed
+from radiotwin.processes import die_with_parent
 
 HOST, LINK = "127.0.0.1", "federation"
 START_S, END_S, POLL_S, STATUS_S, RESTART_S = 120.0, 15.0, 0.5, 30.0, 15.0
