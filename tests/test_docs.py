@@ -23,7 +23,7 @@ def test_the_site_builds(tmp_path):
         env=os.environ | {"EXECUTE_EXAMPLES": "false", "NO_MKDOCS_2_WARNING": "1"})
     assert result.returncode == 0, result.stderr
     reference = (tmp_path / "site" / "reference.html").read_text(encoding="utf-8")
-    for name in ("radiotwin.twin.fit_twin", "radiotwin.twin.Twin.predict", "radiotwin.radiomap.RadioMap.read",
+    for name in ("radiotwin.twin.fit_twin", "radiotwin.twin.Twin.predict", "radiotwin.radiomap.RadioMap.load",
                  "radiotwin.closeloop.criteria.SelectionCriteria", "marl.parallel_env.HarvestEnv",
                  "radiotwin.footprints.build.build_scene_from_map"):
         assert f'id="{name}"' in reference
