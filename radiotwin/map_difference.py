@@ -9,7 +9,7 @@ import numpy as np
 import xarray as xr
 
 from radiotwin.display.style import DIFFERENCE_COLOURS, plain, residual_range_db
-from radiotwin.display.summary import Summary, count, some
+from radiotwin.display.summary import Summarised, Summary, count, some
 from radiotwin.errors import BadInput
 from radiotwin.frames import is_same_frame, place
 from radiotwin.map_view import map_table, origin_of, pick, plot_values
@@ -24,8 +24,8 @@ NAME = "difference_db"
 SAME_M = 1e-3  # positions nearer than this are one [m]
 
 
-@dataclass(frozen=True, eq=False)
-class MapDifference:
+@dataclass(frozen=True, eq=False, repr=False)
+class MapDifference(Summarised):
     """Gain of one map minus that of another.
 
     Of a map of distributions (`sigma_db`) the mean counts, also where a link would not be detected;
@@ -147,12 +147,6 @@ class MapDifference:
     def __len__(self) -> int:
         """Return the number of devices."""
         return self.dataset.sizes["device"]
-
-    def __repr__(self) -> str:
-        return self._summary.text()
-
-    def _repr_html_(self) -> str:
-        return self._summary.html()
 
     @property
     def _summary(self) -> Summary:

@@ -16,7 +16,7 @@ from radiotwin.budgets import DEVICES
 from radiotwin.cells import check_suffix, require_pyarrow, shown, write_csv
 from radiotwin.display import PlotFrame, Summary, new_axes
 from radiotwin.display.style import GAIN_COLOURS, level_range_db, plain
-from radiotwin.display.summary import count, some, span
+from radiotwin.display.summary import Summarised, count, some, span
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 from radiotwin.frames import (
@@ -54,8 +54,8 @@ _MAY_BE_EMPTY = {"receiver_z_m", *LEVELS, *OPTIONAL}
 _DEVICE_MAY_BE_EMPTY = {"x_m", "y_m", "z_m", *DEVICE_OPTIONAL}
 
 
-@dataclass(frozen=True, eq=False)
-class Measurements:
+@dataclass(frozen=True, eq=False, repr=False)
+class Measurements(Summarised):
     """Levels of links between devices and receivers.
 
     Attributes:
@@ -246,12 +246,6 @@ class Measurements:
 
     def __bool__(self) -> bool:
         return True
-
-    def __repr__(self) -> str:
-        return self._summary.text()
-
-    def _repr_html_(self) -> str:
-        return self._summary.html()
 
     @property
     def _summary(self) -> Summary:

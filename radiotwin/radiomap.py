@@ -11,7 +11,7 @@ import xarray as xr
 
 from radiotwin.budgets import DEVICES, MAP_AXIS
 from radiotwin.display.style import GAIN_COLOURS, level_range_db, plain
-from radiotwin.display.summary import Summary, count, some, span
+from radiotwin.display.summary import Summarised, Summary, count, some, span
 from radiotwin.errors import BadInput
 from radiotwin.hdf5 import check_hdf5
 from radiotwin.inputs import open_input
@@ -46,8 +46,8 @@ _NUMBERS = ("frequency_hz", "gain_limit_db", "origin_latitude_deg", "origin_long
             "origin_altitude_m", "shadowing_share", "shadowing_length_m")  # among the attributes
 
 
-@dataclass(frozen=True, eq=False)
-class RadioMap:
+@dataclass(frozen=True, eq=False, repr=False)
+class RadioMap(Summarised):
     """Channel gain over a lattice.
 
     Attributes:
@@ -197,12 +197,6 @@ class RadioMap:
     def __len__(self) -> int:
         """Return the number of devices."""
         return self.dataset.sizes["device"]
-
-    def __repr__(self) -> str:
-        return self._summary.text()
-
-    def _repr_html_(self) -> str:
-        return self._summary.html()
 
     @property
     def _summary(self) -> Summary:

@@ -13,7 +13,7 @@ import xarray as xr
 from radiotwin.cells import write_csv
 from radiotwin.display import PlotFrame, Summary, new_axes
 from radiotwin.display.style import RESIDUAL_COLOURS, plain, residual_range_db
-from radiotwin.display.summary import count
+from radiotwin.display.summary import Summarised, count
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 from radiotwin.frames import read_frame
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 WHEN = ("before", "after")
 
 
-@dataclass(frozen=True, eq=False)
-class Residuals:
+@dataclass(frozen=True, eq=False, repr=False)
+class Residuals(Summarised):
     """Measured minus predicted levels of links that took no part in the prediction.
 
     Attributes:
@@ -119,12 +119,6 @@ class Residuals:
 
     def __bool__(self) -> bool:
         return True
-
-    def __repr__(self) -> str:
-        return self._summary.text()
-
-    def _repr_html_(self) -> str:
-        return self._summary.html()
 
     @property
     def _summary(self) -> Summary:

@@ -27,7 +27,7 @@ from radiotwin.closeloop.residual_tests import ResidualDependence, residual_depe
 from radiotwin.closeloop.selection import SelectionResult, add_shadowing, forward_selection
 from radiotwin.closeloop.sensitivity import Detectable, detectable
 from radiotwin.closeloop.thinning import thin_links
-from radiotwin.display.summary import Summary, count, some
+from radiotwin.display.summary import Summarised, Summary, count, some
 from radiotwin.effects.params import Parameter
 from radiotwin.effects.registry import catalogue
 from radiotwin.effects.unexplained_trend import UnexplainedTrend
@@ -40,8 +40,8 @@ from radiotwin.scene import Scene
 from radiotwin.tables import Origin
 
 
-@dataclass(eq=False)
-class Loop:
+@dataclass(eq=False, repr=False)
+class Loop(Summarised):
     """Result of a close-loop.
 
     Attributes:
@@ -104,12 +104,6 @@ class Loop:
             return "unexplained"
         sure = step.probabilities[NONE] >= self.criteria.min_probability
         return "none" if sure else "undecided"
-
-    def __repr__(self) -> str:
-        return self._summary.text()
-
-    def _repr_html_(self) -> str:
-        return self._summary.html()
 
     @property
     def _summary(self) -> Summary:

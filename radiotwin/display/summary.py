@@ -1,5 +1,6 @@
 """Summaries of objects: one line for a terminal, a small table for a notebook."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass
 from html import escape
@@ -37,6 +38,21 @@ class Summary:
             for subject, finding in self.facts)
         return (f"<div><strong>{escape(self.kind)}</strong>: {escape(shown(self.line, MAX_CELL))}"
                 f"<table>{rows}</table></div>")
+
+
+class Summarised(ABC):
+    """An object that shows its summary: in a terminal one line, in a notebook a table."""
+
+    @property
+    @abstractmethod
+    def _summary(self) -> Summary:
+        """What is shown."""
+
+    def __repr__(self) -> str:
+        return self._summary.text()
+
+    def _repr_html_(self) -> str:
+        return self._summary.html()
 
 
 def count(number: int, noun: str) -> str:

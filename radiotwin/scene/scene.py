@@ -11,7 +11,7 @@ import numpy as np
 
 from radiotwin.antennas import Antenna, Pattern, read_pattern
 from radiotwin.budgets import SHAPES
-from radiotwin.display.summary import Summary, count, some
+from radiotwin.display.summary import Summarised, Summary, count, some
 from radiotwin.errors import BadInput
 from radiotwin.inputs import open_input, read_bytes, require_within
 from radiotwin.scene.citymap import CityMap
@@ -30,8 +30,8 @@ if TYPE_CHECKING:
 _BLOCK_BYTES = 2**20
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
+@dataclass(frozen=True, eq=False, repr=False)
+class Scene(Summarised):
     """A scene folder that was read and checked.
 
     Attributes:
@@ -136,12 +136,6 @@ class Scene:
     def __getstate__(self) -> dict[str, object]:
         """Leave the 3D map out: it is read again from the folder where it is needed."""
         return {"folder": Path(os.path.abspath(self.folder)), "config": self.config}
-
-    def __repr__(self) -> str:
-        return self._summary.text()
-
-    def _repr_html_(self) -> str:
-        return self._summary.html()
 
     @property
     def _summary(self) -> Summary:

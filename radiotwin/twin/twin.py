@@ -16,7 +16,7 @@ from radiotwin.channel.path_kriging import PathKriging
 from radiotwin.channel.regression_kriging import RegressionKriging
 from radiotwin.channel.residual_field import ResidualField
 from radiotwin.display import Summary, geo_data_frame
-from radiotwin.display.summary import count, some
+from radiotwin.display.summary import Summarised, count, some
 from radiotwin.effects.correlated_shadowing import NAME as SHADOWING
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.fold_model import FittedEffect
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 CHUNK, CHUNK_WITH_EFFECTS = 200_000, 20_000  # links predicted at once: bounds memory
 
 
-@dataclass(frozen=True, eq=False)
-class Twin:
+@dataclass(frozen=True, eq=False, repr=False)
+class Twin(Summarised):
     """A learnt model of all links of a scene.
 
     Attributes:
@@ -229,12 +229,6 @@ class Twin:
 
     def __bool__(self) -> bool:
         return True
-
-    def __repr__(self) -> str:
-        return self._summary.text()
-
-    def _repr_html_(self) -> str:
-        return self._summary.html()
 
     @property
     def _summary(self) -> Summary:
