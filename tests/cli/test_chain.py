@@ -110,4 +110,4 @@ def test_a_twin_by_paths_is_made_and_used_as_any_other(chain, run):
     scores = pd.read_csv(chain / "few" / "comparison" / "scores.csv")
     assert {"segmented_nn", "raytrace", "by-paths"} <= set(scores["model"])
     refused = run("locate few/measurements.csv --twin by-paths --scene scene -o nowhere.csv", cwd=chain)
-    assert refused.returncode == 2 and "radiotwin fit --model raytrace" in refused.stderr
+    assert refused.returncode == 2 and "fit --model raytrace" in refused.stderr

@@ -37,7 +37,8 @@ def test_the_batches_of_a_plan_are_kept_for_the_map(own_scene, tmp_path, monkeyp
     assert plan.links == 2 * len(own_scene.lattice.positions_m)
     assert plan.batches == 2 * 13 and plan.finished == CALIBRATED
     assert 0 < plan.batch_s <= plan.batch_p90_s < 10 and plan.start_s > 0
-    assert 2e8 < plan.peak_bytes < plan.memory_bytes == settings.memory_bytes()
+    assert plan.peak_bytes > 2e8  # of this process, in which other tests have run
+    assert plan.memory_bytes == settings.memory_bytes()
     files = {path: path.stat().st_mtime_ns for path in own_scene.folder.glob("cache/trace-*/device-*.npy")}
     assert len(files) == CALIBRATED
     trace_map(own_scene, settings, tmp_path / "map.nc", ["d0", "d1"])
