@@ -46,7 +46,7 @@ from radiotwin.twin import Twin, fit_twin
 
 @dataclass(frozen=True)
 class Party:
-    """What one party holds, and nobody else sees.
+    """Data of one party, which nobody else sees.
 
     Attributes:
         scene: its folder.

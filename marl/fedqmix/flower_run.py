@@ -262,7 +262,7 @@ def _config_of(party: Party) -> dict[str, str | int]:
 
 
 def _descendants(root: int) -> dict[int, str]:
-    """Return processes that come from one: number -> time of their start. Only Linux tells."""
+    """Return processes that come from one: number -> time of their start (Linux only)."""
     parents = {int(path.name): _stat(int(path.name)) for path in Path("/proc").glob("[0-9]*")}
     found, new = dict[int, str](), [root]
     while new:

@@ -120,7 +120,7 @@ class FederatedSession:
                    f"{', '.join(map(str, lost))[:200]}")
 
     def _show(self, parties: list[Party]) -> None:
-        """Print what each party's policy collects, which only this machine's parties can tell."""
+        """Print what each party's policy collects, where the parties run on this machine."""
         curves, rows = {}, []
         for party in parties:
             logs = sorted(party.folder.glob("run-*/metrics.csv"))

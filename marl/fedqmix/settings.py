@@ -41,7 +41,7 @@ def check_federation(federation: FederationSettings, learner: LearnerSettings,
 
 
 class EngineSettings(BaseModel):
-    """What means are made with, and what the parties have."""
+    """Settings of the means, and data of the parties."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 

@@ -69,7 +69,7 @@ class Residuals(Summarised):
 
     def rmse_db(self, when: str = "after") -> float:
         """Return the root mean square of a residual [dB], `before` or `after`."""
-        return _rmse_db(self._values_db(self.table, when))
+        return rmse_db(self._values_db(self.table, when))
 
     def plot(self, when: str = "after", device: str | None = None, ax: Axes | None = None, *,
              scene: Scene | None = None, geographic: bool | None = None) -> Axes:
@@ -98,7 +98,7 @@ class Residuals(Summarised):
         plot_links(table[known], values_db[known], ax, frame, scene, "measured − predicted [dB]",
                    False, cmap=RESIDUAL_COLOURS, vmin=-high_db, vmax=high_db)
         whose = "" if device is None else f" of device {plain(device)}"
-        ax.set_title(f"held-out residual{whose}, {when}: RMSE {_rmse_db(values_db):.2f} dB")
+        ax.set_title(f"held-out residual{whose}, {when}: RMSE {rmse_db(values_db):.2f} dB")
         return ax
 
     def to_xarray(self) -> xr.Dataset:
@@ -137,6 +137,7 @@ class Residuals(Summarised):
         return table[f"{when}_db"].to_numpy(dtype=float)
 
 
-def _rmse_db(values_db: np.ndarray) -> float:
+def rmse_db(values_db: np.ndarray) -> float:
+    """Return the root mean square of the values that are known; NaN where none is [dB]."""
     known = values_db[np.isfinite(values_db)]
     return float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")

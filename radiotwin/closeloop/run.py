@@ -198,7 +198,8 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     drop_idle_faults(selection)
     select_change_points(selection, links, bases[best], folds, seed, on_progress)
     on_progress("unknown devices again, beside the effects")
-    selection.model = relocate_devices(selection.model, links, make_bases(scene, seed)[best])
+    anew = make_bases(scene, seed, executor)[best]  # which remembers no earlier position
+    selection.model = relocate_devices(selection.model, links, anew)
     selection.explained = selection.model
     on_progress("looking at what is left")
     dependences_after = dependences_before

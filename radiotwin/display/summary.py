@@ -46,7 +46,7 @@ class Summarised(ABC):
     @property
     @abstractmethod
     def _summary(self) -> Summary:
-        """What is shown."""
+        """Summary that is shown."""
 
     def __repr__(self) -> str:
         return self._summary.text()

@@ -57,7 +57,7 @@ class LocalPool(Pool):
         return self._workers
 
     def room(self, resources: Resources) -> int:
-        """Return for how many workers this machine has memory; for its cores where none is told."""
+        """Return how many workers fit into memory; the number of cores where it is not known."""
         free = free_memory_bytes()
         if free is None or not resources.memory_bytes:
             return max(self._most or 0, _cores() // resources.cores)

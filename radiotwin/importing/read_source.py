@@ -40,7 +40,7 @@ class WithoutHeader:
 
 @dataclass(frozen=True)
 class Expected:
-    """What a file may have.
+    """Columns that a file may have.
 
     Attributes:
         columns: sets of columns, of which a header is likely to have one, in lower case.

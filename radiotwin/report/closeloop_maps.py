@@ -5,6 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, QuadMesh
 from matplotlib.figure import Figure
 
+from radiotwin.closeloop.residuals import rmse_db
 from radiotwin.display.style import GAIN_COLOURS, RESIDUAL_COLOURS, residual_range_db
 from radiotwin.report.closeloop_data import EffectData, LoopData
 from radiotwin.report.effect_markers import mark
@@ -34,7 +35,7 @@ def residual_map_figure(data: LoopData, background: MapBackground) -> Figure:
         image = _draw_cells(ax, grid, RESIDUAL_COLOURS, -range_db, range_db)
         for effect in data.effects:
             mark(ax, effect)
-        ax.set_title(f"{title}\nRMSE {_rmse_db(residual_db):.2f} dB", fontsize=11)
+        ax.set_title(f"{title}\nRMSE {rmse_db(residual_db):.2f} dB", fontsize=11)
     figure.colorbar(image, ax=figure.axes, shrink=0.85, extend="both", label=RESIDUAL_LABEL)
     end = "receiver" if background.receivers_move else "device"
     draw_legend_below(
@@ -117,7 +118,7 @@ def affected_links_figure(effect: EffectData, background: MapBackground) -> Figu
                           vmin=-range_db, vmax=range_db, linewidths=0.2, edgecolors="0.3", zorder=3)
         ax.set(xlim=frame[:2], ylim=frame[2:])
         mark(ax, effect)
-        error = f"{_rmse_db(residual_db[rows]):.2f} dB" if len(rows) else "none was detected"
+        error = f"{rmse_db(residual_db[rows]):.2f} dB" if len(rows) else "none was detected"
         ax.set_title(f"{title}\nRMSE of the {len(rows):,} links that it changes: {error}",
                      fontsize=11)
     figure.colorbar(dots, ax=figure.axes, shrink=0.85, extend="both", label=RESIDUAL_LABEL)
@@ -130,8 +131,3 @@ def _draw_cells(ax: Axes, grid: tuple[np.ndarray, np.ndarray, np.ndarray], colou
     """Draw means over cells, as `MapBackground.cell_means` returns them."""
     return ax.pcolormesh(*grid, cmap=colours, vmin=low, vmax=high, zorder=2, alpha=0.9,
                          linewidth=0, rasterized=True)
-
-
-def _rmse_db(residual_db: np.ndarray) -> float:
-    known = residual_db[np.isfinite(residual_db)]
-    return float(np.sqrt(np.mean(known**2))) if len(known) else np.nan

@@ -103,12 +103,12 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
 
 def _cards(report: dict) -> list[tuple[str, str]]:
     cards = []
-    combined = report["error"].get("combined")
-    if combined and report["baselines"]:
-        best = min(report["baselines"], key=lambda name: report["baselines"][name]["rmse_db"])
-        cards.append(("best prediction, RMSE", f"{words.number(combined['rmse_db'])} dB"))
-        cards.append((f"{name_label(best)} alone",
-                      f"{words.number(report['baselines'][best]['rmse_db'])} dB"))
+    prediction = report.get("prediction")
+    if prediction:
+        cards.append(("best prediction, RMSE",
+                      f"{words.number(prediction['combined_rmse_db'])} dB"))
+        cards.append((f"{name_label(prediction['best_baseline'])} alone",
+                      f"{words.number(prediction['best_baseline_rmse_db'])} dB"))
     for key, label, unit in CARDS:
         before, after = (words.number(report["error"][when].get(key))
                          for when in ("before", "after"))

@@ -68,7 +68,7 @@ class Lattice:
 
     @property
     def above(self) -> str:
-        """What altitudes are above, for people: `ground` or `datum`."""
+        """Reference of the altitudes, as people read it: `ground` or `datum`."""
         return "datum" if self.ground_m is None else "ground"
 
     @property

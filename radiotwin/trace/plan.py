@@ -1,4 +1,4 @@
-"""What a trace would cost, from a few of its batches."""
+"""Estimated cost of a trace, from a few of its batches."""
 
 import math
 import time

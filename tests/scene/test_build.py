@@ -317,19 +317,6 @@ def test_part_of_a_city(town, tmp_path):
     assert report.extent_m == (-75, 0, -75, 40)
 
 
-def test_a_lattice_that_is_asked_for(town, tmp_path):
-    """Its extent is in the frame of the file, and moves with the city."""
-    options = BuildOptions(extent_m=(-30, 30, -20, 20), step_m=5.0, altitudes_m=(3.0, 1.5), devices=2)
-    report = build_scene(town.write(), tmp_path / "out", options)
-    assert report.extent_m == (-30, 30, -20, 20) and report.step_m == 5.0
-    scene = Scene.load(tmp_path / "out")
-    assert scene.lattice.shape == (2, 9, 13) and scene.lattice.z_m.tolist() == [1.5, 3.0]
-    assert scene.city.height_at(-60.0, -60.0) == pytest.approx(8.0)  # buildings around it are kept
-    text = StringIO()
-    print_report(report, Console(file=text, width=200))
-    assert "3, 1.5 m" in text.getvalue() and "of the roofs" not in text.getvalue()
-
-
 def test_other_files_are_never_erased(town, tmp_path):
     out = tmp_path / "out"
     build_scene(town.write(), out)

@@ -1,10 +1,16 @@
 """The lattice: what lies on it, and in which order."""
 
+from io import StringIO
+
 import numpy as np
 import pytest
+from rich.console import Console
 
 from radiotwin.errors import BadInput
+from radiotwin.scene import Scene
+from radiotwin.scene.build import BuildOptions, build_scene
 from radiotwin.scene.lattice import Lattice
+from radiotwin.scene.report import print_report
 
 
 def test_both_borders_belong_to_it():
@@ -41,3 +47,16 @@ def test_index_of_many_positions_takes_little_memory():
     assert (lattice.index_of(lattice.positions_m[order] + 0.009) == order).all()
     with pytest.raises(BadInput, match="not on the lattice"):
         lattice.index_of(np.array([[0.0, np.nan, 10.0]]))
+
+
+def test_a_lattice_that_is_asked_for(town, tmp_path):
+    """Its extent is in the frame of the file, and moves with the city."""
+    options = BuildOptions(extent_m=(-30, 30, -20, 20), step_m=5.0, altitudes_m=(3.0, 1.5), devices=2)
+    report = build_scene(town.write(), tmp_path / "out", options)
+    assert report.extent_m == (-30, 30, -20, 20) and report.step_m == 5.0
+    scene = Scene.load(tmp_path / "out")
+    assert scene.lattice.shape == (2, 9, 13) and scene.lattice.z_m.tolist() == [1.5, 3.0]
+    assert scene.city.height_at(-60.0, -60.0) == pytest.approx(8.0)  # buildings around it are kept
+    text = StringIO()
+    print_report(report, Console(file=text, width=200))
+    assert "3, 1.5 m" in text.getvalue() and "of the roofs" not in text.getvalue()
