@@ -34,7 +34,7 @@ PARAMETERS = {
     "scale_height_m": "scale height (1/e)",
     "scattered_db": "scattered power, relative to free space", "strength": "strength",
     "roughness_m": "ground roughness", "ground_m": "ground height",
-    "lost_share": "dropout probability", "rise_and_fall_db": "peak-to-peak variation",
+    "lost_share": "share lost", "drop_db": "level without lock, lower by", "rise_and_fall_db": "peak-to-peak variation",
     "level_at_100_m": "level at 100 m", "length_m": "length", "width_m": "width",
     "height_m": "height", "share": "share of the variance", "sigma_db": "standard deviation",
     "true_minus_given_x_m": "true − given position, east",
