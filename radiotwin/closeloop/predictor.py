@@ -242,11 +242,12 @@ def physics_db(model: FoldModel, fit: FitResult, rest: CorrelatedShadowing | Non
     reading = model.predict(fit)
     mean_db, scale_db, limit_db = (each[test] for each in (
         reading.mean_db, reading.scale_db, model.limit_db))
+    losses = model.regression(test).losses
     forests = residual_forests(model, fit, part, seed, trees)
     added: list[tuple] = [(0.0, 1.0), *((forest.predict(part.common[test]), 1.0)
                                         for forest in forests.values())]
     if rest is not None:
         added.append(rest.at(model.links.select(test)))
     return np.column_stack([
-        mean_if_detected(mean_db + shift * scale_db, scale_db * left, limit_db, model.dof)
+        mean_if_detected(mean_db + shift * scale_db, scale_db * left, limit_db, model.dof, losses)
         for shift, left in added])

@@ -6,7 +6,7 @@ An effect belongs to one stage. In this order a level passes through them:
     gain       decibels that are added
     receiver   what the receiver makes of the level that arrives
     limit      below which level a link is blank
-    detection  which links are blank whatever their level
+    detection  which links are blank, or weaker, now and then whatever their level
 
 `docs/add-an-effect.md` is the guide for authors.
 """
@@ -27,6 +27,7 @@ from radiotwin.effects.params import (
     Variation,
     quantities,
 )
+from radiotwin.inference.student import Losses
 from radiotwin.links import LinkData
 
 if TYPE_CHECKING:
@@ -260,13 +261,13 @@ class _BlankingEffect(Effect):
 
 
 class DetectionEffect(_BlankingEffect):
-    """An effect that leaves levels as they are and makes links blank whatever their level."""
+    """An effect that loses links, or some of their level, now and then whatever their level."""
 
     stage = "detection"
 
     @abstractmethod
-    def dropout_probability(self, links: LinkData, params: Any) -> np.ndarray:
-        """Return the probability (n,), below 1, that a link is blank whatever its level."""
+    def losses(self, links: LinkData, params: Any) -> Losses:
+        """Return what becomes of n links; each value (n,), probabilities below 1."""
 
 
 class LimitEffect(_BlankingEffect):

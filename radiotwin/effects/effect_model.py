@@ -113,7 +113,7 @@ class EffectModel:
         return Prediction(
             mean_db, scale_db * np.sqrt(self.dof / (self.dof - 2)),
             detection_probability(mean_db, scale_db, model.limit_db, self.dof,
-                                  regression.dropout_probability))
+                                  regression.losses))
 
 
 def device_sd_db(model: FoldModel, result: FitResult) -> float:

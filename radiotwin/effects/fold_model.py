@@ -24,6 +24,7 @@ from radiotwin.inference.censored_regression import (
     Linearisation,
     Response,
 )
+from radiotwin.inference.student import NO_LOSSES, Losses
 from radiotwin.links import LinkData
 
 
@@ -133,7 +134,7 @@ class FoldModel:
             censored_regression.design([term.columns[rows] for term in terms], n),
             np.concatenate([self.level_prior_sd_db, *(term.prior_sd_db for term in terms)]),
             self.group[rows], response(self.effects, "receiver", rows), self.dof,
-            self._dropout_probability(rows), self._random_effect_sd_db(rows))
+            self._losses(rows), self._random_effect_sd_db(rows))
 
     @cached_property
     def training(self) -> CensoredRegression:
@@ -177,14 +178,16 @@ class FoldModel:
         return tuple(FittedEffect(each.effect, each.params, result.coefficients[own])
                      for each, own in zip(self.effects, self.coefficient_slices, strict=True))
 
-    def _dropout_probability(self, rows: np.ndarray | slice) -> np.ndarray | float:
-        """Return (n,) the probability of a blank whatever the level; 0 without such effects."""
-        kept: np.ndarray | float = 1.0
-        for each in self.effects:
-            if isinstance(each.effect, DetectionEffect):
-                links = self.links.select(rows)
-                kept = kept * (1.0 - each.effect.dropout_probability(links, each.params))
-        return 1.0 - kept
+    def _losses(self, rows: np.ndarray | slice) -> Losses:
+        """Return what becomes of links whatever their level."""
+        every = [each.effect.losses(self.links, each.params).select(rows)
+                 for each in self.effects if isinstance(each.effect, DetectionEffect)]
+        if not every:
+            return NO_LOSSES
+        kept = np.prod([1.0 - np.asarray(each.blank) for each in every], axis=0)
+        # Two effects that lower levels of the same links are not looked for.
+        most = max(every, key=lambda each: float(np.mean(each.drop)))
+        return Losses(1.0 - kept, most.drop, most.drop_db)
 
     def _random_effect_sd_db(self, rows: np.ndarray | slice) -> np.ndarray | float:
         """Return (n,) the sd of what was learnt of other links only; 0 where there is none."""

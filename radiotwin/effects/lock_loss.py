@@ -1,8 +1,9 @@
-"""A receiver that loses lock now and then: a link is blank although its level is above the limit.
+"""A receiver that loses lock now and then: links are blank, or weaker, whatever their level.
 
-A blank is then either too weak or lost, P(blank) = p + (1 - p) F (the p-tobit of Deaton and Irish
-1984, 'Statistical models for zero expenditures in household budgets', Journal of Public Economics
-23), with a p for each receiver. Losses in sequences have the same p as losses at random; that
+A blank is either too weak or lost, P(blank) = p + (1 - p) F (the p-tobit of Deaton and Irish 1984,
+'Statistical models for zero expenditures in household budgets', Journal of Public Economics 23),
+with a p for each receiver. Of a receiver that goes on reading without lock the level is lower by
+some decibels with a probability p. Losses in sequences have the same p as losses at random; that
 neighbouring links are lost together widens the interval.
 """
 
@@ -15,6 +16,7 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import frequent_labels
 from radiotwin.effects.base import DetectionEffect
+from radiotwin.effects.level_drops import MIN_DROP_DB, find_drops
 from radiotwin.effects.params import (
     QUANTILE_90,
     EffectParams,
@@ -24,10 +26,11 @@ from radiotwin.effects.params import (
     Variation,
 )
 from radiotwin.effects.residual_view import ResidualView
+from radiotwin.inference.student import Losses
 from radiotwin.links import LinkData
 
 MIN_LINKS = 60  # of a receiver, with line of sight
-MIN_NATS = 5.0  # that dropouts must gain to be proposed for a receiver
+MIN_NATS = 5.0  # that losses must gain to be proposed for a receiver
 STRONGEST = 0.25  # share of the links, which must gain, too
 MIN_DEVICE_LINKS = 20  # of a device, to be asked whether it gains
 MIN_DEVICES = 0.6  # share of those devices that must gain
@@ -36,71 +39,105 @@ PROBABILITIES = np.geomspace(0.002, 0.9, 60)  # tried
 MIN_PROBABILITY = 1e-9  # of a level below the limit; bounds the weight of one link
 MAX_VARIED = 8  # receivers whose probabilities are refined; more take too long
 STEP, MAX_CHANGE = 0.3, 1.0  # of the log-odds
+STEP_DB, MAX_CHANGE_DB = 1.0, 6.0  # of a drop
+MAX_DROP_DB = 80.0  # the range of a good receiver
 
 
 class LockLoss(DetectionEffect):
-    """A dropout probability for each receiver whose links become likelier by it."""
+    """A probability of loss for each receiver whose links become likelier by it."""
 
     name = "lock_loss"
-    confused_with = ("missing_obstacle", "noise_floor_censoring")
+    confused_with = ("missing_obstacle", "noise_floor_censoring", "episode", "faulty_flight")
 
     class Params(EffectParams):
-        """Dropout probabilities of receivers."""
+        """Receivers that lose lock."""
 
         receivers: dict[ReceiverIndex, Annotated[float, Field(ge=0, lt=1)]] = Field(
-            description="Dropout probability of each receiver, by index.")
-
-    @override
-    def unavailable(self, links: LinkData) -> str | None:
-        if not np.isfinite(links.limit_db).any():
-            return "the limit of detection is not known, so that a blank has no meaning"
-        return None if np.isnan(links.level_db).any() else "no link is blank"
+            description="Probability of a loss, of each receiver by index.")
+        drops_db: dict[ReceiverIndex, Annotated[float, Field(gt=0, le=MAX_DROP_DB)]] = Field(
+            default_factory=dict, description="By how much the level is lower without lock, of "
+            "those receivers that are not blank then [dB].")
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        links, found = view.links, {}
-        # Behind buildings, links are blank for want of a path, too.
+        links, blank, shares, drops_db = view.links, {}, {}, {}
+        # Behind buildings, links are blank, or weak, for want of a path, too.
         clear = links.los if links.los.any() else np.ones(len(links), dtype=bool)
         for receiver in frequent_labels(links.receiver[clear], MIN_LINKS):
             rows = np.flatnonzero(clear & (links.receiver == receiver))
-            margin = (links.limit_db[rows] - view.mean_db[rows]) / view.scale_db[rows]
-            probability, nats = _likeliest(stdtr(DOF, margin), np.isnan(links.level_db[rows]))
-            # A receiver less sensitive than declared misses no strong links, and an obstacle
-            # affects some devices only.
-            strong = margin <= np.quantile(margin, STRONGEST)
-            if (nats.sum() > MIN_NATS * view.design_effect and nats[strong].sum() > 0
-                    and _most_devices_gain(links.device[rows], nats)):
-                found[receiver] = probability
-        return [self.Params(receivers=found)] if found else []
+            probability = _blank_share(view, rows)
+            if probability is not None:
+                blank[receiver] = probability
+            heard = rows[np.isfinite(links.level_db[rows])]
+            found = find_drops(view, receiver, heard, view.design_effect, MIN_NATS) \
+                if len(heard) >= MIN_LINKS else None
+            if found is not None and _most_devices_gain(links.device[heard], found.nats):
+                shares[receiver], drops_db[receiver] = found.share, found.drop_db
+        proposed = [self.Params(receivers=blank)] if blank else []
+        if shares:
+            proposed.append(self.Params(receivers=shares, drops_db=drops_db))
+        return proposed
 
     @override
-    def dropout_probability(self, links: LinkData, params: Params) -> np.ndarray:
-        by_receiver = np.zeros(len(links.receiver_names))
-        by_receiver[list(params.receivers)] = list(params.receivers.values())
-        return by_receiver[links.receiver]
+    def losses(self, links: LinkData, params: Params) -> Losses:
+        blank, drop, drop_db = np.zeros((3, len(links.receiver_names)))
+        for receiver, probability in params.receivers.items():
+            (drop if receiver in params.drops_db else blank)[receiver] = probability
+        drop_db[list(params.drops_db)] = list(params.drops_db.values())
+        return Losses(*(each[links.receiver] for each in (blank, drop, drop_db)))
 
     @override
     def variation(self, params: Params) -> Variation | None:
         if len(params.receivers) > MAX_VARIED:
             return None
         log_odds = logit(np.array(list(params.receivers.values())))
+        drops_db = np.array(list(params.drops_db.values()))
+        start, change = np.r_[log_odds, drops_db], np.r_[
+            np.full(len(log_odds), MAX_CHANGE), np.full(len(drops_db), MAX_CHANGE_DB)]
+        least = np.r_[np.full(len(log_odds), -np.inf), np.full(len(drops_db), MIN_DROP_DB / 2)]
+        most = np.r_[np.full(len(log_odds), np.inf), np.full(len(drops_db), MAX_DROP_DB)]
+
+        def changed(numbers: np.ndarray) -> LockLoss.Params:
+            shares, own_db = np.split(numbers, [len(log_odds)])
+            return self.Params(receivers=dict(zip(params.receivers, expit(shares).tolist())),
+                               drops_db=dict(zip(params.drops_db, own_db.tolist())))
+
         return Variation(
-            log_odds, np.full(len(log_odds), STEP), log_odds - MAX_CHANGE, log_odds + MAX_CHANGE,
-            lambda numbers: self.Params(
-                receivers=dict(zip(params.receivers, expit(numbers).tolist()))))
+            start, np.r_[np.full(len(log_odds), STEP), np.full(len(drops_db), STEP_DB)],
+            np.maximum(start - change, least), np.minimum(start + change, most), changed)
 
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
-        log_odds_sd = estimate.params_sd
-        if not len(log_odds_sd):  # too many to be varied
-            log_odds_sd = np.full(len(params.receivers), np.nan)
+        sd = estimate.params_sd
+        if not len(sd):  # too many to be varied
+            sd = np.full(len(params.receivers) + len(params.drops_db), np.nan)
+        shares_sd, drops_sd_db = np.split(sd, [len(params.receivers)])
         result = {}
-        for (receiver, probability), sd in zip(params.receivers.items(), log_odds_sd):
-            low, high = expit(logit(probability) + QUANTILE_90 * sd * np.array([-1, 1]))
+        for (receiver, probability), own_sd in zip(params.receivers.items(), shares_sd):
+            low, high = expit(logit(probability) + QUANTILE_90 * own_sd * np.array([-1, 1]))
             result[f"lost_share[{links.receiver_names[receiver]}]"] = Parameter(
                 probability, float(low), float(high), "of its links")
+        for (receiver, drop_db), sd_db in zip(params.drops_db.items(), drops_sd_db):
+            result[f"drop_db[{links.receiver_names[receiver]}]"] = Parameter.normal(
+                drop_db, sd_db, "dB")
         return result
+
+
+def _blank_share(view: ResidualView, rows: np.ndarray) -> float | None:
+    """Return the likeliest share of the links (n,) of a receiver that are lost; None: no gain."""
+    links = view.links
+    blank = np.isnan(links.level_db[rows])
+    if not blank.any() or not np.isfinite(links.limit_db[rows]).all():
+        return None
+    margin = (links.limit_db[rows] - view.mean_db[rows]) / view.scale_db[rows]
+    probability, nats = _likeliest(stdtr(DOF, margin), blank)
+    # A receiver less sensitive than declared misses no strong links, and an obstacle affects some
+    # devices only.
+    strong = margin <= np.quantile(margin, STRONGEST)
+    gains = (nats.sum() > MIN_NATS * view.design_effect and nats[strong].sum() > 0
+             and _most_devices_gain(links.device[rows], nats))
+    return probability if gains else None
 
 
 def _likeliest(below: np.ndarray, blank: np.ndarray) -> tuple[float, np.ndarray]:

@@ -164,7 +164,7 @@ def _curvatures(problem: CensoredRegression, predicted: Linearisation,
     """
     slope, curvature, scale_slope = student.derivatives(
         problem.level_db, problem.limit_db, predicted.mean_db, predicted.scale_db, problem.dof,
-        problem.dropout_probability)
+        problem.losses)
     seen = np.isfinite(problem.level_db)
     expected = (problem.dof + 1) / (problem.dof + 3) / predicted.scale_db**2
     return (slope, scale_slope, np.where(seen, expected, curvature),

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array, issparse
-from scipy.special import stdtr
 
 from radiotwin.inference import student
+from radiotwin.inference.student import NO_LOSSES, Losses
 
 MIN_SCALE_DB = 0.05
 FIRST_SCALE_DB = 5.0  # where the search for the error scales begins
@@ -55,7 +55,7 @@ class CensoredRegression:
         group: (n,) index of the error scale.
         receiver: response to the level that arrives; None = none.
         dof: degrees of freedom of the errors.
-        dropout_probability: (n,), or one for all, of a blank whatever the level.
+        losses: of links, whatever their level.
         random_effect_sd_db: (n,), or one for all, standard deviation of what nothing was learnt of,
             beside the error scale [dB].
     """
@@ -71,7 +71,7 @@ class CensoredRegression:
     group: np.ndarray
     receiver: Response | None
     dof: float
-    dropout_probability: np.ndarray | float = 0.0
+    losses: Losses = NO_LOSSES
     random_effect_sd_db: np.ndarray | float = 0.0
 
     def arriving(self, coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
@@ -128,23 +128,25 @@ class CensoredRegression:
     def nll_at(self, mean_db: np.ndarray, scale_db: np.ndarray) -> np.ndarray:
         """Return the negative log-likelihood (n,) around any mean and scale (n,) [nats]."""
         return student.censored_nll(self.level_db, self.limit_db, mean_db, scale_db, self.dof,
-                                    self.dropout_probability)
+                                    self.losses)
 
     def residual_db(self, result: "FitResult") -> np.ndarray:
         """Return measured minus predicted levels (n,) [dB].
 
-        Of a blank: the least change of the mean after which it is as likely detected as not, 0
-        where it already is less likely, times the probability that it is blank for its level and
-        did not drop out.
+        What a level has probably dropped by is added. Of a blank: the least change of the mean
+        after which it is as likely detected as not, 0 where it already is less likely, times the
+        probability that it is blank for its level and did not drop out.
         """
         predicted = self.predict(result)
         mean, blank = predicted.mean_db, np.isnan(self.level_db)
         limit = np.where(np.isfinite(self.limit_db), self.limit_db, mean)
         excess_db = np.minimum(limit - mean, 0.0)
-        below = (1 - self.dropout_probability) * stdtr(
-            self.dof, excess_db / predicted.scale_db)
-        missed = np.maximum(self.dropout_probability + below, student.MIN_PROBABILITY)
-        return np.where(blank, excess_db * below / missed, self.level_db - mean)
+        below = (1 - self.losses.blank) * student.below_probability(
+            -excess_db, predicted.scale_db, np.zeros(len(mean)), self.dof, self.losses)
+        missed = np.maximum(self.losses.blank + below, student.MIN_PROBABILITY)
+        dropped_db = student.expected_drop_db(self.level_db, mean, predicted.scale_db, self.dof,
+                                              self.losses)
+        return np.where(blank, excess_db * below / missed, self.level_db - mean + dropped_db)
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,7 +264,7 @@ def _slope_and_hessian(problem: CensoredRegression, predicted: Linearisation,
 def _derivatives(problem: CensoredRegression, predicted: Linearisation,
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return student.derivatives(problem.level_db, problem.limit_db, predicted.mean_db,
-                               predicted.scale_db, problem.dof, problem.dropout_probability)
+                               predicted.scale_db, problem.dof, problem.losses)
 
 
 def _scales(problem: CensoredRegression, predicted: Linearisation,

@@ -33,8 +33,9 @@ def test_the_dropout_probability_is_the_share_of_blanks_far_above_the_limit(seen
     strong = (given.links.receiver == 1) & (given.mean_db > LIMIT_DB + 10)
     counted = np.isnan(given.links.level_db[strong]).mean()
     assert params.receivers[1] == pytest.approx(counted, rel=0.25)
-    share = LockLoss().dropout_probability(given.links, params)
-    np.testing.assert_array_equal(share, np.where(given.links.receiver == 1, params.receivers[1], 0.0))
+    losses = LockLoss().losses(given.links, params)
+    np.testing.assert_array_equal(losses.blank, np.where(given.links.receiver == 1, params.receivers[1], 0.0))
+    assert not losses.drop.any()
 
 
 def test_whole_slots_that_are_lost_are_found_as_well(seen):
@@ -51,7 +52,7 @@ def test_whole_slots_that_are_lost_are_found_as_well(seen):
 ], ids=["nothing", "deaf", "device", "wall"])
 def test_what_is_blank_for_other_reasons_is_not_lost_lock(seen, lost):
     given = seen(lost)
-    assert LockLoss().unavailable(given.links) is None and LockLoss().propose(given) == []
+    assert LockLoss().propose(given) == []
 
 
 def test_behind_buildings_links_may_be_blank_for_want_of_a_path(seen):
@@ -62,10 +63,11 @@ def test_behind_buildings_links_may_be_blank_for_want_of_a_path(seen):
     assert LockLoss().propose(given) == []
 
 
-def test_it_is_unavailable_where_a_blank_has_no_meaning(make_links):
-    links = make_links([[0.0, 0, 1.5]], np.ones((80, 3)))
-    assert "limit" in LockLoss().unavailable(links)
-    assert "blank" in LockLoss().unavailable(make_links([[0.0, 0, 1.5]], np.ones((80, 3)), limit_db=-100.0))
+def test_without_a_limit_a_blank_has_no_meaning(seen):
+    given = seen(lambda links, level_db, rng: rng.random(len(links)) < 0.2)
+    assert LockLoss().propose(given)
+    given.links.limit_db[:] = -np.inf
+    assert LockLoss().propose(given) == []
 
 
 def test_links_lost_at_random_are_named_and_counted(open_ground, loop):

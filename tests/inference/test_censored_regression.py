@@ -15,7 +15,12 @@ from radiotwin.inference.censored_regression import (
     _slope_and_hessian,
     fit,
 )
-from radiotwin.inference.student import derivatives
+from radiotwin.inference.student import (
+    Losses,
+    derivatives,
+    detection_probability,
+    mean_if_detected,
+)
 
 
 def problem(level_db, columns, limit_db=-np.inf, dof=5.0, split=1, paths=None, receiver=None, prior_sd_db=np.inf):
@@ -96,7 +101,7 @@ def test_links_that_drop_out_whatever_their_level_do_not_bias_it(seed):
     probability = np.where(np.arange(len(level_db)) % 2, 0.3, 0.0)
     dropped = np.random.default_rng(seed).random(len(level_db)) < probability
     given = problem(np.where((level_db < limit_db) | dropped, np.nan, level_db), columns, limit_db)
-    known = replace(given, dropout_probability=probability)
+    known = replace(given, losses=Losses(blank=probability))
     found = fit(known)
     sd_db = np.sqrt(np.diag(covariance(known, found)))
     assert (np.abs(found.coefficients - truth) < 4.5 * sd_db).all() and sd_db.max() < 0.2
@@ -107,32 +112,67 @@ def test_links_that_drop_out_whatever_their_level_do_not_bias_it(seed):
     assert known.residual_db(found)[strong].min() > -0.5 and given.residual_db(found)[strong].max() < -9
 
 
-@pytest.mark.parametrize("share", [0.0, 0.03, 0.6])
-def test_derivatives_are_those_of_the_likelihood_also_where_links_drop_out(share):
+@pytest.mark.parametrize(("share", "drop"), [(0.0, 0.0), (0.03, 0.0), (0.6, 0.0), (0.0, 0.2), (0.1, 0.4)])
+def test_derivatives_are_those_of_the_likelihood_also_where_links_are_lost(share, drop):
     """Slope and curvature against differences in the mean, and the term of the scale against those in its logarithm."""
     rng = np.random.default_rng(5)
     level_db = rng.uniform(-100, -60, 300)
     level_db[::2] = np.nan
-    given = replace(problem(level_db, np.ones((300, 1)), -95.0), dropout_probability=np.full(300, share))
+    given = replace(problem(level_db, np.ones((300, 1)), -95.0), losses=Losses(np.full(300, share), np.full(300, drop), np.full(300, 12.0)))
     mean, scale, step = rng.uniform(-110, -70, 300), 3.0, 1e-3
     slope, curvature, scale_slope = derivatives(level_db, given.limit_db, mean, np.full(300, scale), given.dof,
-                                                given.dropout_probability)
+                                                given.losses)
     around = [given.nll_at(mean + way * step, np.full(300, scale)) for way in (-1, 0, 1)]
     np.testing.assert_allclose(slope, (around[0] - around[2]) / (2 * step), atol=1e-5)
     blank = np.isnan(level_db)
     exact = (around[0] - 2 * around[1] + around[2]) / step**2
     np.testing.assert_allclose(curvature[blank], np.maximum(exact[blank], 0), atol=1e-5)
-    assert curvature.min() > 0 > exact[blank].min()  # far from the limit the likelihood is not concave
+    assert curvature.min() > 0
+    if not drop:
+        assert exact[blank].min() < 0  # far from the limit the likelihood is not concave
     wider, narrower = (given.nll_at(mean, np.full(300, scale * np.exp(way * step))) for way in (1, -1))
     np.testing.assert_allclose(scale_slope, (narrower - wider) / (2 * step), atol=1e-5)
 
 
 def test_the_likelihood_of_a_link_that_may_drop_out_is_that_of_either():
     given = replace(problem(np.array([-80.0, np.nan, np.nan]), np.ones((3, 1)), -90.0),
-                    dropout_probability=np.array([0.1, 0.1, 0.0]))
+                    losses=Losses(blank=np.array([0.1, 0.1, 0.0])))
     found = given.nll_at(np.full(3, -84.0), np.full(3, 4.0))
     below = student.cdf(-6 / 4, 5)
     np.testing.assert_allclose(found, -np.log([0.9 * student.pdf(1, 5) / 4, 0.1 + 0.9 * below, below]))
+
+
+def test_the_likelihood_of_a_level_that_may_have_dropped_is_that_of_a_mixture():
+    given = replace(problem(np.array([-80.0, -99.0, np.nan]), np.ones((3, 1)), -110.0),
+                    losses=Losses(0.1, np.array([0.0, 0.3, 0.3]), 16.0))
+    found = given.nll_at(np.full(3, -84.0), np.full(3, 4.0))
+    seen = 0.7 * student.pdf(-15 / 4, 5) + 0.3 * student.pdf(1 / 4, 5)
+    below = 0.7 * student.cdf(-26 / 4, 5) + 0.3 * student.cdf(-10 / 4, 5)
+    np.testing.assert_allclose(found, -np.log([0.9 * student.pdf(1, 5) / 4, 0.9 * seen / 4, 0.1 + 0.9 * below]))
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_levels_that_drop_now_and_then_do_not_bias_it(seed):
+    columns, truth, level_db = draw(seed)
+    dropped = np.random.default_rng(seed).random(len(level_db)) < 0.25
+    given = problem(level_db - 18.0 * dropped, columns)
+    known = replace(given, losses=Losses(drop=0.25, drop_db=18.0))
+    found = fit(known)
+    sd_db = np.sqrt(np.diag(covariance(known, found)))
+    assert (np.abs(found.coefficients - truth) < 4.5 * sd_db).all()
+    assert found.scale_db[0] == pytest.approx(3.0, rel=0.08) and fit(given).scale_db[0] > 4
+    assert abs(known.residual_db(found)[dropped].mean()) < 1 and given.residual_db(found)[dropped].mean() < -10
+
+
+@pytest.mark.parametrize("limit_db", [-np.inf, -100.0])
+def test_mean_and_probability_of_detection_count_both_states(limit_db):
+    """Against a million draws."""
+    rng = np.random.default_rng(1)
+    level_db = -85 + 4 * rng.standard_t(5, 10**6) - 20 * (rng.random(10**6) < 0.3)
+    seen = (level_db > limit_db) & (rng.random(10**6) > 0.2)
+    args = np.array([-85.0]), np.array([4.0]), np.array([limit_db]), 5, Losses(0.2, 0.3, 20.0)
+    assert detection_probability(*args)[0] == pytest.approx(seen.mean(), abs=0.002)
+    assert mean_if_detected(*args)[0] == pytest.approx(level_db[seen].mean(), abs=0.03)
 
 
 def test_what_paths_add_and_receivers_compress_is_undone():
