@@ -58,3 +58,5 @@ def test_all_of_it(folder):
         done = subprocess.run([sys.executable, f"program{number}.py"], cwd=folder, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
     assert (folder / "figure.png").stat().st_size > 10_000
+    of_d3 = dict(re.findall(r"^(\w+): (\d+)% of the data of d3", done.stdout, re.MULTILINE))
+    assert int(of_d3["urgent"]) > int(of_d3["qmix"])
