@@ -3,6 +3,10 @@
 The recommendation has the distribution of the loss over buildings and places in them. The median of
 one of its two classes of buildings is what a link loses at first; how much more or less it is here
 is fitted, with the spread of the distribution as the prior.
+
+Receivers' positions are off by metres, so each has a probability to be inside (`chance_inside`),
+and loses that share: the mean over both cases. One on the pavement loses some of it, too, unless it
+has line of sight.
 """
 
 from typing import Literal, NamedTuple
@@ -17,6 +21,7 @@ from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.params import EffectParams, Estimate, Parameter
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.links import LinkData
+from radiotwin.links.indoors import chance_inside
 
 MIN_LINKS = 30  # with one end inside
 MIN_HZ, MAX_HZ = 80e6, 100e9  # of the recommendation
@@ -86,9 +91,10 @@ class BuildingEntry(GainEffect):
         if not MIN_HZ <= links.frequency_hz <= MAX_HZ:
             return ("the frequency is not known, or outside the 80 MHz to 100 GHz of ITU-R P.2109; "
                     "give frequency_hz")
-        count = int(self._enters(links).sum())
+        count = int(self._chance(links).sum())
         if count < MIN_LINKS:
-            return f"{count} links have one end inside a building; {MIN_LINKS} are needed"
+            return (f"{count} links probably have one end inside a building; {MIN_LINKS} are "
+                    "needed")
         return None
 
     @override
@@ -98,11 +104,11 @@ class BuildingEntry(GainEffect):
 
     @override
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
-        enters = self._enters(links).astype(float)
+        chance = self._chance(links)
         median_db = entry_loss_db(params.frequency_hz, links.elevation_deg, params.building)
         low_db, high_db = (entry_loss_db(params.frequency_hz, 0.0, params.building, probability)
                            for probability in (0.1587, 0.8413))  # one standard deviation apart
-        return Term(-enters * median_db, -enters[:, None], np.array([(high_db - low_db) / 2]))
+        return Term(-chance * median_db, -chance[:, None], np.array([(high_db - low_db) / 2]))
 
     @override
     def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
@@ -126,9 +132,13 @@ class BuildingEntry(GainEffect):
         """Return the fitted loss of a horizontal path [dB]."""
         return float(entry_loss_db(params.frequency_hz, 0.0, params.building) + coefficients[0])
 
-    def _enters(self, links: LinkData) -> np.ndarray:
-        """Return whether (n,) links have one end inside a building and the other outside."""
+    def _chance(self, links: LinkData) -> np.ndarray:
+        """Return the probability (n,) that one end is inside a building and the other outside."""
         def derive() -> np.ndarray:
             city = city_of(links, self.name)
-            return city.inside(links.device_m[links.device]) != city.inside(links.receiver_m)
+            device = city.inside(links.device_m)[links.device]
+            receiver = city.inside(links.receiver_m).astype(float)
+            measured = links.receiver >= 0  # others are points of a map, whose places are exact
+            receiver[measured] = chance_inside(city, links.receiver_m[measured])
+            return np.where(links.los, 0.0, np.where(device, 1 - receiver, receiver))
         return self._entering.get(links, None, derive)

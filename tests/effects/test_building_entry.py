@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import trimesh
+from scipy.stats import norm
 
 from radiotwin.effects.building_entry import BuildingEntry, entry_loss_db
 from radiotwin.scene.citymap import CityMap
@@ -41,10 +42,23 @@ def test_only_links_that_enter_lose(indoors, view):
     traditional, efficient = effect.propose(view(indoors, np.zeros(80), 1.0))
     term = effect.term(indoors, traditional, None)
     expected_db = entry_loss_db(2.4e9, indoors.elevation_deg, "traditional")
-    np.testing.assert_allclose(term.offset_db, np.where(np.arange(80) < 40, -expected_db, 0.0))
-    np.testing.assert_array_equal(term.columns[:, 0], np.where(np.arange(80) < 40, -1.0, 0.0))
+    chance = -term.columns[:, 0]
+    assert (chance[:40] > 0.8).all() and (chance[:40] == 1.0).mean() > 0.3 and (chance[40:] == 0.0).all()
+    np.testing.assert_allclose(term.offset_db, -chance * expected_db)
     assert 8 < term.prior_sd_db[0] < 12  # sigma_1 of traditional buildings is 9.6 + 2 log f
     assert (effect.term(indoors, efficient, None).offset_db[:40] < term.offset_db[:40] - 10).all()
+
+
+def test_near_a_wall_it_is_a_matter_of_chance(indoors, make_links, view):
+    """The normal distribution of the position behind the wall of the block, far from its corners."""
+    depth_m = np.repeat([-6.0, -2.0, 0.1, 2.0, 6.0, 20.0], 10)
+    receiver_m = np.column_stack([130.0 - depth_m, np.zeros(60), np.full(60, 1.5)])
+    links = make_links([[0.0, 0, 1.5]], receiver_m, city=indoors.city)
+    effect = BuildingEntry()
+    chance = -effect.term(links, effect.propose(view(links, np.zeros(60), 1.0))[0], None).columns[:, 0]
+    np.testing.assert_allclose(chance, norm.cdf(depth_m, scale=4.0), atol=0.05)
+    seen = make_links([[0.0, 40.0, 1.5]], [[60.0, 40.0, 1.5], [69.0, 33.0, 1.5]], city=indoors.city)
+    assert seen.los.all() and (effect.term(seen, effect.propose(view(seen, np.zeros(2), 1.0))[0], None).columns == 0).all()
 
 
 def test_it_needs_a_map_a_frequency_and_links_indoors(indoors, make_links):
