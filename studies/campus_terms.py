@@ -11,7 +11,7 @@ from radiotwin.channel.followed_paths import interaction_gains
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.effects.sector_antenna import SectorPattern, sector_pattern_db
 from radiotwin.links import LinkData, prepare_links
-from radiotwin.links.indoors import chance_inside
+from radiotwin.links.indoors import SURE, chance_inside
 from studies.campus import SPLITS, campus
 from studies.closeloop_real import AZIMUTHS_DEG
 from studies.runner import Study
@@ -102,7 +102,26 @@ def fit_terms(seed: int, settings: dict) -> dict:
         fold = make_folds(links, seed, way).index
         found[way] = {name: _rmse_db(np.column_stack([terms["sector"], *(
             terms[each] for each in columns)]), level_db, fold) for name, columns in models.items()}
-    return {"links": len(links), "los": float(links.los.mean()), "rmse_db": found}
+    result = {"links": len(links), "los": float(links.los.mean()), "rmse_db": found}
+    if models is INDOORS:
+        result |= _indoors(level_db, terms)
+    return result
+
+
+def _indoors(level_db: np.ndarray, terms: dict[str, np.ndarray]) -> dict:
+    """Return numbers of links with their receiver indoors, and by how much these are weaker."""
+    chance, told = terms["chance of being indoors"][:, 0], terms["indoors"][:, 0] > 0
+    columns = np.column_stack([terms["sector"], *(
+        terms[each] for each in MODELS["+ antenna, LoS class"])])
+    outdoors = chance == 0
+    weights = np.linalg.lstsq(columns[outdoors], level_db[outdoors], rcond=None)[0]
+    rest_db = level_db - columns @ weights
+    groups = {"indoors by the map, surely": told & (chance >= SURE),
+              "indoors by the map, perhaps": told & (chance < SURE),
+              "outdoors by the map, perhaps indoors": ~told & (chance >= 1 - SURE)}
+    return {"groups": {name: {"links": int(rows.sum()),
+                              "median_db": float(np.median(rest_db[rows]))}
+                       for name, rows in groups.items()}}
 
 
 def _rmse_db(columns: np.ndarray, level_db: np.ndarray, fold: np.ndarray) -> float:
@@ -117,13 +136,20 @@ def _rmse_db(columns: np.ndarray, level_db: np.ndarray, fold: np.ndarray) -> flo
 def terms_table(rows: pd.DataFrame) -> str:
     """Return errors by model and split."""
     titles = {"all": "What each part brings", "indoors": "Indoors by the map, or probably"}
-    return "\n\n".join(
-        markdown(["model", *(SPLITS[way] for way in WAYS)],
-                 [[model, *(number(row["rmse_db"][way][model], 2 + (name == "indoors"))
-                            for way in WAYS)] for model in row["rmse_db"][WAYS[0]]],
-                 titles[name], ": least squares told the azimuths, RMSE [dB]")
-        for name, row in rows.set_index("name").iterrows())
+    parts = [markdown(["model", *(SPLITS[way] for way in WAYS)],
+                      [[model, *(number(row["rmse_db"][way][model], 2 + (name == "indoors"))
+                                 for way in WAYS)] for model in row["rmse_db"][WAYS[0]]],
+                      titles[name], ": least squares told the azimuths, RMSE [dB]")
+             for name, row in rows.set_index("name").iterrows()]
+    parts += [markdown(["receiver", "links", "median [dB]"],
+                       [[name, f"{group['links']:,}", number(group["median_db"], 1)]
+                        for name, group in groups.items()],
+                       "Beside walls and behind them",
+                       ": level beside what is predicted outdoors")
+              for groups in rows.get("groups", pd.Series()).dropna()]
+    return "\n\n".join(parts)
 
 
 STUDIES = {"terms": Study("What does each part of the physics bring on a real campus?", fit_terms,
-                          lambda seed: {"all": {}, "indoors": {"only": "indoors"}}, terms_table, seeds=1)}
+                          lambda seed: {"all": {}, "indoors": {"only": "indoors"}}, terms_table,
+                          seeds=1)}
