@@ -6,9 +6,10 @@ is fitted, with the spread of the distribution as the prior.
 
 Receivers' positions are off by metres, so each has a probability to be inside (`chance_inside`),
 and loses that share: the mean over both cases. One on the pavement loses some of it, too, unless it
-has line of sight.
+has line of sight. How much the loss scatters from place to place is fitted as well.
 """
 
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -18,13 +19,14 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import LinkCache, city_of
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.params import EffectParams, Estimate, Parameter
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, quantity
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.links import LinkData
 from radiotwin.links.indoors import chance_inside
 
 MIN_LINKS = 30  # with one end inside
 MIN_HZ, MAX_HZ = 80e6, 100e9  # of the recommendation
+START_SD_DB = 5.0  # of the search for the scatter
 MAX_PROBABILITY = 0.99  # of the loss: a greater one is something else
 
 
@@ -80,6 +82,9 @@ class BuildingEntry(GainEffect):
 
         building: Building = Field(description="Class of ITU-R P.2109.")
         frequency_hz: float = Field(ge=MIN_HZ, le=MAX_HZ, description="Of the radio [Hz].")
+        scatter_sd_db: float = quantity(
+            0.0, unit="dB", low=0.0, high=30.0, step=2.0,
+            description="Standard deviation of the loss, over buildings and places in them [dB].")
 
     def __init__(self) -> None:
         self._entering = LinkCache()
@@ -99,8 +104,8 @@ class BuildingEntry(GainEffect):
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
-        return [self.Params(building=building, frequency_hz=view.links.frequency_hz)
-                for building in CLASSES]
+        return [self.Params(building=building, frequency_hz=view.links.frequency_hz,
+                            scatter_sd_db=START_SD_DB) for building in CLASSES]
 
     @override
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
@@ -108,7 +113,8 @@ class BuildingEntry(GainEffect):
         median_db = entry_loss_db(params.frequency_hz, links.elevation_deg, params.building)
         low_db, high_db = (entry_loss_db(params.frequency_hz, 0.0, params.building, probability)
                            for probability in (0.1587, 0.8413))  # one standard deviation apart
-        return Term(-chance * median_db, -chance[:, None], np.array([(high_db - low_db) / 2]))
+        return Term(-chance * median_db, -chance[:, None], np.array([(high_db - low_db) / 2]),
+                    random_effect_sd_db=np.sqrt(chance) * params.scatter_sd_db)
 
     @override
     def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
@@ -124,8 +130,10 @@ class BuildingEntry(GainEffect):
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
+        scatter = Parameter.normal(params.scatter_sd_db, estimate.params_sd[0], "dB")
         return {"entry_loss_db": Parameter.normal(self._loss_db(params, estimate.coefficients),
-                                                  estimate.coefficients_sd[0], "dB")}
+                                                  estimate.coefficients_sd[0], "dB"),
+                "scatter_sd_db": replace(scatter, low=max(scatter.low, 0.0))}
 
     @staticmethod
     def _loss_db(params: Params, coefficients: np.ndarray) -> float:
