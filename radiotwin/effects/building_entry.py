@@ -26,6 +26,7 @@ from radiotwin.links.indoors import chance_inside
 
 MIN_LINKS = 30  # with one end inside
 MIN_HZ, MAX_HZ = 80e6, 100e9  # of the recommendation
+MIN_LOSS_DB = 1.0  # less is none: 1 % of traditional buildings cost below 1.6 dB, at 2.4 GHz
 START_SD_DB = 5.0  # of the search for the scatter
 MAX_PROBABILITY = 0.99  # of the loss: a greater one is something else
 
@@ -122,6 +123,8 @@ class BuildingEntry(GainEffect):
             params.frequency_hz, 0.0, params.building, MAX_PROBABILITY)
         if loss_db < 0:
             return f"buildings would have to amplify, by {-loss_db:.1f} dB"
+        if loss_db < MIN_LOSS_DB:
+            return f"its links lose {loss_db:.1f} dB only: they scatter, and do not enter buildings"
         if loss_db > most_db:
             return (f"an entry loss of {loss_db:.0f} dB is above the {most_db:.0f} dB that 99 % of "
                     "such buildings stay below (ITU-R P.2109)")

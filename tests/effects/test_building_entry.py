@@ -92,7 +92,7 @@ def test_it_needs_a_map_a_frequency_and_links_indoors(indoors, make_links):
     assert "0 links" in BuildingEntry().unavailable(indoors.select(np.arange(80) >= 40))
 
 
-@pytest.mark.parametrize("more_db, message", [(0.0, None), (-30.0, "amplify"), (60.0, "99 %")])
+@pytest.mark.parametrize("more_db, message", [(0.0, None), (-30.0, "amplify"), (-15.0, "lose 0.2 dB only"), (60.0, "99 %")])
 def test_what_no_building_does_is_implausible(more_db, message):
     params = BuildingEntry.Params(building="traditional", frequency_hz=2.4e9)
     reason = BuildingEntry().implausible(params, np.array([more_db]))
