@@ -22,6 +22,7 @@ ROOT = Path(__file__).parents[1]
 def handlers(monkeypatch):
     monkeypatch.setattr(sys, "argv", ["radiotwin", "fit", "links.csv"])
     before = {number: signal.getsignal(number) for number in (*signals.NUMBERS, signal.SIGALRM)}
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # ignored, where the tests run under nohup
     hook = sys.unraisablehook
     yield
     sys.unraisablehook = hook
@@ -55,6 +56,15 @@ def test_an_error_is_one_message_and_a_status(work, status, message, capsys):
     assert exit_status(work, "all is kept") == status
     said = capsys.readouterr().err
     assert message in said and len(said.splitlines()) == bool(message)
+
+
+def test_under_nohup_a_hang_up_stops_nothing():
+    def work():
+        os.kill(os.getpid(), signal.SIGHUP)
+        return 0
+
+    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    assert exit_status(work, "all is kept") == 0
 
 
 def test_an_app_is_interrupted_with_a_message(capsys):
