@@ -1,4 +1,4 @@
-"""Is the evidence for a cause what it claims to be? Laplace's approximation against nested sampling: `nested`.
+"""Is evidence what it claims to be? Laplace's approximation against nested sampling: `nested`.
 
 Ten campaigns over open ground with something hidden in them, plain to see or hardly. For each the
 evidence that `close-loop` weighs (radiotwin/closeloop/hypotheses.py), and that of nested sampling
@@ -22,8 +22,8 @@ from radiotwin.effects.base import Effect
 from radiotwin.effects.body_shadowing import BodyShadowing
 from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.fitting import add_effect
-from radiotwin.effects.foliage import Foliage
 from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.foliage import Foliage
 from radiotwin.effects.interference import Interference
 from radiotwin.effects.position_errors import DevicePositionError
 from radiotwin.inference.censored_regression import FitResult
