@@ -72,7 +72,7 @@ def compare(seed: int, settings: dict) -> dict:
     from dynesty import NestedSampler
 
     kind, size = CASES[settings["case"]]
-    world = worlds.fly(seed)
+    world = worlds.fly(seed, limit_db=-200.0)  # none is blank
     hide(world, kind, size)
     kept = worlds.measured(world).select(world.slot % EVERY == 0)
     links = prepare_links(kept, None)
@@ -104,8 +104,8 @@ Sampled = tuple[Callable[[np.ndarray], float], np.ndarray, np.ndarray]
 
 
 def _without(hypotheses: Hypotheses) -> Sampled:
-    return _of(hypotheses, lambda numbers: (hypotheses.base_z, np.zeros((len(hypotheses.base_z), 0)),
-                                            np.zeros(0)), np.zeros(0), np.zeros(0))
+    nothing = hypotheses.base_z, np.zeros((len(hypotheses.base_z), 0)), np.zeros(0)
+    return _of(hypotheses, lambda numbers: nothing, np.zeros(0), np.zeros(0))
 
 
 def _with(hypotheses: Hypotheses, whole: FoldModel, fit: FitResult) -> Sampled:
