@@ -34,11 +34,11 @@ LAYERS = (
     {"frames", "display"},
     {"measurement_columns"},
     {"execution"},
-    {"array_file", "geodesy", "llvm", "safe_xml", "cells", "progress", "published", "records", "hdf5",
+    {"array_file", "geodesy", "llvm", "cuda", "safe_xml", "cells", "progress", "published", "records", "hdf5",
      "threads", "processes"},
     {"pieces"},
     {"console", "csv_layout"},
-    {"content_hash", "files", "inputs", "plugins", "spreadsheet", "tables", "texts"},
+    {"content_hash", "files", "inputs", "plugins", "spreadsheet", "tables", "texts", "trial_link"},
     {"budgets", "interruption"},
     {"errors", "signals"},
 )
