@@ -46,8 +46,8 @@ def build_scene(
 
     Args:
         source: map (`.osm`, `.osm.pbf`, `.geojson`, `.gpkg`, `.parquet`, `.shp`, `.city.json`,
-            `.gml`), model (`.obj`, `.glb`, `.gltf`, `.stl`, `.ply`), Mitsuba or Sionna RT XML file, `sionna:NAME`,
-            or `preset:NAME`, which takes no option but `check_only`.
+            `.gml`), model (`.obj`, `.glb`, `.gltf`, `.stl`, `.ply`), Mitsuba or Sionna RT XML file,
+            `sionna:NAME`, or `preset:NAME`, which takes no option but `check_only`.
         folder: scene folder to write; a scene that is already in it is replaced. None:
             `scenes/NAME`.
         frequency_hz: of the scene's radio [Hz]; None: 2.4 GHz.
