@@ -7,6 +7,7 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.frames import is_same_frame, place
+from radiotwin.links.heights import height_notes
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 
@@ -139,7 +140,8 @@ def _off_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
             "feet and degrees are not converted")
     return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}"
             for odd, where in ((inside, f"inside a building: {INDOORS}"),
-                               (below, f"below the ground: {BURIED}")) if odd.any()]
+                               (below, f"below the ground: {BURIED}"))
+            if odd.any()] + height_notes(receiver_m, scene)
 
 
 def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,
