@@ -59,7 +59,6 @@ def test_heights_above_the_ground_that_were_imported_as_altitudes(run, folder, t
     """Flown above hills of 500 m: taken for altitudes above the sea they are below the ground."""
     shutil.copytree(folder / "scene", tmp_path / "scene")
     assert run("survey scene --truth segmented --flights 1 -o measurements.csv", cwd=tmp_path).returncode == 0
-    datum_m = tomllib.loads((tmp_path / "scene" / "scene.toml").read_text())["terrain"]["datum_m"]
     table = pd.read_csv(tmp_path / "measurements.csv")
     assert run("fit measurements.csv --scene scene --model log_distance -o right", cwd=tmp_path).stderr.count("below the ground") == 0
     ground_m = hills(table["receiver_x_m"], table["receiver_y_m"])
