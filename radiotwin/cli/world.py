@@ -11,6 +11,7 @@ from radiotwin.cli.options import (
     OnlyDevices,
     PointsFile,
     Quality,
+    Radius,
     RaySeed,
     SceneFolder,
     TargetDb,
@@ -47,6 +48,7 @@ def trace(
         help="paths (gain at points) or map (mean over lattice cells).")] = "paths",
     combining: Combining = "power",
     devices: OnlyDevices = None,
+    radius: Radius = None,
     seed: RaySeed = 1,
     workers: Workers = "auto",
     cluster: Cluster = None,
@@ -63,7 +65,7 @@ def trace(
 
     scene, names = Scene.load(folder), split_names(devices)
     settings = _settings(scene, scene.lattice.positions_m, names, quality, target_db, solver=solver,
-                         combining=combining, seed=seed)
+                         combining=combining, seed=seed, radius_m=radius)
     if plan:
         _print_plan(scene, settings, names)
         return
@@ -108,6 +110,7 @@ def gains(
         "--sum", help="power (of the paths' powers) or coherent (of their fields).")] = "power",
     quality: Quality = None,
     target_db: TargetDb = None,
+    radius: Radius = None,
     seed: RaySeed = 1,
     workers: Workers = "auto",
     cluster: Cluster = None,
@@ -123,7 +126,8 @@ def gains(
 
     scene, names = Scene.load(folder), split_names(devices)
     points_m = read_points(points, scene.config.origin, scene.city)
-    settings = _settings(scene, points_m, names, quality, target_db, combining=combining, seed=seed)
+    settings = _settings(scene, points_m, names, quality, target_db, combining=combining, seed=seed,
+                         radius_m=radius)
     with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
         table = trace_points(scene, points_m, settings, out, names, executor)
     notice(pieces.progress)
@@ -174,7 +178,7 @@ def _speeds(text: str) -> list[float]:
 
 
 def _settings(scene: "Scene", points_m: "np.ndarray", devices: list[str] | None,
-              quality: str | None, target_db: float | None, **others: str | int
+              quality: str | None, target_db: float | None, **others: str | int | float | None
               ) -> "SolverSettings":
     """Return the settings of a quality, or those that reach a target, with what they cost."""
     from radiotwin.pieces import keep_pieces
