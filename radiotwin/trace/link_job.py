@@ -126,6 +126,9 @@ class SolveTiles:
     """Gains along paths in the part of the city that a piece reaches.
 
     The solver of the last tile is kept, as neighbouring pieces may share it.
+
+    Attributes:
+        shapes: Number of shapes in that tile.
     """
 
     def __init__(self, scene: Scene, settings: SolverSettings) -> None:
@@ -133,6 +136,7 @@ class SolveTiles:
         self._frequency_hz, self._settings = scene.config.radio.frequency_hz, settings
         self._solved: tuple[Tile | None, int] | None = None
         self._solver: Any = None
+        self.shapes = 0
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_solved": None, "_solver": None}
@@ -148,7 +152,9 @@ class SolveTiles:
         if self._solved != (piece.tile, piece.batch_receivers):
             self._solver = None  # frees the last one's memory first
             settings = replace(self._settings, batch_receivers=piece.batch_receivers)
-            part = self._city.part(self._city.near(piece.tile))
+            kept = self._city.near(piece.tile)
+            self.shapes = int(kept.sum())
+            part = self._city.part(kept)
             self._solver = PathGains(part or None, self._frequency_hz, settings)
             self._solved = piece.tile, piece.batch_receivers
         return self._solver.gains(piece.device_m, piece.points_m, piece.antennas)
