@@ -9,8 +9,8 @@ from radiotwin.scene.materials import Material
 from radiotwin.scene.reader import read_city
 from radiotwin.scene.writer import CityShape
 from radiotwin.trace import SolverSettings, trace_gains, trace_map
+from radiotwin.trace.lattice_gains import lattice_pieces
 from radiotwin.trace.tiles import (
-    MANY_SHAPES,
     PackedCity,
     batches_by_place,
     longest_path_m,
@@ -109,15 +109,25 @@ def test_no_points_no_batches():
     assert batches_by_place(np.zeros((0, 3)), 40) == []
 
 
-def test_small_cities_are_traced_whole_and_large_ones_by_tiles(small_scene, own_scene):
+def test_small_cities_are_traced_whole_and_large_ones_by_tiles(small_scene, own_scene, monkeypatch):
     settings = SolverSettings()
     assert with_radius(small_scene, settings) is settings
-    for number in range(MANY_SHAPES + 1):
-        (own_scene.folder / "meshes" / f"more-{number}.ply").touch()
+    monkeypatch.setattr("radiotwin.trace.tiles.MANY_SHAPES", 3)
     assert with_radius(own_scene, settings).radius_m == 400.0
     for given in (float("inf"), 50.0):
         assert with_radius(own_scene, SolverSettings(radius_m=given)).radius_m == given
     assert with_radius(own_scene, SolverSettings(solver="map")).radius_m is None
+
+
+def test_what_is_solved_together_in_a_small_city_stays_as_it_was(small_scene):
+    """Its gains stay the same to the bit: consecutive positions, of the whole city, under the same names."""
+    for settings in (SolverSettings(), SolverSettings(radius_m=float("inf"))):
+        pieces, order = lattice_pieces(small_scene, settings, [1])
+        lattice_m = small_scene.lattice.positions_m
+        assert order.tolist() == list(range(len(lattice_m)))
+        assert [piece.name for piece in pieces][:2] == ["device-001-batch-00000", "device-001-batch-00001"]
+        assert all(piece.tile is None for piece in pieces)
+        assert all(np.array_equal(piece.points_m, lattice_m[100 * k:100 * k + 100]) for k, piece in enumerate(pieces))
 
 
 def test_a_whole_city_has_the_same_key_as_ever():
