@@ -1,7 +1,8 @@
 """Cities by tiles: costs in 2,000 and in 50,000 buildings, and what a radius leaves out: `regions`.
 
 The cities are those of `studies.region_city`, built once by `radiotwin build-scene` and kept in
-`build/regions`. Receivers are drawn from the lattice within 1 km of each device.
+`build/regions`. Receivers lie within 1 km of each device: drawn all over it for the costs, in
+patches of neighbouring lattice positions for the error, as those of a map.
 """
 
 import json
@@ -14,12 +15,18 @@ import numpy as np
 import pandas as pd
 
 from radiotwin import Scene, SolverSettings
-from radiotwin.execution import Executor
 from radiotwin.execution.worker import peak_bytes
 from radiotwin.files import atomic_path
+from radiotwin.scene.reader import read_city
 from radiotwin.trace import trace_gains
 from radiotwin.trace.link_job import Links, SolveTiles, link_pieces
-from radiotwin.trace.tiles import RADIUS_M, batches_by_place
+from radiotwin.trace.tiles import (
+    RADIUS_M,
+    PackedCity,
+    batches_by_place,
+    longest_path_m,
+    tile_of,
+)
 from studies.load import run_measured
 from studies.region_city import city_footprints, write_map
 from studies.runner import Study
@@ -36,8 +43,8 @@ def region_cases(seed: int) -> dict[str, dict]:
     cost = {"part": "cost", "quality": "fast", "devices": 10, "radius_m": RADIUS_M}
     return {"2,000 buildings": cost | {"buildings": 2_000, "links": 1_000},
             "50,000 buildings": cost | {"buildings": 50_000, "links": 1_000},
-            "error": {"part": "error", "buildings": 2_000, "links": 200, "quality": "default",
-                      "devices": 2, "radii_m": list(RADII_M)}}
+            "error": {"part": "error", "buildings": 2_000, "quality": "default", "devices": 4,
+                      "patches": 2, "receivers": 20, "radii_m": list(RADII_M)}}
 
 
 def measure_region(seed: int, settings: dict) -> dict:
@@ -74,6 +81,16 @@ def _points(scene: Scene, device: int, count: int, size: int, seed: int) -> np.n
     rng = np.random.default_rng([seed, device])
     drawn_m = near_m[rng.choice(len(near_m), min(count, len(near_m)), replace=False)]
     return drawn_m[np.concatenate(batches_by_place(drawn_m, size))]
+
+
+def _patches(scene: Scene, device: int, count: int, size: int, seed: int) -> list[np.ndarray]:
+    """Draw patches (size, 3) of neighbouring outdoor lattice positions near a device [m]."""
+    lattice_m = scene.lattice.positions_m[~scene.blocked.ravel()]
+    near_m = lattice_m[np.linalg.norm(lattice_m - scene.device_m[device], axis=1) < REACH_M]
+    rng = np.random.default_rng([seed, device])
+    middles_m = near_m[rng.choice(len(near_m), count, replace=False)]
+    return [near_m[np.argsort(np.linalg.norm(near_m - middle_m, axis=1), kind="stable")[:size]]
+            for middle_m in middles_m]
 
 
 def measure_cost(seed: int, settings: dict) -> dict:
@@ -114,23 +131,28 @@ def measure_error(seed: int, settings: dict) -> dict:
         By radius, and of a second seed in the whole city (`noise`): links detected in both, 50th
         and 90th percentile of the differences [dB], and the share of links detected in one only.
     """
-    solver = SolverSettings.of_quality(settings["quality"], seed=2 * seed + 1)
     scene = Scene.load(_folder(settings["buildings"], seed) / "scene")
-    points_m = [_points(scene, device, settings["links"] // settings["devices"],
-                        solver.batch_receivers, seed) for device in range(settings["devices"])]
+    size = settings["receivers"]
+    links = [(device, patch_m) for device in range(settings["devices"])
+             for patch_m in _patches(scene, device, settings["patches"], size, seed)]
+    first_seed = 2 * seed + 1
 
     def traced(**others: float | int) -> np.ndarray:
-        each = SolverSettings.of_quality(settings["quality"],
-                                         **{"seed": solver.seed, "radius_m": np.inf} | others)
+        solver = SolverSettings.of_quality(settings["quality"], batch_receivers=size, **(
+            {"seed": first_seed, "radius_m": np.inf} | others))
         gain_db = np.concatenate([
-            trace_gains(scene, scene.device_m[device][None], some_m, each, executor=Executor())[0]
-            for device, some_m in enumerate(points_m)])
+            trace_gains(scene, scene.device_m[device][None], patch_m, solver)[0]
+            for device, patch_m in links])
         return np.where(gain_db >= scene.config.gain_limit_db, gain_db, np.nan)
 
+    city = PackedCity.of(read_city(scene.xml_path))
     whole_db = traced()
-    found = {"noise": _compared(whole_db, traced(seed=solver.seed + 1))}
+    found = {"noise": _compared(whole_db, traced(seed=first_seed + 1))}
     for radius_m in settings["radii_m"]:
-        found[f"{radius_m:g}"] = _compared(whole_db, traced(radius_m=radius_m))
+        kept = [city.near(tile_of(scene.device_m[device], patch_m, radius_m,
+                                  longest_path_m(scene))).mean() for device, patch_m in links]
+        found[f"{radius_m:g}"] = _compared(whole_db, traced(radius_m=radius_m)) | {
+            "kept_share": float(np.mean(kept))}
     return {"links": len(whole_db), "errors": found}
 
 
@@ -159,10 +181,11 @@ def region_table(rows: pd.DataFrame) -> str:
     errors = rows[rows["settings"].map(lambda settings: settings["part"]) == "error"]
     for _, row in errors.iterrows():
         text.append(markdown(
-            ["against the whole city", "links", "median [dB]", "9 of 10 within [dB]", "mean [dB]",
-             "within 0.1 dB", "detected in one only"],
+            ["against the whole city", "shapes kept", "links", "median [dB]",
+             "9 of 10 within [dB]", "mean [dB]", "within 0.1 dB", "detected in one only"],
             [[f"radius {name} m" if name != "noise" else "whole city, another seed",
-              f"{one['links']:,}", f"{one['median_db']:.3f}", f"{one['p90_db']:.2f}",
+              f"{100 * one.get('kept_share', 1.0):.0f} %", f"{one['links']:,}",
+              f"{one['median_db']:.3f}", f"{one['p90_db']:.2f}",
               f"{one['mean_db']:+.3f}", f"{100 * one['within_share']:.0f} %",
               f"{100 * one['one_only_share']:.1f} %"] for name, one in row["errors"].items()],
             f"Error of a radius, seed {row['seed']}",

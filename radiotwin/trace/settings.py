@@ -59,6 +59,7 @@ class SolverSettings:
         radius_m: Culling radius [m]: what lies farther from the lines of a batch's links is left
             out (`paths` only, see `radiotwin.trace.tiles`); infinite: nothing is. None: nothing of
             a city of up to 5,000 shapes, else 400 m.
+        compute_device: `cpu`, or `cuda`: a GPU, whose gains differ from the processor's.
     """
 
     solver: Literal["paths", "map"] = "paths"
@@ -71,9 +72,11 @@ class SolverSettings:
     combining: Literal["power", "coherent"] = "power"
     seed: int = 1
     radius_m: float | None = None
+    compute_device: Literal["cpu", "cuda"] = "cpu"
 
     def __post_init__(self) -> None:
-        for name, allowed in (("solver", ("paths", "map")), ("combining", ("power", "coherent"))):
+        for name, allowed in (("solver", ("paths", "map")), ("combining", ("power", "coherent")),
+                              ("compute_device", ("cpu", "cuda"))):
             if getattr(self, name) not in allowed:
                 raise BadInput(f"{name} = {getattr(self, name)!r} is unknown; allowed are "
                                f"{', '.join(allowed)}")
@@ -128,9 +131,14 @@ class SolverSettings:
         return int(MEMORY_MARGIN * (2**29 + 36 * rays))
 
     def attributes(self) -> dict[str, Any]:
-        """Return all that decides a gain, as attributes of a NetCDF file (without booleans)."""
+        """Return all that decides a gain, as attributes of a NetCDF file (without booleans).
+
+        The processor is not among them: maps of it are the same on every machine.
+        """
         own = {name: int(value) if isinstance(value, bool) else value
                for name, value in asdict(self).items()
                if name != "radius_m" or self.is_tiled}
+        if self.compute_device == "cpu":
+            del own["compute_device"]
         return own | {"table_size": TABLE_SIZE, "diffraction_probability": DIFFRACTION_PROBABILITY,
                       "paths_counted": "once"}

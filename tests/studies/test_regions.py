@@ -46,9 +46,9 @@ def test_costs_are_shown_beside_those_of_the_smaller_city():
     results = {"2,000 buildings": {"link_ms": 10.0}, "50,000 buildings": {"link_ms": 12.0}}
     rows = [{"name": name, "seed": 0, "settings": settings, "cpu_s": 1.0, "results": {
         "build": build, "links": 200} | (
-        {"errors": {"noise": error, "400": error}} if settings["part"] == "error" else
+        {"errors": {"noise": error, "400": error | {"kept_share": 0.3}}} if settings["part"] == "error" else
         {"read_s": 3.0, "shapes": 700.0, "peak_gib": 2.0} | results[name])} for name, settings in region_cases(0).items()]
     table = region_table(read_frame(rows))
     assert "| 50,000 buildings | 0 | 10 | 5 | 480 | 3.0 | 200 | 700 | 12.0 | 1.20 | 2.00 |" in table
-    assert "| radius 400 m | 190 | 0.010 | 0.09 | -0.020 | 91 % | 0.5 % |" in table
-    assert "| whole city, another seed | 190 |" in table
+    assert "| radius 400 m | 30 % | 190 | 0.010 | 0.09 | -0.020 | 91 % | 0.5 % |" in table
+    assert "| whole city, another seed | 100 % | 190 |" in table
