@@ -4,6 +4,7 @@ import contextlib
 import io
 import os
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ import pytest
 
 from radiotwin import console, signals
 from radiotwin.cli import main
+from tests.cli.strangers import FIT, MAP, SECRET, SURVEY
 
 COMMAND = Path(sys.executable).with_name("radiotwin")
 COLUMNS = 100
@@ -61,3 +63,21 @@ def run_installed():
         return subprocess.run([str(COMMAND), *shlex.split(arguments)], cwd=cwd, capture_output=True, text=True,
                               timeout=300, env=os.environ | {"COLUMNS": str(COLUMNS)})
     return run_installed
+
+
+@pytest.fixture(scope="session")
+def scene_to_map(run, tmp_path_factory):
+    """A folder with a scene, a survey of it (m.csv), a twin, and a map."""
+    folder = tmp_path_factory.mktemp("scene-to-map")
+    for command in ("build-scene preset:small -o scene", SURVEY.replace("out", "m"), FIT.replace("out", "twin"),
+                    MAP.replace("out", "map")):
+        assert run(command, folder).returncode == 0
+    return folder
+
+
+@pytest.fixture
+def strangers_folder(scene_to_map, tmp_path):
+    """A copy of them, beside a secret."""
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "outside" / "secret").write_text(SECRET)
+    return shutil.copytree(scene_to_map, tmp_path / "work", ignore=shutil.ignore_patterns("cache"))
