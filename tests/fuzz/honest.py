@@ -93,19 +93,11 @@ def make_honest(folder: Path) -> None:
     with one_core():
         for line in COMMANDS:
             run_here(line, folder)
-            if line.startswith("radiotwin build-scene preset"):
-                _keep_one_unknown(folder / "scene" / "scene.toml")
     _declare_antennas(folder / "scene")
     _write_effects(folder)
     table = pd.read_csv(folder / "survey" / "measurements.csv")
     table.to_csv(folder / "survey" / "packed.csv.gz", index=False)
     table.to_parquet(folder / "survey" / "table.parquet", index=False)
-
-
-def _keep_one_unknown(path: Path) -> None:
-    """Make all devices but one anchors: each that is searched for takes seconds."""
-    text = path.read_text()
-    path.write_text(text.replace('"unknown"', '"anchor"', text.count('"unknown"') - 1))
 
 
 def _write_survey(folder: Path) -> None:

@@ -42,33 +42,18 @@ def cases():
     return st.sampled_from([target for target in TARGETS if not target.slow]).flatmap(of)
 
 
-def keeps_the_rule(run, case):
+@settings(max_examples=200, deadline=None, derandomize=True, database=None, phases=(Phase.generate, Phase.shrink),
+          suppress_health_check=list(HealthCheck))
+@given(case=cases())
+def test_damaged_files_keep_the_rule(run, case):
     outcome = run(case)
     assert not outcome.breaches, f"{outcome.breaches}\n{case.dumps()}\n{outcome.output[-2000:]}"
 
 
-def drawn(count):
-    """A decorator: the test is given so many cases, always the same ones."""
-    def decorate(test):
-        return settings(max_examples=count, deadline=None, derandomize=True, database=None, phases=(
-            Phase.generate, Phase.shrink), suppress_health_check=list(HealthCheck))(given(case=cases())(test))
-    return decorate
-
-
-@drawn(60)
-def test_damaged_files_keep_the_rule(run, case):
-    keeps_the_rule(run, case)
-
-
-@pytest.mark.slow
-@drawn(400)
-def test_many_damaged_files_keep_the_rule(run, case):
-    keeps_the_rule(run, case)
-
-
 @pytest.mark.parametrize("case", KNOWN, ids=[f"{case.kind}-{number}" for number, case in enumerate(KNOWN, start=1)])
 def test_what_failed_once_keeps_the_rule(run, case):
-    keeps_the_rule(run, case)
+    outcome = run(case)
+    assert not outcome.breaches, f"{outcome.breaches}\n{outcome.output[-2000:]}"
 
 
 @pytest.mark.parametrize("target", [

@@ -16,8 +16,8 @@ from marl.checkpoint import load_checkpoint
 from marl.options import settings_of
 from tests.command_line import run_planning
 
-SMALL = ("--truth segmented --real-episodes 2 --episodes 20 --batch 4 --replay 20 --flights 4 "
-         "--planner-iterations 100 ")
+SMALL = ("--truth segmented --real-episodes 2 --episodes 40 --batch 8 --replay 40 --flights 8 "
+         "--planner-iterations 300 ")
 
 
 @pytest.fixture(scope="module")
@@ -54,14 +54,14 @@ def test_a_whole_run_writes_everything_and_ends_in_the_table(scene_option, tmp_p
     assert [line.split()[:2] for line in lines] == [["fedqmix", "NN"], ["fedqmix", "log-distance"], ["fedqmix", "the"],
                                                     ["planner", "NN"], ["greedy", "2"], ["random", "0"]]
     # Trained in the truth, every episode of both replicas is a real one, and so are three looks at the policy.
-    assert lines[2].split()[3] == str(2 * 2 * 20 + 3 * 64)
+    assert lines[2].split()[3] == str(160 + 3 * 64)
     folder = tmp_path / "result"
     for name in ("config.json", "metrics.csv", "checkpoint.safetensors", "comparison.csv", "curve.png", "trajectories.png",
                  "flights.csv", "twin/twin.json", "compare/truth/metrics.csv"):
         assert (folder / name).is_file(), name
     assert list((folder / "tensorboard").iterdir())
     config = json.loads((folder / "config.json").read_text())
-    assert config["run"]["real_episodes"] == 2 and config["learner"]["batch"] == 4
+    assert config["run"]["real_episodes"] == 2 and config["learner"]["batch"] == 8
     with (folder / "comparison.csv").open() as file:
         ratios = {(row["method"], row["trained_in"]): float(row["truth_ratio"]) for row in csv.DictReader(file)}
     assert all(0 < ratio <= 1 for ratio in ratios.values()) and ratios["planner", "NN twin"] > ratios["random", ""]
@@ -69,7 +69,7 @@ def test_a_whole_run_writes_everything_and_ends_in_the_table(scene_option, tmp_p
 
 def test_a_killed_run_resumes_to_the_same_result_bit_for_bit(scene_option, tmp_path):
     words = scene_option + SMALL + "--compare false "
-    status, _, err = run_here(words + "--out unbroken", tmp_path)
+    status, _, err = run(words + "--out unbroken", tmp_path)
     assert status == 0, err
     process = start(words + "--out killed", tmp_path)
     checkpoint = tmp_path / "killed" / "checkpoint.safetensors"
@@ -88,9 +88,9 @@ def test_a_killed_run_resumes_to_the_same_result_bit_for_bit(scene_option, tmp_p
         assert one == other
     for name in ("trajectories.png", "curve.png", "twin/twin.json"):
         assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "unbroken" / name).read_bytes()
-    status, _, err = run_here(words + "--out killed --resume --learning-rate 0.1", tmp_path)
+    status, _, err = run(words + "--out killed --resume --learning-rate 0.1", tmp_path)
     assert status == 2 and "--learning-rate 0.1" in err and "0.002" in err
-    status, _, err = run_here(words + "--out killed", tmp_path)
+    status, _, err = run(words + "--out killed", tmp_path)
     assert status == 2 and "--resume" in err
 
 
@@ -99,7 +99,7 @@ def test_a_learner_may_train_in_a_twin_that_follows_paths(small_scene, tmp_path)
     text = scene.read_text()
     unknown = text.count('"unknown"')
     scene.write_text(text.replace('"unknown"', '"anchor"', unknown - 1))  # to look for each takes seconds
-    status, out, err = run_here("--scene scene " + SMALL + "--real-episodes 1 --twin raytrace --compare false "
+    status, out, err = run("--scene scene " + SMALL + "--real-episodes 1 --twin raytrace --compare false "
                            "--algorithm qmix --out result", tmp_path)
     assert status == 0, err
     twin = json.loads((tmp_path / "result" / "twin" / "twin.json").read_text())
