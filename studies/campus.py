@@ -194,7 +194,7 @@ def campus_table(rows: pd.DataFrame) -> str:
               number(max(map(abs, row["azimuth_error_deg"].values()), default=np.nan), 0),
               counted(row["named"])]
              for name in named if name in words for row in [by_name.loc[name]]],
-            title, ", base `twin`, 60 m blocks held out"))
+            title, ", base `twin`; 60 m blocks held out, or what the row says"))
     return "\n\n".join(parts)
 
 
