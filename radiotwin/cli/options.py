@@ -44,6 +44,10 @@ Workers = Annotated[str, typer.Option(
     metavar="auto|N", help="Processes that share the work; 1 is this one. auto: as many as there "
                            "are cores and memory, where it takes long enough. The result is the "
                            "same to the bit.")]
+ComputeDevice = Annotated[str, typer.Option(
+    "--device", metavar="auto|cpu|cuda",
+    help="Where rays are traced: auto takes a GPU where tracing works on one. Gains of a GPU "
+         "differ from the processor's by rounding.")]
 Cluster = Annotated[str | None, typer.Option(
     metavar="auto|ADDRESS", help="Run on Ray: auto starts a cluster on this machine and ends it "
                                  "again, ADDRESS (HOST:PORT) joins one. Needs radiotwin[ray].")]

@@ -8,6 +8,7 @@ import typer
 from radiotwin.cli.options import (
     Cluster,
     Combining,
+    ComputeDevice,
     OnlyDevices,
     PointsFile,
     Quality,
@@ -50,6 +51,7 @@ def trace(
     seed: RaySeed = 1,
     workers: Workers = "auto",
     cluster: Cluster = None,
+    device: ComputeDevice = "auto",
     plan: Annotated[bool, typer.Option(
         "--plan", help="Only estimate time and memory, from a few batches.")] = False,
 ) -> None:
@@ -57,13 +59,15 @@ def trace(
 
     A killed run is resumed, a finished one is reused.
     """
+    from radiotwin.cuda import tracing_device
     from radiotwin.execution import open_executor
     from radiotwin.scene import Scene
     from radiotwin.trace import trace_map, truth_path
 
+    used = tracing_device(device)
     scene, names = Scene.load(folder), split_names(devices)
     settings = _settings(scene, scene.lattice.positions_m, names, quality, target_db, solver=solver,
-                         combining=combining, seed=seed)
+                         combining=combining, seed=seed, compute_device=used)
     if plan:
         _print_plan(scene, settings, names)
         return
@@ -111,19 +115,23 @@ def gains(
     seed: RaySeed = 1,
     workers: Workers = "auto",
     cluster: Cluster = None,
+    device: ComputeDevice = "auto",
 ) -> None:
     """Ray-trace gains at any points.
 
     An empty gain has a reason, such as no path.
     """
+    from radiotwin.cuda import tracing_device
     from radiotwin.execution import open_executor
     from radiotwin.pieces import keep_pieces
     from radiotwin.scene import Scene
     from radiotwin.trace import read_points, trace_points
 
+    used = tracing_device(device)
     scene, names = Scene.load(folder), split_names(devices)
     points_m = read_points(points, scene.config.origin, scene.city)
-    settings = _settings(scene, points_m, names, quality, target_db, combining=combining, seed=seed)
+    settings = _settings(scene, points_m, names, quality, target_db, combining=combining, seed=seed,
+                         compute_device=used)
     with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
         table = trace_points(scene, points_m, settings, out, names, executor)
     notice(pieces.progress)

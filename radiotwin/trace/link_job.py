@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from radiotwin.cuda import share_of_gpu
 from radiotwin.errors import BadInput
 from radiotwin.execution import Job, Resources
 from radiotwin.scene import Scene
@@ -106,7 +107,7 @@ def link_job(scene: Scene, settings: SolverSettings, description: str) -> Job[Li
     Raises:
         BadInput: Antennas, which the solver `map` does not know.
     """
-    resources = Resources(memory_bytes=settings.memory_bytes())
+    resources = _resources(settings)
     if settings.solver == "paths":
         return Job(description, SolveLinks(scene, settings), resources, len, Links.halves,
                    lambda first, second: np.concatenate([first, second]))
@@ -114,6 +115,14 @@ def link_job(scene: Scene, settings: SolverSettings, description: str) -> Job[Li
         raise BadInput(f"{scene.folder / 'scene.toml'} declares antennas, which the solver 'map' "
                        "does not know; use the solver 'paths'")
     return Job(description, SolveCells(scene, settings), resources, len)
+
+
+def _resources(settings: SolverSettings) -> Resources:
+    memory_bytes = settings.memory_bytes()
+    if settings.compute_device == "cpu":
+        return Resources(memory_bytes)
+    # It is the GPU's memory; that of the processor has not been measured.
+    return Resources(memory_bytes, is_bound=False, gpu_share=share_of_gpu(memory_bytes))
 
 
 @dataclass(frozen=True)

@@ -55,6 +55,7 @@ class SolverSettings:
             model: a ray that enters one meets no inner walls, floors or furniture.
         combining: `power` adds the powers of paths (the mean over fading), `coherent` their fields.
         seed: Seed of the interactions that rays take.
+        compute_device: `cpu`, or `cuda`: a GPU, whose gains differ from the processor's.
     """
 
     solver: Literal["paths", "map"] = "paths"
@@ -66,9 +67,11 @@ class SolverSettings:
     refraction: bool = False
     combining: Literal["power", "coherent"] = "power"
     seed: int = 1
+    compute_device: Literal["cpu", "cuda"] = "cpu"
 
     def __post_init__(self) -> None:
-        for name, allowed in (("solver", ("paths", "map")), ("combining", ("power", "coherent"))):
+        for name, allowed in (("solver", ("paths", "map")), ("combining", ("power", "coherent")),
+                              ("compute_device", ("cpu", "cuda"))):
             if getattr(self, name) not in allowed:
                 raise BadInput(f"{name} = {getattr(self, name)!r} is unknown; allowed are "
                                f"{', '.join(allowed)}")
@@ -112,8 +115,13 @@ class SolverSettings:
         return int(MEMORY_MARGIN * (2**29 + 36 * rays))
 
     def attributes(self) -> dict[str, Any]:
-        """Return all that decides a gain, as attributes of a NetCDF file (without booleans)."""
+        """Return all that decides a gain, as attributes of a NetCDF file (without booleans).
+
+        The processor is not among them: maps of it are the same on every machine.
+        """
         own = {name: int(value) if isinstance(value, bool) else value
                for name, value in asdict(self).items()}
+        if self.compute_device == "cpu":
+            del own["compute_device"]
         return own | {"table_size": TABLE_SIZE, "diffraction_probability": DIFFRACTION_PROBABILITY,
                       "paths_counted": "once"}

@@ -37,7 +37,7 @@ def close_loop(run, tmp_path, monkeypatch):
     """Run the command on tables: exit status, standard output and error. Pictures are drawn coarsely, and without the
     search for room between their parts, which would take longer than all else."""
     monkeypatch.setattr("radiotwin.report.style.DPI", 30)
-    monkeypatch.setattr("matplotlib.figure.Figure.get_layout_engine", lambda _: None)
+    monkeypatch.setattr("matplotlib.layout_engine.ConstrainedLayoutEngine.execute", lambda *_: {})
 
     def close_loop(links, devices, arguments="", prepare=None):
         links.to_csv(tmp_path / "measurements.csv", index=False)

@@ -8,9 +8,9 @@ import pytest
 import radiotwin as rt
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
-from tests.worlds import open_ground, predicted_by_the_model_alone
+from tests.worlds import open_ground
 
-__all__ = ["open_ground", "predicted_by_the_model_alone"]
+__all__ = ["open_ground"]
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def view():
 
 
 @pytest.fixture
-def loop(predicted_by_the_model_alone):
+def loop():
     """Close the loop over measurements without a map: names of the effects found, and the first one's parameters."""
     def run(measurements):
         report = rt.make_report(rt.close_loop(measurements, base="log-distance"))
