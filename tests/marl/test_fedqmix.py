@@ -14,11 +14,7 @@ import pytest
 
 from marl.checkpoint import load_checkpoint
 from marl.options import settings_of
-<<<<<<< HEAD
-from tests.command_line import run_planning
-=======
 from radiotwin import cuda
->>>>>>> main
 
 SMALL = ("--truth segmented --real-episodes 2 --episodes 40 --batch 8 --replay 40 --flights 8 "
          "--planner-iterations 300 ")
@@ -39,11 +35,6 @@ def run(words, cwd):
     process = start(words, cwd)
     out, err = process.communicate(timeout=300)
     return process.returncode, out, err
-
-
-def run_here(words, cwd):
-    done = run_planning(shlex.split(words), cwd)
-    return done.returncode, done.stdout, done.stderr
 
 
 def metrics(path):
@@ -136,7 +127,7 @@ def flat(value):
     ("--out result --resume", ["nothing to resume"])])
 def test_bad_input_is_one_message_and_leaves_nothing(words, parts, small_scene, tmp_path):
     given = words if "--scene" in words else f"--scene {shlex.quote(str(small_scene.folder))} --truth segmented {words}"
-    status, out, err = run_here(given, tmp_path)
+    status, out, err = run(given, tmp_path)
     assert status == 2 and "Traceback" not in err and not out
     assert all(part in err for part in parts), err
     assert not list(tmp_path.iterdir())
