@@ -30,7 +30,7 @@ MODULES = {"models": "models", "curve": "learning", "federation": "learning", "t
            "impossible": "impossible", "accuracy": "tracer",
            "campus": "campus", "readings": "campus_learning",
            "away": "campus_learning", "terms": "campus_terms",
-           "workers": "execution", "scheduler": "execution",
+           "workers": "execution", "scheduler": "execution", "regions": "regions",
            "maps": "wrong_maps", "foreign": "foreign", "calibration": "calibration"}
 """Name of a study -> its module in this package."""
 Run = Callable[[int, dict], dict]

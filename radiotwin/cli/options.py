@@ -37,6 +37,9 @@ TargetDb = Annotated[float | None, typer.Option(
          "few links, is within this [dB].")]
 Combining = Annotated[str, typer.Option(
     help="power (sum of the paths' powers) or coherent (sum of their fields).")]
+Radius = Annotated[float | None, typer.Option(
+    help="Leave out what lies farther from the lines of a batch's links [m; 400 in cities of more "
+         "than 5,000 shapes, inf (the whole city) in others].")]
 RaySeed = Annotated[int, typer.Option(min=0, help="Seed of the rays.")]
 FitSeed = Annotated[int, typer.Option(min=0, help="Seed of the fits and the search.")]
 

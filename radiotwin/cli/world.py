@@ -12,6 +12,7 @@ from radiotwin.cli.options import (
     OnlyDevices,
     PointsFile,
     Quality,
+    Radius,
     RaySeed,
     SceneFolder,
     TargetDb,
@@ -48,6 +49,7 @@ def trace(
         help="paths (gain at points) or map (mean over lattice cells).")] = "paths",
     combining: Combining = "power",
     devices: OnlyDevices = None,
+    radius: Radius = None,
     seed: RaySeed = 1,
     workers: Workers = "auto",
     cluster: Cluster = None,
@@ -67,7 +69,8 @@ def trace(
     used = tracing_device(device)
     scene, names = Scene.load(folder), split_names(devices)
     settings = _settings(scene, scene.lattice.positions_m, names, quality, target_db, solver=solver,
-                         combining=combining, seed=seed, compute_device=used)
+                         combining=combining, seed=seed, radius_m=radius,
+                         compute_device=used)
     if plan:
         _print_plan(scene, settings, names)
         return
@@ -112,6 +115,7 @@ def gains(
         "--sum", help="power (of the paths' powers) or coherent (of their fields).")] = "power",
     quality: Quality = None,
     target_db: TargetDb = None,
+    radius: Radius = None,
     seed: RaySeed = 1,
     workers: Workers = "auto",
     cluster: Cluster = None,
@@ -131,7 +135,7 @@ def gains(
     scene, names = Scene.load(folder), split_names(devices)
     points_m = read_points(points, scene.config.origin, scene.city)
     settings = _settings(scene, points_m, names, quality, target_db, combining=combining, seed=seed,
-                         compute_device=used)
+                         radius_m=radius, compute_device=used)
     with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
         table = trace_points(scene, points_m, settings, out, names, executor)
     notice(pieces.progress)
@@ -182,7 +186,7 @@ def _speeds(text: str) -> list[float]:
 
 
 def _settings(scene: "Scene", points_m: "np.ndarray", devices: list[str] | None,
-              quality: str | None, target_db: float | None, **others: str | int
+              quality: str | None, target_db: float | None, **others: str | int | float | None
               ) -> "SolverSettings":
     """Return the settings of a quality, or those that reach a target, with what they cost."""
     from radiotwin.pieces import keep_pieces
