@@ -11,7 +11,7 @@ import xarray as xr
 
 from radiotwin.budgets import DEVICES, MAP_AXIS
 from radiotwin.display.style import GAIN_COLOURS, level_range_db, plain
-from radiotwin.display.summary import Summarised, Summary, count, some, span
+from radiotwin.display.summary import Summary, count, some, span
 from radiotwin.errors import BadInput
 from radiotwin.hdf5 import check_hdf5
 from radiotwin.inputs import open_input
@@ -30,7 +30,7 @@ from radiotwin.map_file import (
     without_cf,
     write_blocks,
 )
-from radiotwin.map_view import map_table, origin_of, pick, plot_values
+from radiotwin.map_view import OverDevices, map_table, pick, plot_values
 from radiotwin.measurement_columns import MAX_COORDINATE_M
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
@@ -47,7 +47,7 @@ _NUMBERS = ("frequency_hz", "gain_limit_db", "origin_latitude_deg", "origin_long
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RadioMap(Summarised):
+class RadioMap(OverDevices):
     """Channel gain over a lattice.
 
     Attributes:
@@ -172,10 +172,6 @@ class RadioMap(Summarised):
         ax.set_title(f"{source}: device {plain(device)} at {altitude_m:g} m")
         return ax
 
-    def to_xarray(self) -> xr.Dataset:
-        """Return a copy of the dataset."""
-        return self.dataset.copy(deep=True)
-
     def to_geodataframe(self) -> "GeoDataFrame":
         """Return a row with a point for each device and position, in metres of the local frame.
 
@@ -193,10 +189,6 @@ class RadioMap(Summarised):
         if not isinstance(other, RadioMap):
             return NotImplemented
         return MapDifference.of(self.dataset, other.dataset)
-
-    def __len__(self) -> int:
-        """Return the number of devices."""
-        return self.dataset.sizes["device"]
 
     @property
     def _summary(self) -> Summary:
@@ -247,24 +239,9 @@ class RadioMap(Summarised):
         return self.dataset.drop_vars(self.variables)
 
     @property
-    def attributes(self) -> dict[str, Any]:
-        """Provenance."""
-        return {str(name): value for name, value in self.dataset.attrs.items()}
-
-    @property
-    def origin(self) -> Origin | None:
-        """Of the local frame; None where it is not known."""
-        return origin_of(self.attributes)
-
-    @property
     def variables(self) -> tuple[str, ...]:
         """`gain_db`, `los` and, of a learned map, `sigma_db`."""
         return tuple(name for name in _VARIABLES if name in self.dataset)
-
-    @property
-    def devices(self) -> list[str]:
-        """Names of the devices."""
-        return [str(name) for name in self.dataset["device"].values]
 
     @property
     def lattice(self) -> Lattice:
