@@ -1,6 +1,6 @@
 """Is evidence what it claims to be? Laplace's approximation against nested sampling: `nested`.
 
-Ten campaigns over open ground with something hidden in them, plain to see or hardly. For each the
+Ten campaigns over open ground with something hidden in them, plain to see or less. For each the
 evidence that `close-loop` weighs (radiotwin/closeloop/hypotheses.py), and that of nested sampling
 over the effect's numbers and the two variances of the rest: exact levels at every draw, dense
 matrices, and a library of its own (dynesty; Speagle 2020, MNRAS 493). `pip install dynesty==3.1.0`.
@@ -35,9 +35,9 @@ from tests import worlds
 
 LIVE_POINTS = 200
 EVERY = 9  # of how many slots one is kept: dense matrices are slow
-CASES = {"a clock, 4 s": ("late", 4), "a clock, 1 s": ("late", 1),
-         "an anchor, 30 m off": ("moved", 30.0), "an anchor, 10 m off": ("moved", 10.0),
-         "a grove, 15 dB": ("grove", 15.0), "a grove, 5 dB": ("grove", 5.0),
+CASES = {"a clock, 8 s": ("late", 8), "a clock, 4 s": ("late", 4),
+         "an anchor, 100 m off": ("moved", 100.0), "an anchor, 60 m off": ("moved", 60.0),
+         "a grove, 15 dB": ("grove", 15.0), "a grove, 10 dB": ("grove", 10.0),
          "a body, 10 dB": ("body", 10.0), "a body, 3 dB": ("body", 3.0),
          "an emitter, -70 dB": ("emitter", -70.0), "an emitter, -80 dB": ("emitter", -80.0)}
 EFFECTS: dict[str, type[Effect]] = {
