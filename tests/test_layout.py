@@ -39,6 +39,7 @@ LAYERS = (
      "threads", "processes"},
     {"pieces"},
     {"console", "csv_layout"},
+    {"sqlite_tables"},
     {"content_hash", "files", "inputs", "plugins", "spreadsheet", "tables", "texts"},
     {"budgets", "interruption"},
     {"errors", "signals"},

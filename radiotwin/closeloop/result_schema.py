@@ -150,6 +150,16 @@ class DetectableRecord(Record):
     pattern: str
 
 
+class ReceiverDifferenceRecord(Record):
+    """How much more one receiver reads than another where both have been."""
+
+    first: str
+    second: str
+    difference_db: ParameterRecord
+    pairs: Whole
+    places: Whole
+
+
 class FoldsRecord(Record):
     """How links were held out."""
 
@@ -176,6 +186,7 @@ class ReportRecord(Record):
     candidates: list[CandidateRecord]
     posterior: list[StepRecord] = Field(default_factory=list)
     detectable: list[DetectableRecord] = Field(default_factory=list)
+    receivers_compared: list[ReceiverDifferenceRecord] = Field(default_factory=list)
     heldout: FoldsRecord
     error: ErrorRecord
     baselines: dict[str, BaselineRecord]
