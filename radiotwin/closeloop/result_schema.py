@@ -132,7 +132,7 @@ class ProbabilityRecord(Record):
 
 
 class StepRecord(Record):
-    """What the residual says at one step of the selection."""
+    """Evidence in the residual at one step of the selection."""
 
     step: Whole
     probabilities: list[ProbabilityRecord]

@@ -11,13 +11,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import shapely
 
 from radiotwin.budgets import COLUMNS, FILE_BYTES
 from radiotwin.errors import BadInput
 from radiotwin.footprints.features import MapFile
-from radiotwin.footprints.gis_files import map_file
+from radiotwin.footprints.gis_files import area_of_wkb, map_file
+from radiotwin.footprints.systems import chosen_system
 from radiotwin.sqlite_tables import open_tables, require_table, scan, stored_columns
 
 _KINDS = ("POLYGON", "MULTIPOLYGON", "GEOMETRY", "GEOMETRYCOLLECTION", "SURFACE", "MULTISURFACE",
@@ -25,11 +25,12 @@ _KINDS = ("POLYGON", "MULTIPOLYGON", "GEOMETRY", "GEOMETRYCOLLECTION", "SURFACE"
 _ENVELOPE_DOUBLES = (0, 4, 6, 6, 8)  # of a geometry's header, by its code
 
 
-def read_geopackage(path: Path) -> MapFile:
+def read_geopackage(path: Path, crs: str | None = None) -> MapFile:
     """Read the polygons of all layers of a GeoPackage, in any coordinate reference system.
 
     Args:
         path: `.gpkg` file.
+        crs: coordinate reference system of layers whose own is undefined; None: refuse them.
 
     Returns:
         The buildings, layer by layer.
@@ -43,7 +44,7 @@ def read_geopackage(path: Path) -> MapFile:
         with open_tables(path, "GeoPackage") as database:
             for layer, geometry, srs in _layers(database):
                 rows = _rows(path, database, layer, geometry)
-                part = map_file(path, rows, _system(database, srs))
+                part = map_file(path, rows, chosen_system(path, _system(database, srs), crs))
                 found.features += part.features
                 found.left_out += part.left_out
     except (sqlite3.Error, shapely.errors.GEOSException, OverflowError) as error:
@@ -94,8 +95,7 @@ def _area(blob: Any) -> Any:
     extended, empty, code = flags & 32, flags & 16, (flags >> 1) & 7
     if extended or empty or code >= len(_ENVELOPE_DOUBLES):
         return None
-    area = shapely.from_wkb(blob[8 + 8 * _ENVELOPE_DOUBLES[code]:])
-    return shapely.force_2d(area) if np.isfinite(shapely.get_coordinates(area)).all() else None
+    return area_of_wkb(blob[8 + 8 * _ENVELOPE_DOUBLES[code]:])
 
 
 def _system(database: sqlite3.Connection, number: int) -> str | None:

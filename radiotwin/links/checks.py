@@ -7,6 +7,7 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.frames import is_same_frame, place
+from radiotwin.links.heights import height_notes
 from radiotwin.links.indoors import POSITION_SD_M, SURE, chance_inside
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
@@ -143,7 +144,8 @@ def _off_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
     sure = f"{deep.sum():,} of them surely, with positions off by {POSITION_SD_M:g} m"
     return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}"
             for odd, where in ((inside, f"inside a building ({sure}): {INDOORS}"),
-                               (below, f"below the ground: {BURIED}")) if odd.any()]
+                               (below, f"below the ground: {BURIED}"))
+            if odd.any()] + height_notes(receiver_m, scene)
 
 
 def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,
