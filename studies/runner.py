@@ -25,6 +25,7 @@ MODULES = {"models": "models", "curve": "learning", "federation": "learning", "t
            "options": "learning", "twin": "twins", "quality": "twins", "pays": "disturbances",
            "hidden": "closeloop", "null": "closeloop", "towers": "twins",
            "real": "closeloop_real", "tracer": "tracer", "speed": "speed", "load": "load",
+           "growth": "growth",
            "kill": "kill", "flower": "flower", "paths": "path_list", "engine": "engine",
            "impossible": "impossible", "accuracy": "tracer",
            "campus": "campus", "readings": "campus_learning",

@@ -38,5 +38,5 @@ def test_the_note_says_how_many_surely_are(block):
     ground = trimesh.creation.box(extents=(400, 400, 0.2))
     city = CityMap(*trimesh.util.append_faces([ground.vertices, block.vertices], [ground.faces, block.faces]))
     receiver_m = np.array([[0.0, 0, 1.5], [29.0, 0, 1.5], [0.0, 19.0, 1.5], [60.0, 0, 1.5], [0.0, 90, 1.5]])
-    (note,) = check_positions(receiver_m, np.array([[100.0, 100.0, 10.0]]), SimpleNamespace(city=city))
+    (note,) = check_positions(receiver_m, np.array([[100.0, 100.0, 10.0]]), SimpleNamespace(city=city, config=SimpleNamespace(origin=None)))
     assert note.startswith("3 of 5 links have their receiver inside a building (1 of them surely, with positions off by 4 m)")
