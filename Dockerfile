@@ -16,6 +16,8 @@ COPY scenes ./scenes
 RUN pip install -c constraints.txt '.[all]'
 
 FROM python:3.11-slim-bookworm
+# The version of a package would vanish from the archive with its next security update.
+# hadolint ignore=DL3008
 RUN apt-get update \
     && apt-get install -y --no-install-recommends libllvm19 \
     && rm -rf /var/lib/apt/lists/*
@@ -24,7 +26,7 @@ COPY --from=build /opt/radiotwin /opt/radiotwin
 ENV PATH=/opt/radiotwin/bin:$PATH MPLBACKEND=Agg MPLCONFIGDIR=/tmp/matplotlib NUMBA_CACHE_DIR=/tmp/numba \
     XDG_CACHE_HOME=/tmp/cache
 RUN useradd --create-home --uid 1000 radiotwin && install -d -o radiotwin /work
-USER radiotwin
+USER 1000
 WORKDIR /work
 ENTRYPOINT ["radiotwin"]
 CMD ["--help"]

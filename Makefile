@@ -61,7 +61,7 @@ test-flower:
 check: $(INSTALLED)
 	$(BIN)/ruff check
 	$(BIN)/mypy
-	$(PYTEST) -m "not slow and not llvm" $(FAST_TESTS)
+	$(PYTEST) -m "not slow and not llvm and not whole_loop" $(FAST_TESTS)
 
 # In a folder of its own, where the examples leave what they make.
 docs: $(INSTALLED)

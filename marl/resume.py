@@ -1,4 +1,4 @@
-"""What a run goes on from, checked against the mission before it is used."""
+"""State that a run resumes from, checked against the mission before it is used."""
 
 import math
 from pathlib import Path

@@ -18,9 +18,10 @@ from marl.randomness import stream
 from marl.registry import learner_class
 from marl.settings import LearnerSettings, RunSettings
 from marl.sizes import check_sizes
-from marl.threads import keep_memory, limit_threads, torch_device
+from marl.threads import keep_memory, limit_threads
 from radiotwin.cells import write_csv
 from radiotwin.console import print_rows
+from radiotwin.cuda import torch_device
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_file, atomic_path, is_temporary
 from radiotwin.inputs import read_bytes, read_json, require_plain

@@ -1,4 +1,4 @@
-"""Threads, memory and device of a process that trains."""
+"""Threads and memory of a process that trains."""
 
 import ctypes
 import sys
@@ -6,8 +6,6 @@ import sys
 import scipy.linalg  # noqa: F401  compiled code uses its BLAS, limited only once it is loaded
 import threadpoolctl
 import torch
-
-from radiotwin.errors import BadInput
 
 
 def limit_threads(count: int) -> None:
@@ -28,15 +26,3 @@ def keep_memory() -> None:
         mmap_threshold, trim_threshold = -3, -1  # M_MMAP_THRESHOLD, M_TRIM_THRESHOLD of malloc.h
         ctypes.CDLL(None).mallopt(mmap_threshold, 32 << 20)
         ctypes.CDLL(None).mallopt(trim_threshold, 512 << 20)
-
-
-def torch_device(wanted: str) -> str:
-    """Return the torch device for `auto`, `cpu` or `cuda`.
-
-    Raises:
-        BadInput: `cuda` where there is none.
-    """
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise BadInput("device cuda: torch finds no usable GPU here; leave the option out, or "
-                       "install a CUDA build of torch")
-    return ("cuda" if torch.cuda.is_available() else "cpu") if wanted == "auto" else wanted

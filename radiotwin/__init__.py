@@ -4,7 +4,8 @@
 first used, so that importing the package takes no time.
 """
 
-from importlib import import_module
+import sys
+from importlib import import_module, util
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -113,3 +114,16 @@ def _version() -> str:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+def _hide_folder_coverage() -> None:
+    """Hide a folder `coverage` in the working directory from `import coverage`.
+
+    numba imports that package where there is one, and would take our output folder for it.
+    """
+    found = util.find_spec("coverage") if "coverage" not in sys.modules else None
+    if found is not None and found.origin is None:  # a folder without a module
+        sys.modules["coverage"] = None  # type: ignore[assignment]
+
+
+_hide_folder_coverage()

@@ -89,6 +89,8 @@ ROWS = Budget("ROWS", 50_000_000, "rows", "a table")
 ROW_BYTES = Budget("ROW_BYTES", 16 * 2**20, "bytes in one row", "a CSV file")
 COLUMNS = Budget("COLUMNS", 5_000, "columns", "a table")
 CELLS = Budget("CELLS", 1_000_000_000, "cells", "a table: rows times columns")
+BAG_CHUNK_BYTES = Budget("BAG_CHUNK_BYTES", 256 * 2**20, "bytes",
+                         "one chunk of a ROS bag or MCAP file, after decompression")
 IMPORT_FILES = Budget("IMPORT_FILES", 10_000, "files", "one import: in folders and zip files")
 # Cities
 DEVICES = Budget("DEVICES", 100_000, "devices", "a scene, or a table of devices")

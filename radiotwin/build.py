@@ -39,14 +39,15 @@ def build_scene(
     up: str | None = None, default_height_m: float | None = None,
     height_column: str | None = None, ground_column: str | None = None,
     material_table: MaterialTable | Path | str | None = None,
-    terrain: Path | str | None = None, overpass: bool = False, check_only: bool = False,
+    terrain: Path | str | None = None, crs: str | None = None, overpass: bool = False,
+    check_only: bool = False,
 ) -> BuildReport:
     """Build a scene folder from a map or a city model, and report on it.
 
     Args:
-        source: map (`.osm`, `.osm.pbf`, `.geojson`, `.gpkg`, `.shp`, `.city.json`, `.gml`), model
-            (`.obj`, `.glb`, `.gltf`, `.stl`, `.ply`), Mitsuba or Sionna RT XML file, `sionna:NAME`,
-            or `preset:NAME`, which takes no option but `check_only`.
+        source: map (`.osm`, `.osm.pbf`, `.geojson`, `.gpkg`, `.parquet`, `.shp`, `.city.json`,
+            `.gml`), model (`.obj`, `.glb`, `.gltf`, `.stl`, `.ply`), Mitsuba or Sionna RT XML file,
+            `sionna:NAME`, or `preset:NAME`, which takes no option but `check_only`.
         folder: scene folder to write; a scene that is already in it is replaced. None:
             `scenes/NAME`.
         frequency_hz: of the scene's radio [Hz]; None: 2.4 GHz.
@@ -70,6 +71,7 @@ def build_scene(
         ground_column: of a map: column of the ground's elevation, which is subtracted.
         material_table: of a map: materials of its tags, or the file that declares them.
         terrain: of a map: GeoTIFF of the ground's heights; None: flat ground.
+        crs: of a map: coordinate reference system of a file that names none, as `EPSG:25832`.
         overpass: download the map `source`, an .osm file that does not exist yet, for `bbox`.
         check_only: write nothing, and return errors in the report instead of raising them.
 
@@ -87,14 +89,14 @@ def build_scene(
     of_cities = _given(scale=scale, up=up)
     of_maps = _given(default_height_m=default_height_m, height_column=height_column,
                      ground_column=ground_column, material_table=material_table,
-                     terrain=terrain, overpass=overpass or None)
+                     terrain=terrain, crs=crs, overpass=overpass or None)
     text = str(source)
     if map_suffix(source):
         _refuse(of_cities, f"{source} is a map")
         table = _material_table(material_table, materials or {})
         options = MapOptions(bbox, default_height_m, table,
                              _height_column(height_column, ground_column),
-                             None if terrain is None else Path(terrain))
+                             None if terrain is None else Path(terrain), crs)
         options.check()
         if overpass:
             _download(source, bbox)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from radiotwin.compare import Comparison, compare_models, split_flights
 from radiotwin.comparison_output import write_comparison
+from radiotwin.cuda import Device
 from radiotwin.errors import BadInput
 from radiotwin.report import read_run, write_comparison_figures, write_picture, write_report
 from radiotwin.scene import Scene
@@ -22,6 +23,7 @@ ROOF_MATERIALS = {"sionna:munich": {"metal": "itu_marble", "wood": "itu_brick"}}
 
 
 def run_demo(source: str = "preset:small", folder: Path | str = "demo", *, seed: int = 0,
+             device: Device = "cpu",
              on_progress: Callable[[str], None] = lambda step: None) -> Comparison:
     """Run the chain and write everything into a folder.
 
@@ -29,6 +31,7 @@ def run_demo(source: str = "preset:small", folder: Path | str = "demo", *, seed:
         source: `preset:NAME` or any source of `build_scene`.
         folder: for scene, truth, measurements, twin, comparison and `report.html`.
         seed: of placement, flights and fits.
+        device: where rays are traced.
         on_progress: called with one line about each step.
 
     Raises:
@@ -39,7 +42,8 @@ def run_demo(source: str = "preset:small", folder: Path | str = "demo", *, seed:
     scene = _scene(source, folder / "scene", seed, on_progress)
     on_progress(f"2 tracing {len(scene.config.devices)} devices × "
                 f"{len(scene.lattice.positions_m)} positions with Sionna RT")
-    truth = trace_map(scene, SolverSettings.of_quality("default"), scene.folder / "truth.nc")
+    truth = trace_map(scene, SolverSettings.of_quality("default", compute_device=device),
+                      scene.folder / "truth.nc")
     write_picture(truth, scene, folder / "truth.png")
     on_progress(f"3 flying {FLIGHTS} flights of {len(scene.config.uavs)} UAVs")
     measurements = fly_survey(scene, truth, flights=FLIGHTS, pattern="random-waypoint", seed=seed)

@@ -1,44 +1,23 @@
 """Checks of this machine: what works, and how to mend what does not."""
 
-import math
 import os
 import platform
 import re
 import shutil
-import subprocess
 import sys
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
 
 from rich.console import Console
-from scipy.constants import speed_of_light
 
-from radiotwin import llvm
+from radiotwin import cuda, llvm
 from radiotwin.threads import usable_cores
+from radiotwin.trial_link import FREE_SPACE_GAIN_DB, TOLERANCE_DB, TrialFailed, trace_trial_link
 
 GIB = 2**30
 MIN_MEMORY_GIB = 4  # twice what tracing scenes/rbm takes (docs/results.md)
 MIN_DISK_GIB = 2
-TRACE_TIMEOUT_S = 120  # a first run compiles its kernels
-
-# One link in free space, in a process of its own: a wrong libLLVM may abort it.
-_TRACE = """
-import numpy as np
-from radiotwin import llvm
-llvm.prepare()
-import sionna.rt
-scene = sionna.rt.load_scene()
-scene.frequency = 2.4e9
-one_antenna = sionna.rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
-scene.tx_array = scene.rx_array = one_antenna
-scene.add(sionna.rt.Transmitter("device", [0, 0, 10]))
-scene.add(sionna.rt.Receiver("receiver", [100, 0, 10]))
-real, imaginary = sionna.rt.PathSolver(deterministic=True)(scene, max_depth=0).a
-print(10 * np.log10(float((np.square(real) + np.square(imaginary)).sum())))
-"""
-# Friis' equation for the same link.
-_FREE_SPACE_GAIN_DB = 20 * math.log10(speed_of_light / 2.4e9 / (4 * math.pi * 100))
 _REMEDY = "install the versions of sionna-rt, mitsuba and drjit that constraints.txt names"
 
 Rows = list[tuple[str, str]]
@@ -135,24 +114,14 @@ def _memory_gib() -> float | None:
 
 
 def _check_gpu() -> Rows:
-    """List graphics processors; without one everything runs on the processor."""
-    rows = []
-    if shutil.which("nvidia-smi"):
-        query = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version",
-                 "--format=csv,noheader"]
-        answer = subprocess.run(query, check=False, capture_output=True, text=True)
-        if answer.returncode == 0:
-            rows += [("GPU", line) for line in answer.stdout.strip().splitlines()]
-    if not rows:
-        return [("GPU", "none: everything runs on the processor")]
-    try:
-        import torch  # takes seconds
-
-        used = torch.cuda.is_available()
-        rows.append(("torch", "uses it" if used else
-                     "does not use it (a CPU build, or the driver)"))
-    except (ImportError, OSError) as error:
-        rows.append(("torch", f"cannot be imported: {error}"))
+    """List graphics processors, and what `--device auto` uses."""
+    rows = [("GPU", str(gpu)) for gpu in cuda.gpus()] or [("GPU", "none is listed by nvidia-smi")]
+    for work, refusal in (("tracing", cuda.tracing_refusal), ("training", cuda.torch_refusal)):
+        try:
+            reason = refusal()
+        except (ImportError, OSError) as error:
+            reason = f"torch cannot be imported: {error}"
+        rows.append((work, f"on the processor: {reason}" if reason else "on the GPU"))
     return rows
 
 
@@ -192,19 +161,12 @@ def _check_llvm(diagnosis: Diagnosis) -> Rows:
 def _check_tracing(diagnosis: Diagnosis) -> Rows:
     """Trace one link in free space and compare it with Friis' equation."""
     item = "one link of 100 m at 2.4 GHz"
-    command = [sys.executable, "-P", "-c", _TRACE]
     try:
-        done = subprocess.run(command, check=False, capture_output=True, text=True,
-                              timeout=TRACE_TIMEOUT_S)
-    except subprocess.TimeoutExpired:
-        diagnosis.problems.append(f"tracing one link did not end within {TRACE_TIMEOUT_S} s")
-        return [(item, "did not end")]
-    if done.returncode != 0:
-        complaint = (done.stderr.strip().splitlines() or [f"exit status {done.returncode}"])[-1]
-        diagnosis.problems.append(f"tracing fails ({complaint}): {_REMEDY}")
-        return [(item, f"fails: {complaint}")]
-    gain_db = float(done.stdout.split()[-1])
-    if abs(gain_db - _FREE_SPACE_GAIN_DB) > 0.01:
+        gain_db = trace_trial_link("cpu")
+    except TrialFailed as reason:
+        diagnosis.problems.append(f"tracing fails ({reason}): {_REMEDY}")
+        return [(item, f"fails: {reason}")]
+    if not abs(gain_db - FREE_SPACE_GAIN_DB) <= TOLERANCE_DB:  # NaN, too
         diagnosis.problems.append(f"tracing gives {gain_db:.2f} dB, free space has "
-                                  f"{_FREE_SPACE_GAIN_DB:.2f} dB: {_REMEDY}")
-    return [(item, f"{gain_db:.2f} dB (free space: {_FREE_SPACE_GAIN_DB:.2f} dB)")]
+                                  f"{FREE_SPACE_GAIN_DB:.2f} dB: {_REMEDY}")
+    return [(item, f"{gain_db:.2f} dB (free space: {FREE_SPACE_GAIN_DB:.2f} dB)")]

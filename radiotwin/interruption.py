@@ -1,4 +1,4 @@
-"""What is kept of the work of this process, for the message after Ctrl-C."""
+"""Count of kept parts of this process's work, for the message after Ctrl-C."""
 
 _finished = 0
 

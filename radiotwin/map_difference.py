@@ -9,12 +9,11 @@ import numpy as np
 import xarray as xr
 
 from radiotwin.display.style import DIFFERENCE_COLOURS, plain, residual_range_db
-from radiotwin.display.summary import Summarised, Summary, count, some
+from radiotwin.display.summary import Summary, count, some
 from radiotwin.errors import BadInput
 from radiotwin.frames import is_same_frame, place
-from radiotwin.map_view import map_table, origin_of, pick, plot_values
+from radiotwin.map_view import OverDevices, map_table, origin_of, pick, plot_values
 from radiotwin.scene import Scene
-from radiotwin.tables import Origin
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame
@@ -25,7 +24,7 @@ SAME_M = 1e-3  # positions nearer than this are one [m]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MapDifference(Summarised):
+class MapDifference(OverDevices):
     """Gain of one map minus that of another.
 
     Of a map of distributions (`sigma_db`) the mean counts, also where a link would not be detected;
@@ -83,11 +82,6 @@ class MapDifference(Summarised):
         return self.dataset[NAME].values
 
     @property
-    def devices(self) -> list[str]:
-        """Names of the devices."""
-        return [str(name) for name in self.dataset["device"].values]
-
-    @property
     def rmse_db(self) -> float:
         """Root of the mean square over all links that both maps have [dB]; NaN without one."""
         known = self.difference_db[np.isfinite(self.difference_db)].astype(float)
@@ -98,11 +92,6 @@ class MapDifference(Summarised):
         """Mean over all links that both maps have [dB]; NaN without one."""
         known = self.difference_db[np.isfinite(self.difference_db)].astype(float)
         return float(known.mean()) if len(known) else float("nan")
-
-    @property
-    def origin(self) -> Origin | None:
-        """Of the frame; None where neither map knows it."""
-        return origin_of({str(name): value for name, value in self.dataset.attrs.items()})
 
     def plot(self, device: str | None = None, altitude_m: float | None = None,
              ax: Axes | None = None, *, scene: Scene | None = None,
@@ -132,10 +121,6 @@ class MapDifference(Summarised):
         ax.set_title(f"{names}\ndevice {plain(device)} at {altitude_m:g} m")
         return ax
 
-    def to_xarray(self) -> xr.Dataset:
-        """Return a copy of the dataset."""
-        return self.dataset.copy(deep=True)
-
     def to_geodataframe(self) -> GeoDataFrame:
         """Return a row with a point for each device and position, in metres of the local frame.
 
@@ -143,10 +128,6 @@ class MapDifference(Summarised):
             BadInput: GeoPandas is not installed.
         """
         return map_table(self.dataset, [NAME], self.origin)
-
-    def __len__(self) -> int:
-        """Return the number of devices."""
-        return self.dataset.sizes["device"]
 
     @property
     def _summary(self) -> Summary:

@@ -12,7 +12,7 @@ import xarray as xr
 from radiotwin.display import PlotFrame, geo_data_frame, new_axes
 from radiotwin.display.axes import add_colour_bar, add_legend, draw_cells, draw_points
 from radiotwin.display.style import plain
-from radiotwin.display.summary import some
+from radiotwin.display.summary import Summarised, some
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
 from radiotwin.tables import Origin
@@ -27,6 +27,39 @@ def origin_of(attributes: dict[str, Any]) -> Origin | None:
     found = {name: float(attributes[f"origin_{name}"]) for name in Origin.model_fields
              if f"origin_{name}" in attributes}
     return Origin(**found) if {"latitude_deg", "longitude_deg"} <= found.keys() else None
+
+
+class OverDevices(Summarised):
+    """Base of what has values for each device over a lattice.
+
+    Attributes:
+        dataset: variables with dims (device, z, y, x), coordinates x, y, z [m], provenance.
+    """
+
+    dataset: xr.Dataset
+
+    def __len__(self) -> int:
+        """Return the number of devices."""
+        return self.dataset.sizes["device"]
+
+    @property
+    def devices(self) -> list[str]:
+        """Names of the devices."""
+        return [str(name) for name in self.dataset["device"].values]
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Provenance."""
+        return {str(name): value for name, value in self.dataset.attrs.items()}
+
+    @property
+    def origin(self) -> Origin | None:
+        """Of the local frame; None where it is not known."""
+        return origin_of(self.attributes)
+
+    def to_xarray(self) -> xr.Dataset:
+        """Return a copy of the dataset."""
+        return self.dataset.copy(deep=True)
 
 
 def pick(dataset: xr.Dataset, device: str | None, altitude_m: float | None

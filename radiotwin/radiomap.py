@@ -10,7 +10,7 @@ import numpy as np
 import xarray as xr
 
 from radiotwin.display.style import GAIN_COLOURS, level_range_db, plain
-from radiotwin.display.summary import Summarised, Summary, count, some, span
+from radiotwin.display.summary import Summary, count, some, span
 from radiotwin.map_difference import MapDifference
 from radiotwin.map_file import (
     ATTRIBUTES,
@@ -24,7 +24,7 @@ from radiotwin.map_file import (
     placed_attributes,
 )
 from radiotwin.map_reading import load_dataset, open_dataset
-from radiotwin.map_view import map_table, origin_of, pick, plot_values
+from radiotwin.map_view import OverDevices, map_table, pick, plot_values
 from radiotwin.map_writing import write_parts
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class RadioMap(Summarised):
+class RadioMap(OverDevices):
     """Channel gain over a lattice.
 
     Attributes:
@@ -160,10 +160,6 @@ class RadioMap(Summarised):
         ax.set_title(f"{source}: device {plain(device)} at {altitude_m:g} m")
         return ax
 
-    def to_xarray(self) -> xr.Dataset:
-        """Return a copy of the dataset."""
-        return self.dataset.copy(deep=True)
-
     def to_geodataframe(self) -> "GeoDataFrame":
         """Return a row with a point for each device and position, in metres of the local frame.
 
@@ -181,10 +177,6 @@ class RadioMap(Summarised):
         if not isinstance(other, RadioMap):
             return NotImplemented
         return MapDifference.of(self.dataset, other.dataset)
-
-    def __len__(self) -> int:
-        """Return the number of devices."""
-        return self.dataset.sizes["device"]
 
     @property
     def _summary(self) -> Summary:
@@ -246,24 +238,9 @@ class RadioMap(Summarised):
         return self.dataset.drop_vars(self.variables)
 
     @property
-    def attributes(self) -> dict[str, Any]:
-        """Provenance."""
-        return {str(name): value for name, value in self.dataset.attrs.items()}
-
-    @property
-    def origin(self) -> Origin | None:
-        """Of the local frame; None where it is not known."""
-        return origin_of(self.attributes)
-
-    @property
     def variables(self) -> tuple[str, ...]:
         """`gain_db`, `los` and, of a learned map, `sigma_db`."""
         return tuple(name for name in VARIABLES if name in self.dataset)
-
-    @property
-    def devices(self) -> list[str]:
-        """Names of the devices."""
-        return [str(name) for name in self.dataset["device"].values]
 
     @property
     def lattice(self) -> Lattice:

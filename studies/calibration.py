@@ -1,4 +1,4 @@
-"""What evidence is worth: the loop on cases for calibration, and the regression upon it.
+"""Calibration of evidence: the loop on cases for it, and the regression upon it.
 
 The cases are those of the foreign cities for calibration, with their maps and without; some of
 those of the two traced cities whose maps are right within a survey's error (`tests/undeclared`),

@@ -43,7 +43,9 @@ CONTROLS = {"mirrored": "map mirrored", "shifted": "map shifted by 50 m",
             "permuted": "levels permuted within each sector",
             "permuted-all": "levels permuted over all sectors"}
 LACKING = {"no-heights": "a map without heights: 14 m everywhere",
-           "one-phone": "the readings of one phone", "thinned": "one reading in each 10 m cell"}
+           "one-phone": "the readings of one phone", "thinned": "one reading in each 10 m cell",
+           "thinned-quadrant": "the same, a quadrant of the area held out",
+           "thinned-device": "the same, a sector held out"}
 PHONE, CELL_M = "Pixel", 10.0
 HEIGHT_TAG = re.compile(r'<tag k="(building:)?(min_)?(height|levels?|min_level)" [^>]*>')
 SHIFT_M = 50.0
@@ -89,8 +91,12 @@ def campus_cases(seed: int) -> dict[str, dict]:
     """Return every base held out every way, and controls over a wrong map or wrong levels."""
     cases = {f"{split}-{base}": {"split": split, "base": base, "control": None}
              for split in SPLITS for base in BASES}
-    return cases | {control: {"split": "block", "base": "twin", "control": control}
-                    for control in CONTROLS | LACKING}
+    for name in CONTROLS | LACKING:
+        control, _, split = name.rpartition("-")
+        other = split in SPLITS
+        cases[name] = {"split": split if other else "block", "base": "twin",
+                       "control": control if other else name}
+    return cases
 
 
 def find_on_campus(seed: int, settings: dict) -> dict:
@@ -188,7 +194,7 @@ def campus_table(rows: pd.DataFrame) -> str:
               number(max(map(abs, row["azimuth_error_deg"].values()), default=np.nan), 0),
               counted(row["named"])]
              for name in named if name in words for row in [by_name.loc[name]]],
-            title, ", base `twin`, 60 m blocks"))
+            title, ", base `twin`; 60 m blocks held out, or what the row says"))
     return "\n\n".join(parts)
 
 

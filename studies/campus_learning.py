@@ -97,7 +97,7 @@ def away_table(rows: pd.DataFrame) -> str:
               counted(by_name.loc[name]["named"])] for name in names]
     for kind in ("quadrant", "sector"):
         own = by_name.loc[[name for name in names if name.startswith(kind)]]
-        if len(own):
+        if len(own) == sum(name.startswith(kind) for name in away_cases(0)):
             squares = [np.average([each[model] ** 2 for each in own["rmse_db"]],
                                   weights=own["others"]) for model in models]
             lines.append([f"**all {kind}s**", f"{own['others'].sum():,}",

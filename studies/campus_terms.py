@@ -11,6 +11,7 @@ from radiotwin.channel.followed_paths import interaction_gains
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.effects.sector_antenna import SectorPattern, sector_pattern_db
 from radiotwin.links import LinkData, prepare_links
+from radiotwin.links.indoors import SURE, chance_inside
 from studies.campus import SPLITS, campus
 from studies.closeloop_real import AZIMUTHS_DEG
 from studies.runner import Study
@@ -26,18 +27,33 @@ def by_class(values: np.ndarray, los: np.ndarray) -> np.ndarray:
     return np.column_stack([values * los, values * (1 - los)])
 
 
-def terms_of(links: LinkData, seed: int) -> dict[str, np.ndarray]:
-    """Return columns (n, …) of each term, by name."""
+def quick_terms_of(links: LinkData) -> dict[str, np.ndarray]:
+    """Return columns (n, …) of the terms that no path is followed for, by name."""
     city = links.city
     assert city is not None
     los, decades = links.los.astype(float), np.log10(links.distance_m / 100)
-    device_m = links.device_m[links.device]
     pattern_db = np.zeros(len(links))
     for row, name in enumerate(links.device_names):
         own = links.device == row
         pattern_db[own] = sector_pattern_db(
             links.azimuth_deg[own], np.zeros(own.sum()),
             SectorPattern(azimuth_deg=float(AZIMUTHS_DEG[name])))
+    return {
+        "sector": (links.device[:, None] == np.arange(len(links.device_names))).astype(float),
+        "distance": decades[:, None],
+        "LoS class": np.column_stack([los, decades * los]),
+        "antenna": pattern_db[:, None],
+        "indoors": city.inside(links.receiver_m)[:, None].astype(float),
+        "chance of being indoors": np.where(
+            links.los, 0.0, chance_inside(city, links.receiver_m))[:, None]}
+
+
+def terms_of(links: LinkData, seed: int) -> dict[str, np.ndarray]:
+    """Return columns (n, …) of each term, by name."""
+    city = links.city
+    assert city is not None
+    los, decades = links.los.astype(float), np.log10(links.distance_m / 100)
+    device_m = links.device_m[links.device]
     rng, seen = np.random.default_rng(seed), np.zeros((2, len(links)))
     for _ in range(DRAWS):
         there_m = links.receiver_m + np.append(
@@ -48,16 +64,11 @@ def terms_of(links: LinkData, seed: int) -> dict[str, np.ndarray]:
     gains = interaction_gains(links.geometry)
     diffuse = 10 ** (DIFFUSE_DB / 10) * (links.distance_m / 100) ** -DIFFUSE_EXPONENT
     level_db = {kinds: 10 * np.log10(gains[:, :kinds].sum(axis=1) + diffuse) for kinds in (2, 3)}
-    return {
-        "sector": (links.device[:, None] == np.arange(len(links.device_names))).astype(float),
-        "distance": decades[:, None],
-        "LoS class": np.column_stack([los, decades * los]),
-        "antenna": pattern_db[:, None],
+    return quick_terms_of(links) | {
         "elevation": links.elevation_deg[:, None],
         "metres inside": np.log1p(city.metres_inside(device_m, links.receiver_m))[:, None],
         "woods and parks": np.log1p(city.vegetation.metres_through(device_m, links.receiver_m)
                                     )[:, None],
-        "indoors": city.inside(links.receiver_m)[:, None].astype(float),
         "chance of LoS": np.column_stack([chance, decades * chance]),
         "reflections": by_class(level_db[2], los),
         "reflections, diffraction": by_class(level_db[3], los)}
@@ -75,18 +86,42 @@ MODELS: dict[str, tuple[str, ...]] = {
     "+ all": ("distance", "antenna", "LoS class", "elevation", "metres inside", "woods and parks",
               "indoors", "chance of LoS", "reflections, diffraction")}
 
+INDOORS: dict[str, tuple[str, ...]] = {"+ antenna, LoS class": MODELS["+ antenna, LoS class"]} | {
+    f"+ antenna, LoS class, {extra}": ("distance", "antenna", "LoS class", extra)
+    for extra in ("indoors", "chance of being indoors")}
+
 
 def fit_terms(seed: int, settings: dict) -> dict:
     """Return held-out errors of each model, by split."""
     with campus() as (measured, scene):
         links = prepare_links(measured, scene)
-        terms = terms_of(links, seed)
+        models = INDOORS if settings.get("only") == "indoors" else MODELS
+        terms = quick_terms_of(links) if models is INDOORS else terms_of(links, seed)
     level_db, found = links.level_db, {}
     for way in WAYS:
         fold = make_folds(links, seed, way).index
         found[way] = {name: _rmse_db(np.column_stack([terms["sector"], *(
-            terms[each] for each in columns)]), level_db, fold) for name, columns in MODELS.items()}
-    return {"links": len(links), "los": float(links.los.mean()), "rmse_db": found}
+            terms[each] for each in columns)]), level_db, fold) for name, columns in models.items()}
+    result = {"links": len(links), "los": float(links.los.mean()), "rmse_db": found}
+    if models is INDOORS:
+        result |= _indoors(level_db, terms)
+    return result
+
+
+def _indoors(level_db: np.ndarray, terms: dict[str, np.ndarray]) -> dict:
+    """Return numbers of links with their receiver indoors, and by how much these are weaker."""
+    chance, told = terms["chance of being indoors"][:, 0], terms["indoors"][:, 0] > 0
+    columns = np.column_stack([terms["sector"], *(
+        terms[each] for each in MODELS["+ antenna, LoS class"])])
+    outdoors = chance == 0
+    weights = np.linalg.lstsq(columns[outdoors], level_db[outdoors], rcond=None)[0]
+    rest_db = level_db - columns @ weights
+    groups = {"indoors by the map, surely": told & (chance >= SURE),
+              "indoors by the map, perhaps": told & (chance < SURE),
+              "outdoors by the map, perhaps indoors": ~told & (chance >= 1 - SURE)}
+    return {"groups": {name: {"links": int(rows.sum()),
+                              "median_db": float(np.median(rest_db[rows]))}
+                       for name, rows in groups.items()}}
 
 
 def _rmse_db(columns: np.ndarray, level_db: np.ndarray, fold: np.ndarray) -> float:
@@ -100,11 +135,21 @@ def _rmse_db(columns: np.ndarray, level_db: np.ndarray, fold: np.ndarray) -> flo
 
 def terms_table(rows: pd.DataFrame) -> str:
     """Return errors by model and split."""
-    found = rows.iloc[0]["rmse_db"]
-    return markdown(["model", *(SPLITS[way] for way in WAYS)],
-                    [[name, *(number(found[way][name], 2) for way in WAYS)] for name in MODELS],
-                    "What each part brings", ": least squares told the azimuths, RMSE [dB]")
+    titles = {"all": "What each part brings", "indoors": "Indoors by the map, or probably"}
+    parts = [markdown(["model", *(SPLITS[way] for way in WAYS)],
+                      [[model, *(number(row["rmse_db"][way][model], 2 + (name == "indoors"))
+                                 for way in WAYS)] for model in row["rmse_db"][WAYS[0]]],
+                      titles[name], ": least squares told the azimuths, RMSE [dB]")
+             for name, row in rows.set_index("name").iterrows()]
+    parts += [markdown(["receiver", "links", "median [dB]"],
+                       [[name, f"{group['links']:,}", number(group["median_db"], 1)]
+                        for name, group in groups.items()],
+                       "Beside walls and behind them",
+                       ": level beside what is predicted outdoors")
+              for groups in rows.get("groups", pd.Series()).dropna()]
+    return "\n\n".join(parts)
 
 
 STUDIES = {"terms": Study("What does each part of the physics bring on a real campus?", fit_terms,
-                          lambda seed: {"all": {}}, terms_table, seeds=1)}
+                          lambda seed: {"all": {}, "indoors": {"only": "indoors"}}, terms_table,
+                          seeds=1)}

@@ -1,4 +1,4 @@
-"""What `close-loop` makes of real measurements, against what is known of them: `real`.
+"""Results of `close-loop` on real measurements, against what is known of them: `real`.
 
 The folder `RADIOTWIN_DATA` (default: `shared/data` beside the checkout) holds `duke_cbrs` and
 `powder_frs`, each with `measurements.csv.gz` and `devices.csv`, and `powder_frs/noise_only.csv`;

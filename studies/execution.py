@@ -1,4 +1,4 @@
-"""What workers cost: `workers`, a trace by one process, by local ones and by Ray; `scheduler`."""
+"""Cost of workers: `workers`, a trace by one process, by local ones and by Ray; `scheduler`."""
 
 import os
 import threading

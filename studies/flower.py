@@ -134,12 +134,13 @@ def _table(rows: pd.DataFrame) -> str:
     for name, group in rows.groupby("name", sort=False):
         each = np.array(group["reward"].tolist())
         first = group.iloc[0]
-        heard, seconds = (first.get(key) for key in ("heard", "seconds"))
+        heard, seconds, difference = (
+            first.get(key) for key in ("heard", "seconds", "largest_difference"))
         lines.append([str(name), str(len(group)), *(with_sd(each[:, party]) for party in range(3)),
                       with_sd(group["mean_reward"].to_numpy()),
                       " ".join(map(str, heard)) if isinstance(heard, list) else "–",
                       number(float(np.median(seconds)), 0) if isinstance(seconds, list) else "–",
-                      str(first.get("largest_difference") or "–")])
+                      difference if isinstance(difference, str) else "–"])
     return markdown(["", "seeds", "RBM", "RDM", "RBM, measured", "mean of the parties",
                      "parties heard in each round (seed 0)", "seconds a round, median",
                      "largest difference of a weight"], lines)

@@ -15,8 +15,8 @@ from marl.flights import Flights
 from marl.mission import Known, make_mission
 from marl.registry import learner_class
 from marl.settings import PRESETS, RUNS, LearnerSettings, RunSettings
-from marl.threads import torch_device
 from radiotwin import Scene, segmented_truth
+from radiotwin.cuda import torch_device
 from radiotwin.progress import progress
 from studies import tables
 from studies.runner import RECORDS, Study, read_rows

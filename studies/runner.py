@@ -25,11 +25,12 @@ MODULES = {"models": "models", "curve": "learning", "federation": "learning", "t
            "options": "learning", "twin": "twins", "quality": "twins", "pays": "disturbances",
            "hidden": "closeloop", "null": "closeloop", "towers": "twins",
            "real": "closeloop_real", "tracer": "tracer", "speed": "speed", "load": "load",
+           "growth": "growth",
            "kill": "kill", "flower": "flower", "paths": "path_list", "engine": "engine",
            "impossible": "impossible", "accuracy": "tracer",
            "campus": "campus", "readings": "campus_learning",
            "away": "campus_learning", "terms": "campus_terms",
-           "workers": "execution", "scheduler": "execution",
+           "workers": "execution", "scheduler": "execution", "regions": "regions",
            "maps": "wrong_maps", "foreign": "foreign", "calibration": "calibration"}
 """Name of a study -> its module in this package."""
 Run = Callable[[int, dict], dict]

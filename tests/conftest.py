@@ -4,7 +4,9 @@ import uuid
 
 import pytest
 
-from radiotwin import llvm
+from radiotwin import cuda, llvm
+
+GPU_TRIALS = {"tracing": cuda.tracing_refusal, "training": cuda.torch_refusal}
 
 
 def pytest_collection_modifyitems(items):
@@ -12,6 +14,11 @@ def pytest_collection_modifyitems(items):
     if needs_llvm and not llvm.available():
         for item in needs_llvm:
             item.add_marker(pytest.mark.skip(reason="no working libLLVM >= 17; `radiotwin doctor` says what to do"))
+    for item in items:
+        marker = item.get_closest_marker("gpu")
+        refusal = marker and GPU_TRIALS[marker.args[0]]()
+        if refusal:
+            item.add_marker(pytest.mark.skip(reason=f"no GPU for {marker.args[0]}: {refusal}"))
 
 
 @pytest.fixture(autouse=True)

@@ -135,3 +135,9 @@ def test_functions_have_defaults_where_commands_have(name):
     for option in ("seed", "flights", "pattern", "model", "settings"):
         if option in parameters and parameters[option].kind is not inspect.Parameter.VAR_KEYWORD:
             assert parameters[option].default is not inspect.Parameter.empty, option
+
+
+def test_an_output_folder_named_coverage_does_not_stop_numba(tmp_path):
+    (tmp_path / "coverage").mkdir()
+    done = subprocess.run([sys.executable, "-c", "import radiotwin, numba"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from radiotwin import doctor, llvm
+from radiotwin import cuda, doctor, llvm, trial_link
 
 HEADINGS = ["System", "Machine", "GPU", "Packages", "libLLVM", "Tracing", "What to do"]
 
@@ -84,7 +84,7 @@ def test_little_memory_and_disk_is_said_but_stops_nothing(untraced, monkeypatch)
     ],
 )
 def test_tracing_that_does_not_work(monkeypatch, program, said):
-    monkeypatch.setattr(doctor, "_TRACE", program)
+    monkeypatch.setattr(trial_link, "_PROGRAM", program)
     diagnosis = doctor.Diagnosis()
     doctor._check_tracing(diagnosis)
     assert len(diagnosis.problems) == 1
@@ -92,16 +92,17 @@ def test_tracing_that_does_not_work(monkeypatch, program, said):
     assert "constraints.txt" in diagnosis.problems[0]
 
 
-def test_gpu_is_listed(tmp_path, monkeypatch):
+def test_gpu_is_listed_with_what_would_use_it(tmp_path, monkeypatch):
     tool = tmp_path / "nvidia-smi"
-    tool.write_text("#!/bin/sh\necho 'Some GPU, 16384 MiB, 550.1'\n")
+    tool.write_text("#!/bin/sh\necho 'Some GPU, 16384, 550.1'\n")
     tool.chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
-    rows = doctor._check_gpu()
-    assert rows[0] == ("GPU", "Some GPU, 16384 MiB, 550.1")
-    assert rows[1][0] == "torch"
+    monkeypatch.setattr(cuda, "tracing_refusal", lambda: None)
+    monkeypatch.setattr(cuda, "torch_refusal", lambda: "torch is old")
+    assert doctor._check_gpu() == [("GPU", "Some GPU, 16 GiB, driver 550.1"), ("tracing", "on the GPU"),
+                                   ("training", "on the processor: torch is old")]
     tool.write_text("#!/bin/sh\nexit 9\n")  # the tool without its driver
-    assert doctor._check_gpu() == [("GPU", "none: everything runs on the processor")]
+    assert doctor._check_gpu()[0] == ("GPU", "none is listed by nvidia-smi")
 
 
 @pytest.mark.llvm

@@ -1,5 +1,6 @@
 """The examples run as they are, and print what their text says."""
 
+import json
 import re
 import runpy
 from pathlib import Path
@@ -48,6 +49,21 @@ def test_plan_with_your_twin(run):
         (share, name, where) for name, share, where in re.findall(r"(\w+) flights collect (\d+)% .* the (\w+)", out))}
     assert shares["greedy", "truth"] > shares["random", "truth"]
     assert "hovering at the start collects" in out or "radiotwin[rl]" in out
+
+
+def test_first_map(tmp_path, monkeypatch, capsys):
+    """The notebook's cells in one process, as a kernel runs them; it is stored without outputs."""
+    notebook = json.loads((EXAMPLES / "first_map.ipynb").read_text(encoding="utf-8"))
+    cells = [each for each in notebook["cells"] if each["cell_type"] == "code"]
+    assert not any(each["outputs"] or each["execution_count"] for each in cells)
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for number, cell in enumerate(cells):
+        exec(compile("".join(cell["source"]), f"cell {number}", "exec"), names)
+    errors_db = [float(each) for each in re.findall(r": ([\d.]+) dB", capsys.readouterr().out)]
+    assert errors_db[0] < 2 < errors_db[1], "the twin's and the log-distance model's"
+    for name in ("map.csv", "report.html", "twin/twin.json"):
+        assert (tmp_path / "first_map" / name).stat().st_size > 1000
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)

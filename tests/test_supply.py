@@ -1,6 +1,7 @@
 """What is installed, and what SECURITY.md promises about it."""
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -43,6 +44,29 @@ def test_flowers_constraints_differ_from_the_others_only_where_flower_needs_it()
     own, others = (pinned((ROOT / f"constraints{kind}.txt").read_text()) for kind in ("-flower", ""))
     assert {name for name in own if others.get(name, own[name]) != own[name]} == {
         "typer", "rich", "packaging", "protobuf", "ray"}
+
+
+@pytest.fixture(scope="module")
+def project():
+    return tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+
+
+def test_all_is_every_extra_of_a_user(project):
+    extras = project["optional-dependencies"]
+    (every,) = extras["all"]
+    assert set(re.fullmatch(r"radiotwin\[(.*)\]", every)[1].split(",")) == extras.keys() - {"all", "docs", "flower", "test"}
+    listed = re.findall(r"^\| `(\w+)`(?:, `(\w+)`)? \|", (ROOT / "docs" / "install.md").read_text().split("**Extras**")[1], re.MULTILINE)
+    assert {name for names in listed for name in names if name} == extras.keys()
+
+
+def test_the_conda_recipe_has_the_dependencies(project):
+    conda = {"torch": "pytorch", "matplotlib": "matplotlib-base"}
+    run = (ROOT / "recipe" / "recipe.yaml").read_text().split("  run:\n")[1].split("\n\n")[0]
+    named = dict(re.findall(r"(?:- |then: )(?!if:)([\w.-]+) >=([\d.]+)$", run, re.MULTILINE))
+    specs = [re.match(r"([\w.-]+)>=([\d.]+)", each).groups() for each in project["dependencies"]]
+    assert named == {conda.get(name, name): version for name, version in specs} | {
+        "python": project["requires-python"].removeprefix(">=")}
+    assert f'version: "{project["version"]}"' in (ROOT / "recipe" / "recipe.yaml").read_text()
 
 
 def test_every_budget_is_in_the_table():

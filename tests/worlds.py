@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from radiotwin.closeloop.predictor import CombinedPrediction
 from radiotwin.measurements import Measurements
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
@@ -62,6 +63,16 @@ def measured(world, **columns):
 def open_ground():
     """`fly(seed)` makes a world over open ground, `measured(world)` its measurements."""
     return SimpleNamespace(fly=fly, measured=measured)
+
+
+@pytest.fixture
+def predicted_by_the_model_alone(monkeypatch):
+    """A third of the time goes into what predicts best, which has tests of its own."""
+    def alone(model, *_):
+        mean_db = model.held_out_mean_db
+        return CombinedPrediction(mean_db, ["named"], np.ones((2, 1)), mean_db[:, None], np.zeros(len(mean_db)),
+                                  {"log_distance": mean_db})
+    monkeypatch.setattr("radiotwin.closeloop.run.combined_prediction", alone)
 
 
 @pytest.fixture(scope="session")

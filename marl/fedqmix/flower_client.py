@@ -16,7 +16,8 @@ from flwr.clientapp import ClientApp
 from marl.fedqmix.client import Client, Party
 from marl.fedqmix.flower_records import arrays_of, weights_of
 from marl.fedqmix.shared import Shared
-from marl.threads import keep_memory, limit_threads, torch_device
+from marl.threads import keep_memory, limit_threads
+from radiotwin.cuda import torch_device
 from radiotwin.errors import BadInput
 from radiotwin.inputs import read_json
 from radiotwin.processes import die_with_parent

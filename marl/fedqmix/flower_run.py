@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import tomli_w
@@ -26,6 +27,7 @@ from radiotwin.processes import die_with_parent
 
 HOST, LINK = "127.0.0.1", "federation"
 START_S, END_S, POLL_S, STATUS_S, RESTART_S = 120.0, 15.0, 0.5, 30.0, 15.0
+SHORT_S = 0.05
 _LAST_LINES = 15  # of a log, in a message
 
 
@@ -40,6 +42,7 @@ class Processes:
 
     def __init__(self, home: Path, logs: Path, environment: dict[str, str]) -> None:
         self._logs, self._running = logs, dict[str, subprocess.Popen]()
+        self._sessions = set[int]()
         binaries = str(Path(sys.executable).parent)
         self._environment = os.environ | {
             "PATH": os.pathsep.join([binaries, os.environ.get("PATH", os.defpath)]),
@@ -53,6 +56,7 @@ class Processes:
             self._running[name] = subprocess.Popen(
                 command, env=self._environment, stdin=subprocess.DEVNULL, stdout=log, stderr=log,
                 start_new_session=True, preexec_fn=lambda: die_with_parent(parent))
+        self._sessions.add(self._running[name].pid)
 
     def call(self, command: Sequence[str]) -> str:
         """Run a command to its end, and return what it printed.
@@ -94,12 +98,19 @@ class Processes:
             process.wait()
         for pid, began in others.items():
             if _began(pid) == began:  # and not another one with its number
-                os.kill(pid, 9)
+                with suppress(ProcessLookupError):
+                    os.kill(pid, 9)
 
     def close(self) -> None:
-        """End all of them, the last started first."""
+        """End all of them, the last started first, and what those that have ended left behind."""
         for name in reversed(list(self._running)):
             self.stop(name)
+        end = time.monotonic() + END_S
+        while (left := _in_sessions(self._sessions)) and time.monotonic() < end:
+            for pid in left:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, 9)
+            time.sleep(SHORT_S)
 
 
 class Federation:
@@ -271,6 +282,13 @@ def _descendants(root: int) -> dict[int, str]:
         found |= {pid: _began(pid) for pid in children}
         new += children
     return found
+
+
+def _in_sessions(sessions: set[int]) -> list[int]:
+    """Return running processes of these sessions (Linux only), whose leaders may have ended."""
+    stats = {int(path.name): _stat(int(path.name)) for path in Path("/proc").glob("[0-9]*")}
+    return [pid for pid, stat in stats.items()
+            if stat and int(stat[3]) in sessions and stat[0] != "Z"]
 
 
 def _began(pid: int) -> str:

@@ -14,9 +14,10 @@ from marl.fedqmix.settings import EngineSettings, FederationSettings, check_fede
 from marl.fedqmix.shared import Shared, initial_weights, write_app
 from marl.figures import draw_curve
 from marl.settings import LearnerSettings, RunSettings
-from marl.threads import keep_memory, limit_threads, torch_device
+from marl.threads import keep_memory, limit_threads
 from radiotwin.alignment import in_scene_frame
 from radiotwin.console import notice, print_rows, say
+from radiotwin.cuda import torch_device
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.files import atomic_file, is_temporary, scratch_folder
 from radiotwin.measurements import read_measurements

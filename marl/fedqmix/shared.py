@@ -1,4 +1,4 @@
-"""What all parties of a federation share: the Flower App that they run, and its settings."""
+"""Flower App that all parties of a federation run, and its settings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

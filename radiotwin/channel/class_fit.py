@@ -27,7 +27,7 @@ class ClassFit:
 
     @property
     def level_db(self) -> float:
-        """What measured levels lie above the paths'."""
+        """Offset of measured levels from those of the paths [dB]."""
         return float(self.numbers[0])
 
     def scale_db(self, square_db: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ OFFSET_SD_DB = 6.0  # prior of what reflections and diffractions lie above those
 MAX_OFFSET_DB = 20.0
 
 Offsets = tuple[float, float]
-"""What reflected, and diffracted, paths carry beside those over the map [dB]."""
+"""Levels of reflected and of diffracted paths above those of the map [dB]."""
 
 
 def paths_db(links: LinkGeometry, diffuse: tuple[float, float], offsets_db: Offsets = (0.0, 0.0)

@@ -91,8 +91,12 @@ def import_(
         help="Table of fixed receivers, in the same form.")] = None,
     track: Annotated[list[str] | None, typer.Option(
         metavar="[RECEIVER=]FILE", help="Positions over time, where the log has none: .gpx, .nmea, "
-                                        "PX4 .ulg, or a table with time, latitude, longitude, "
+                                        "PX4 .ulg, ROS .bag, .mcap, .db3 or the folder of a ROS "
+                                        "2 bag, or a table with time, latitude, longitude, "
                                         "altitude; may be repeated.")] = None,
+    track_topic: Annotated[str | None, typer.Option(
+        metavar="NAME", help="Topic of the tracks that are ROS bags [the only one with "
+                             "positions].")] = None,
     track_max_gap_s: Annotated[float | None, typer.Option(
         help="Largest time between two positions of a track that are interpolated [5].")] = None,
     gzip: Annotated[bool, typer.Option("--gzip", help="Write measurements.csv.gz.")] = False,
@@ -122,7 +126,7 @@ def import_(
         "min_distance_m": min_distance_m, "max_distance_m": max_distance_m,
         "thin_m": thin_m, "place_m": place_m, "average_m": average_m, "average": average,
         "origin": parse_origin(origin), "crs": crs, "devices": devices, "receivers": receivers,
-        "track": _tracks(track), "track_max_gap_s": track_max_gap_s,
+        "track": _tracks(track, track_topic), "track_max_gap_s": track_max_gap_s,
         "wide": [parse_columns(text) for text in wide] if wide else None}
     mapping = columns
     if columns is not None and "=" in columns and not columns.endswith(".toml"):
@@ -168,12 +172,15 @@ def _print(report: dict[str, Any]) -> None:
         say(f"note: {text}")
 
 
-def _tracks(texts: list[str] | None) -> list[dict[str, str]] | None:
+def _tracks(texts: list[str] | None, topic: str | None) -> list[dict[str, str]] | None:
     """Parse `FILE` or `RECEIVER=FILE`."""
     if texts is None:
+        if topic is not None:
+            raise BadInput(f"--track-topic {topic!r} is of a ROS bag; give that with --track, too")
         return None
     pairs = [(text.rpartition("=")[2], text.rpartition("=")[0]) for text in texts]
-    return [{"file": file, **({"receiver": receiver} if receiver else {})}
+    return [{"file": file, **({"receiver": receiver} if receiver else {}),
+             **({"topic": topic} if topic else {})}
             for file, receiver in pairs]
 
 

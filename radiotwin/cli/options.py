@@ -41,6 +41,9 @@ TargetDb = Annotated[float | None, typer.Option(
          "few links, is within this [dB].")]
 Combining = Annotated[str, typer.Option(
     help="power (sum of the paths' powers) or coherent (sum of their fields).")]
+Radius = Annotated[float | None, typer.Option(
+    help="Leave out what lies farther from the lines of a batch's links [m; 400 in cities of more "
+         "than 5,000 shapes, inf (the whole city) in others].")]
 RaySeed = Annotated[int, typer.Option(min=0, help="Seed of the rays.")]
 FitSeed = Annotated[int, typer.Option(min=0, help="Seed of the fits and the search.")]
 
@@ -48,6 +51,10 @@ Workers = Annotated[str, typer.Option(
     metavar="auto|N", help="Processes that share the work; 1 is this one. auto: as many as there "
                            "are cores and memory, where it takes long enough. The result is the "
                            "same to the bit.")]
+ComputeDevice = Annotated[str, typer.Option(
+    "--device", metavar="auto|cpu|cuda",
+    help="Where rays are traced: auto takes a GPU where tracing works on one. Gains of a GPU "
+         "differ from the processor's by rounding.")]
 Cluster = Annotated[str | None, typer.Option(
     metavar="auto|ADDRESS", help="Run on Ray: auto starts a cluster on this machine and ends it "
                                  "again, ADDRESS (HOST:PORT) joins one. Needs radiotwin[ray].")]

@@ -67,6 +67,8 @@ def build_scene(
     terrain: Annotated[Path | None, typer.Option(
         metavar="FILE.tif", help="Heights of a map's ground, a GeoTIFF; buildings stand on it "
                                  "[flat ground].")] = None,
+    crs: Annotated[str | None, typer.Option(
+        metavar="EPSG:N", help="Coordinate reference system of a map that names none.")] = None,
     overpass: Annotated[bool, typer.Option(
         "--overpass", help="Download CITY, an .osm file that does not exist yet, for --bbox first; "
                            "needs a network.")] = False,
@@ -100,7 +102,7 @@ def build_scene(
                    origin=parse_origin(origin), scale=scale, up=up,
                    default_height_m=height_default, height_column=height_column,
                    ground_column=ground_column, material_table=material_table,
-                   terrain=terrain, overpass=overpass, step_m=step,
+                   terrain=terrain, crs=crs, overpass=overpass, step_m=step,
                    altitudes_m=None if altitudes is None else
                    parse_numbers("--altitudes", altitudes),
                    extent_m=None if extent is None else parse_bounds("--extent", extent),

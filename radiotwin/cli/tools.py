@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from radiotwin.cli.options import ComputeDevice
 from radiotwin.console import console, notice, print_rows, result, say
 
 
@@ -23,17 +24,20 @@ def demo(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of all results.")] = Path("demo"),
     seed: Annotated[int, typer.Option(
         min=0, help="Seed of placement, flights and fits.")] = 0,
+    device: ComputeDevice = "auto",
 ) -> None:
     """Run the whole chain on a small scene, in minutes.
 
     The steps are build, trace, survey, fit and compare; an HTML page shows the result.
     """
     from radiotwin.cli.model import print_comparison
+    from radiotwin.cuda import tracing_device
     from radiotwin.demo import run_demo
     from radiotwin.pieces import keep_pieces
 
+    used = tracing_device(device)
     with keep_pieces() as pieces:
-        comparison = run_demo(scene, out, seed=seed, on_progress=say)
+        comparison = run_demo(scene, out, seed=seed, device=used, on_progress=say)
     notice(pieces.progress)
     print_comparison(comparison)
     say(f"look at {out / 'report.html'}")

@@ -8,9 +8,11 @@ import typer
 from radiotwin.cli.options import (
     Cluster,
     Combining,
+    ComputeDevice,
     OnlyDevices,
     PointsFile,
     Quality,
+    Radius,
     RaySeed,
     SceneFolder,
     TargetDb,
@@ -47,9 +49,11 @@ def trace(
         help="paths (gain at points) or map (mean over lattice cells).")] = "paths",
     combining: Combining = "power",
     devices: OnlyDevices = None,
+    radius: Radius = None,
     seed: RaySeed = 1,
     workers: Workers = "auto",
     cluster: Cluster = None,
+    device: ComputeDevice = "auto",
     plan: Annotated[bool, typer.Option(
         "--plan", help="Only estimate time and memory, from a few batches.")] = False,
 ) -> None:
@@ -57,13 +61,16 @@ def trace(
 
     A killed run is resumed, a finished one is reused.
     """
+    from radiotwin.cuda import tracing_device
     from radiotwin.execution import open_executor
     from radiotwin.scene import Scene
     from radiotwin.trace import trace_map, truth_path
 
+    used = tracing_device(device)
     scene, names = Scene.load(folder), split_names(devices)
     settings = _settings(scene, scene.lattice.positions_m, names, quality, target_db, solver=solver,
-                         combining=combining, seed=seed)
+                         combining=combining, seed=seed, radius_m=radius,
+                         compute_device=used)
     if plan:
         _print_plan(scene, settings, names)
         return
@@ -108,22 +115,27 @@ def gains(
         "--sum", help="power (of the paths' powers) or coherent (of their fields).")] = "power",
     quality: Quality = None,
     target_db: TargetDb = None,
+    radius: Radius = None,
     seed: RaySeed = 1,
     workers: Workers = "auto",
     cluster: Cluster = None,
+    device: ComputeDevice = "auto",
 ) -> None:
     """Ray-trace gains at any points.
 
     An empty gain has a reason, such as no path.
     """
+    from radiotwin.cuda import tracing_device
     from radiotwin.execution import open_executor
     from radiotwin.pieces import keep_pieces
     from radiotwin.scene import Scene
     from radiotwin.trace import read_points, trace_points
 
+    used = tracing_device(device)
     scene, names = Scene.load(folder), split_names(devices)
     points_m = read_points(points, scene.config.origin, scene.city)
-    settings = _settings(scene, points_m, names, quality, target_db, combining=combining, seed=seed)
+    settings = _settings(scene, points_m, names, quality, target_db, combining=combining, seed=seed,
+                         radius_m=radius, compute_device=used)
     with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor:
         table = trace_points(scene, points_m, settings, out, names, executor)
     notice(pieces.progress)
@@ -174,7 +186,7 @@ def _speeds(text: str) -> list[float]:
 
 
 def _settings(scene: "Scene", points_m: "np.ndarray", devices: list[str] | None,
-              quality: str | None, target_db: float | None, **others: str | int
+              quality: str | None, target_db: float | None, **others: str | int | float | None
               ) -> "SolverSettings":
     """Return the settings of a quality, or those that reach a target, with what they cost."""
     from radiotwin.pieces import keep_pieces

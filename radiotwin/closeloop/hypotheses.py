@@ -1,4 +1,4 @@
-"""What competes for a residual: nuisances of the base, causes without a name, and named causes.
+"""Competing explanations of a residual: nuisances of the base, unnamed and named causes.
 
 Nuisances are always there: a level and a slope of each class of line of sight, small errors of each
 device, receiver and flight, and a field over positions (`radiotwin.inference.correlated_evidence`).

@@ -32,7 +32,7 @@ NONE, OTHER = "none", "not in the catalogue"
 
 @dataclass(frozen=True)
 class Step:
-    """What the residual says at one step.
+    """Evidence in the residual at one step.
 
     Attributes:
         number: of effects that were there.
@@ -64,9 +64,9 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
         hypotheses: about what it lacks.
         criteria: a candidate that passed is refused below `min_probability`.
     """
-    unnamed = hypotheses.unnamed_nats
-    best_unnamed = max([0.0, *unnamed.values()])
-    before_db, (rest_db, noise_db) = model.rmse_db(), hypotheses.sizes_db
+    rest_db, noise_db = hypotheses.sizes_db
+    step = Step(len(model.whole.effects), hypotheses.unnamed_nats, rest_db, noise_db, {})
+    before_db, best_unnamed = model.rmse_db(), step.best_unnamed
     judged = []
     for score in scores:
         if score.gain_by_fold.size:
@@ -84,8 +84,8 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
                    f"{criteria.min_probability:g} is needed)")
             score = replace(score, probability=probability, reason=why if low else score.reason)
         judged.append(score)
-    return judged, Step(len(model.whole.effects), unnamed, rest_db, noise_db,
-                        _probabilities(judged, best_unnamed, rest_db, noise_db))
+    return judged, replace(step, probabilities=_probabilities(judged, best_unnamed, rest_db,
+                                                              noise_db))
 
 
 def features(nats: tuple[float, float, float, float], rmse_fall: float,

@@ -15,9 +15,11 @@ from radiotwin.closeloop.posterior import Step
 from radiotwin.closeloop.result_schema import ReportRecord
 from radiotwin.closeloop.run import Loop
 from radiotwin.closeloop.scoring import CandidateScore
+from radiotwin.effects.params import Parameter
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 from radiotwin.links import LinkData
+from radiotwin.links.shared_places import ReceiverDifference, receiver_differences
 from radiotwin.records import read_record, validated
 
 SCHEMA, SCHEMA_1 = "radiotwin.closeloop/2", "radiotwin.closeloop/1"
@@ -69,6 +71,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
         "verdict": loop.verdict, "effects": effects, "candidates": candidates,
         "posterior": [_step(each) for each in selection.steps],
         "detectable": [vars(each) for each in loop.detectable],
+        "receivers_compared": [_difference(each, links) for each in receiver_differences(links)],
         "heldout": {"by": loop.folds.by, "folds": loop.folds.count,
                     "n": int(np.isfinite(loop.after.held_out_nll).sum())},
         "error": error, "baselines": baselines, "combination": combination,
@@ -184,7 +187,7 @@ def _from_version_1(report: dict[str, Any]) -> dict[str, Any]:
     new["error"] = _with_new_bias(report["error"]) | {"combined": None}
     new["baselines"] = _with_new_bias(report["baselines"])
     return new | {"schema": SCHEMA, "criteria": {}, "posterior": [], "detectable": [],
-                  "combination": [], "prediction": None}
+                  "combination": [], "prediction": None, "receivers_compared": []}
 
 
 def _with_new_bias(value: Any) -> Any:
@@ -201,6 +204,13 @@ def _step(step: Step) -> dict[str, Any]:
     return {"step": step.number + 1, "unnamed_nats": step.unnamed_nats, "rest_db": step.rest_db,
             "noise_db": step.noise_db,
             "probabilities": [{"name": name, "probability": each} for name, each in ordered]}
+
+
+def _difference(found: ReceiverDifference, links: LinkData) -> dict[str, Any]:
+    value = Parameter(found.difference_db, found.low_db, found.high_db, "dB")
+    return {"first": links.receiver_names[found.first],
+            "second": links.receiver_names[found.second], "difference_db": value.record(),
+            "pairs": found.pairs, "places": found.places}
 
 
 def _shadowing(score: CandidateScore, model: CrossValidatedModel, rank: int) -> dict[str, Any]:

@@ -132,7 +132,7 @@ class ProbabilityRecord(Record):
 
 
 class StepRecord(Record):
-    """What the residual says at one step of the selection."""
+    """Evidence in the residual at one step of the selection."""
 
     step: Whole
     probabilities: list[ProbabilityRecord]
@@ -148,6 +148,16 @@ class DetectableRecord(Record):
     size: Number | None
     unit: str
     pattern: str
+
+
+class ReceiverDifferenceRecord(Record):
+    """How much more one receiver reads than another where both have been."""
+
+    first: str
+    second: str
+    difference_db: ParameterRecord
+    pairs: Whole
+    places: Whole
 
 
 class FoldsRecord(Record):
@@ -176,6 +186,7 @@ class ReportRecord(Record):
     candidates: list[CandidateRecord]
     posterior: list[StepRecord] = Field(default_factory=list)
     detectable: list[DetectableRecord] = Field(default_factory=list)
+    receivers_compared: list[ReceiverDifferenceRecord] = Field(default_factory=list)
     heldout: FoldsRecord
     error: ErrorRecord
     baselines: dict[str, BaselineRecord]

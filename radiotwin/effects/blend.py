@@ -1,4 +1,4 @@
-"""What interpolation and regression add to named effects, by weights that depend on the place.
+"""Interpolation and regression beside named effects, with weights that depend on the place.
 
 Near measured places they know most, far from them physics does: each member has a weight near
 measurements and one far from them, found on held-out links by `radiotwin.closeloop.predictor`.

@@ -26,7 +26,7 @@ MAX_Z = 6.0  # an outlier counts as this many scales
 
 
 class _State(BaseModel):
-    """What `CorrelatedShadowing.state` returns; arrays are checked by the field."""
+    """State of `CorrelatedShadowing` in a file; arrays are checked by the field."""
 
     model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
 

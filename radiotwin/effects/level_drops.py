@@ -30,12 +30,12 @@ MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal 
 
 @dataclass(frozen=True, eq=False)
 class Drops:
-    """What was found of a receiver.
+    """Drops of a receiver's level.
 
     Attributes:
         share: of its instants.
         drop_db: how much lower they are.
-        nats: (n,) what each of its readings gains.
+        nats: (n,) gain in log-likelihood of each of its readings.
     """
 
     share: float

@@ -8,6 +8,7 @@ from radiotwin.errors import BadInput
 
 P = TypeVar("P")
 R = TypeVar("R")
+SHARE_ROUNDING = 1e-6  # ten tenths are one
 P_contra = TypeVar("P_contra", contravariant=True)
 
 

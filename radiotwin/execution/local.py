@@ -8,12 +8,13 @@ pool of one process, so that it is known whose piece a dead one had, and the oth
 
 import os
 import signal
+import sys
 from collections.abc import Sequence
 from concurrent.futures import Future
 from typing import Any
 
 from radiotwin.errors import RunFailed
-from radiotwin.execution.job import Resources
+from radiotwin.execution.job import SHARE_ROUNDING, Resources
 from radiotwin.execution.pool import Death, Pool, Worker
 from radiotwin.execution.worker import Outcome, begin, run_piece, thread_variables
 from radiotwin.processes import free_memory_bytes, resident_bytes
@@ -37,8 +38,8 @@ class LocalPool(Pool):
 
     def prepare(self, function: bytes, resources: Resources, count: int) -> Sequence[Worker]:
         """Return workers for a job; those that are there already are used again."""
-        room = self.room(resources)
-        wanted = min(self._most or min(room, _cores() // resources.cores), count)
+        room, on_gpu = self.room(resources), _room_on_gpu(resources)
+        wanted = min(self._most or min(room, on_gpu, _cores() // resources.cores), count)
         if self._most is None and wanted < 2:
             return []
         if room < (self._most or 1):
@@ -46,6 +47,9 @@ class LocalPool(Pool):
                 f"{self._most} worker(s) may take {resources.memory_bytes / 2**30:.1f} GiB of "
                 f"memory each, and {room} would fit into what is free on this machine; ask for "
                 "fewer, choose a lower quality, or a machine with more memory")
+        if on_gpu < wanted:
+            raise RunFailed(f"{wanted} workers are asked for, and {on_gpu} share a GPU "
+                            f"({resources.gpu_share:g} of it each); ask for fewer")
         reusable = [each for each in self._workers if each.resources.cores == resources.cores]
         for each in [each for each in self._workers if each not in reusable] + reusable[wanted:]:
             each.close()
@@ -70,6 +74,13 @@ class LocalPool(Pool):
             for each in self._workers:
                 each.close()
             self._workers = []
+
+
+def _room_on_gpu(resources: Resources) -> int:
+    """Return how many workers share one GPU; CUDA gives all of a machine the first one."""
+    if not resources.gpu_share:
+        return sys.maxsize
+    return int(1 / resources.gpu_share + SHARE_ROUNDING)
 
 
 def _cores() -> int:

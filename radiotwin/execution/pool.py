@@ -1,4 +1,4 @@
-"""What a place for work must offer: workers, each of which runs one piece at a time."""
+"""Interface of a place for work: workers, each of which runs one piece at a time."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence

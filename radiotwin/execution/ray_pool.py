@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.execution.job import Resources
+from radiotwin.execution.job import SHARE_ROUNDING, Resources
 from radiotwin.execution.pool import Death, Pool, Worker
 from radiotwin.execution.worker import Outcome, PieceRunner, thread_variables
 from radiotwin.pieces import versions
@@ -125,8 +125,8 @@ class RayPool(Pool):
         nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
         needs = {"CPU": resources.cores, "memory": resources.memory_bytes,
                  "GPU": resources.gpu_share}
-        fitting = sum(min(int(node.get(name, 0) // need) for name, need in needs.items() if need)
-                      for node in nodes)
+        fitting = sum(min(int(node.get(name, 0) / need + SHARE_ROUNDING)
+                          for name, need in needs.items() if need) for node in nodes)
         if fitting < (self._most or 1):
             raise RunFailed(
                 f"{self.name} has room for {fitting} workers of {resources.cores} core(s), "

@@ -20,6 +20,7 @@ from radiotwin.footprints.features import (
     problems_of,
 )
 from radiotwin.footprints.geopackage import read_geopackage
+from radiotwin.footprints.geoparquet import read_geoparquet
 from radiotwin.footprints.gis_files import read_geojson
 from radiotwin.footprints.height_columns import HeightColumn, check_declared, no_height_text
 from radiotwin.footprints.heights import source_text as height_text
@@ -37,6 +38,7 @@ from radiotwin.footprints.solids import (
     find_overlaps,
     make_prisms,
 )
+from radiotwin.footprints.systems import check_declared_system
 from radiotwin.footprints.terrain import Ground, make_ground, stand_on
 from radiotwin.footprints.vegetation import make_vegetation, vegetation_fact
 from radiotwin.geodesy import to_local
@@ -55,10 +57,11 @@ from radiotwin.scene.vegetation import VegetationConfig
 from radiotwin.tables import Origin
 
 OSM_SUFFIXES = (".osm", ".osm.pbf")
-READERS: dict[str, Callable[[Path], MapFile]] = {
-    ".osm": lambda path: assemble(read_osm_xml(path)),
-    ".osm.pbf": lambda path: assemble(read_osm_pbf(path)),
+READERS: dict[str, Callable[[Path, str | None], MapFile]] = {
+    ".osm": lambda path, _: assemble(read_osm_xml(path)),
+    ".osm.pbf": lambda path, _: assemble(read_osm_pbf(path)),
     ".geojson": read_geojson, ".gpkg": read_geopackage,
+    ".parquet": read_geoparquet,
     ".shp": read_shapefile, ".zip": read_shapefile,
     ".city.json": read_cityjson, ".city.json.gz": read_cityjson, ".json": read_cityjson,
     ".cityjson": read_cityjson, ".jsonl": read_cityjson, ".gml": read_citygml,
@@ -83,6 +86,8 @@ class MapOptions:
         height_column: column that goes before all known ones; None: the known ones.
         materials: by tag.
         terrain: GeoTIFF of the ground's heights; None: the ground is flat.
+        crs: coordinate reference system of a file that names none; None: such a file is refused,
+            and GeoJSON is in degrees.
     """
 
     bbox_deg: Bounds | None = None
@@ -90,6 +95,7 @@ class MapOptions:
     materials: MaterialTable = STANDARD
     height_column: HeightColumn | None = None
     terrain: Path | None = None
+    crs: str | None = None
 
     @property
     def height_m(self) -> float:
@@ -101,6 +107,8 @@ class MapOptions:
         if not 0 < self.height_m <= 1000:
             raise BadInput(f"a default height of {self.height_m:g} m is not possible; give "
                            "more than 0 and at most 1000 m")
+        if self.crs is not None:
+            check_declared_system(self.crs)
         if self.bbox_deg is not None:
             south, west, north, east = self.bbox_deg
             if not (-90 <= south < north <= 90 and -180 <= west < east <= 180):
@@ -131,7 +139,7 @@ def build_scene_from_map(
     """Read footprints, extrude them, and write a scene folder with a table of all buildings.
 
     Args:
-        source: `.osm`, `.osm.pbf`, `.geojson` or `.gpkg` file.
+        source: a file with one of the endings of `READERS`.
         out_folder: scene folder to write; a scene in it is replaced.
         map_options: how to read the map; None: the defaults.
         options: frequency, devices, UAVs, seed, origin and lattice; `bbox`, `scale`, `up`,
@@ -155,7 +163,10 @@ def build_scene_from_map(
     suffix = map_suffix(path)
     if suffix is None:
         raise BadInput(f"{path} is not a map; allowed are {', '.join(READERS)}")
-    found = READERS[suffix](path)
+    if map_options.crs is not None and suffix in OSM_SUFFIXES:
+        raise BadInput(f"{path} is in longitude and latitude, as all of OpenStreetMap; leave --crs "
+                       "out")
+    found = READERS[suffix](path, map_options.crs)
     FEATURES.check(len(found.features), path)
     features = _within(found.features, map_options.bbox_deg, path)
     SHAPES.check(len(features), path)
@@ -256,8 +267,8 @@ def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> lis
     for feature, bounds in zip(features, bounds_deg):
         if (np.abs(bounds) > (180, 90, 180, 90)).any():
             raise BadInput(f"{path}: {feature.name} lies at {bounds[0]:g}, {bounds[1]:g}, which is "
-                           "no longitude and latitude in degrees; export the map in EPSG:4326, or "
-                           "with the name of its system")
+                           "no longitude and latitude in degrees; export the map in EPSG:4326 or "
+                           "with the name of its system, or declare it with --crs")
     budget = OutlineBudget(path)
     if bbox_deg is None:
         for feature in features:

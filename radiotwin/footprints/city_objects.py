@@ -18,6 +18,7 @@ from radiotwin.errors import BadInput
 from radiotwin.footprints.features import Feature, LeftOut, MapFile, Shell
 from radiotwin.footprints.height_columns import column_name
 from radiotwin.footprints.systems import (
+    chosen_system,
     find_city_system,
     plane_of,
     to_degrees,
@@ -71,13 +72,15 @@ class CityObject:
     geometries: list[Geometry] = field(default_factory=list)
 
 
-def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[str]) -> MapFile:
+def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[str],
+                  crs: str | None = None) -> MapFile:
     """Return the buildings among the objects of a city model.
 
     Args:
         path: file, for messages.
         objects: in the file's order.
         systems: names of their coordinate reference system, all that the file has.
+        crs: the one of a file that has none; None: refuse it.
 
     Raises:
         BadInput: no, several or an unknown system, or coordinates outside the area of it.
@@ -99,12 +102,13 @@ def city_features(path: Path, objects: Sequence[CityObject], systems: Sequence[s
     problems = _others(objects)
     if not chosen:
         return MapFile([], [LeftOut(one.name, _NOT_BUILT, None) for one in unusable], problems)
+    systems = systems or ([crs] if crs else [])
     if not systems:
         raise BadInput(f"{path} names no coordinate reference system (CityJSON: "
-                       "metadata.referenceSystem, GML: srsName); write it in, for example "
-                       "EPSG:25832")
+                       "metadata.referenceSystem, GML: srsName); declare it with --crs, such as "
+                       "--crs EPSG:25832")
     points = _in_degrees(path, [geometry for _, _, found in chosen for geometry in found],
-                         _one_system(path, systems))
+                         _one_system(path, systems, crs))
     features = _features(chosen, points, by_name)
     return MapFile(features, [LeftOut(one.name, _NOT_BUILT, None) for one in unusable], problems)
 
@@ -144,7 +148,8 @@ def _others(objects: Sequence[CityObject]) -> list[Problem]:
                     f"left out ({listed(kinds)})")]
 
 
-def _one_system(path: Path, names: Sequence[str]) -> "CRS":
+def _one_system(path: Path, names: Sequence[str], crs: str | None) -> "CRS":
+    chosen_system(path, names[0], crs)
     systems = [find_city_system(path, name) for name in dict.fromkeys(names)]
     for name, other in zip(dict.fromkeys(names), systems):
         if plane_of(other) != plane_of(systems[0]):

@@ -42,11 +42,12 @@ _MAX_SYSTEMS = 10
 _MAX_VALUE = 1000  # characters of an attribute
 
 
-def read_citygml(path: Path) -> MapFile:
+def read_citygml(path: Path, crs: str | None = None) -> MapFile:
     """Read the buildings of a CityGML file.
 
     Args:
         path: `.gml` or `.citygml` file.
+        crs: coordinate reference system of a file that names none; None: refuse it.
 
     Returns:
         Their surfaces; of objects that have an outline only, that.
@@ -57,7 +58,7 @@ def read_citygml(path: Path) -> MapFile:
     """
     reader = _Reader(path)
     parse_elements(path, reader.start, reader.end, text=reader.add_text)
-    return city_features(path, reader.objects, reader.systems)
+    return city_features(path, reader.objects, reader.systems, crs)
 
 
 @dataclass

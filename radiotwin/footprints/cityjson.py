@@ -24,12 +24,13 @@ _DEPTHS = {"MultiSurface": 0, "CompositeSurface": 0, "Solid": 1, "MultiSolid": 2
            "CompositeSolid": 2}
 
 
-def read_cityjson(path: Path) -> MapFile:
+def read_cityjson(path: Path, crs: str | None = None) -> MapFile:
     """Read the buildings of a CityJSON file.
 
     Args:
         path: `.json`, `.city.json.gz` or `.cityjson` file, or `.jsonl` with a feature in each
             line.
+        crs: coordinate reference system of a file that names none; None: refuse it.
 
     Returns:
         Their surfaces; of objects that have an outline only, that.
@@ -56,7 +57,7 @@ def read_cityjson(path: Path) -> MapFile:
         objects += _objects(path, document, *transform)
     metadata = head.get("metadata")
     system = metadata.get("referenceSystem") if isinstance(metadata, dict) else None
-    return city_features(path, objects, [system] if isinstance(system, str) else [])
+    return city_features(path, objects, [system] if isinstance(system, str) else [], crs)
 
 
 def _transform(path: Path, head: Mapping) -> tuple[np.ndarray, np.ndarray]:

@@ -23,18 +23,19 @@ from radiotwin.footprints.features import (
     is_building,
 )
 from radiotwin.footprints.height_columns import ALIASES
-from radiotwin.footprints.systems import WGS84, degrees_from, find_system
+from radiotwin.footprints.systems import WGS84, chosen_system, degrees_from, find_system
 from radiotwin.inputs import parse_json, read_text
 
 _OTHER_TAG = re.compile(r'[\s,]*+"((?:[^"\\]|\\.)*+)"\s*+=>\s*+"((?:[^"\\]|\\.)*+)"', re.DOTALL)
 _NAME_LENGTH = 200  # characters of an id that are kept
 
 
-def read_geojson(path: Path) -> MapFile:
+def read_geojson(path: Path, crs: str | None = None) -> MapFile:
     """Read the polygons of a GeoJSON file.
 
     Args:
         path: file after RFC 7946 (longitude, latitude), or with an older `crs` member.
+        crs: coordinate reference system of a file without that member; None: that of RFC 7946.
 
     Returns:
         The buildings.
@@ -58,7 +59,7 @@ def read_geojson(path: Path) -> MapFile:
         name = (str(known)[:_NAME_LENGTH] if isinstance(known, str | int | float)
                 else f"feature {number}")
         rows.append((name, tags, _polygons(path, number, geometry)))
-    return map_file(path, rows, _crs_name(path, data))
+    return map_file(path, rows, chosen_system(path, _crs_name(path, data), crs) or WGS84[0])
 
 
 def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None:
@@ -81,6 +82,16 @@ def _polygons(path: Path, number: int, geometry: Mapping) -> BaseGeometry | None
                        "numbers; export the map again") from None
 
 
+def area_of_wkb(data: bytes) -> BaseGeometry | None:
+    """Return a geometry in well-known binary, in the plane; None: not finite.
+
+    Raises:
+        shapely.errors.GEOSException: damaged.
+    """
+    area = shapely.from_wkb(data)
+    return shapely.force_2d(area) if np.isfinite(shapely.get_coordinates(area)).all() else None
+
+
 def _points(coordinates: Any) -> BaseGeometry | None:
     """Return all positions of a geometry that is no area, for where it lies."""
     points, waiting = [], [coordinates]
@@ -99,10 +110,10 @@ def _points(coordinates: Any) -> BaseGeometry | None:
     return shapely.MultiPoint(known) if np.isfinite(known).all() else None
 
 
-def _crs_name(path: Path, data: Mapping) -> str:
+def _crs_name(path: Path, data: Mapping) -> str | None:
     crs = data.get("crs")
     if crs is None:
-        return WGS84[0]
+        return None
     try:
         return str(crs["properties"]["name"])
     except (TypeError, KeyError):
@@ -167,8 +178,8 @@ def _to_degrees(path: Path, features: list[Feature], crs: str | None) -> list[Fe
     if not features or crs in WGS84:
         return features
     if crs is None:
-        raise BadInput(f"{path} has no coordinate reference system; assign one (in QGIS: Layer "
-                       "CRS) and export it again")
+        raise BadInput(f"{path} has no coordinate reference system; declare it with --crs, such as "
+                       "--crs EPSG:25832")
     project = degrees_from(path, find_system(path, crs))
     return [Feature(feature.name, feature.tags, shapely.transform(feature.area, project))
             for feature in features]

@@ -11,7 +11,7 @@ import io
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -24,6 +24,8 @@ from radiotwin.errors import BadInput
 from radiotwin.footprints.features import MapFile
 from radiotwin.footprints.gis_files import map_file
 from radiotwin.footprints.height_columns import full_names
+from radiotwin.footprints.multipatches import MULTIPATCH, patch_surfaces, patches_file
+from radiotwin.footprints.systems import chosen_system
 from radiotwin.inputs import open_input, read_bytes, require_within
 
 _PARTS = (".shp", ".dbf", ".prj", ".cpg")
@@ -36,11 +38,12 @@ _ERRORS = (struct.error, ValueError, LookupError, TypeError, AttributeError, Ass
            EOFError, OSError, OverflowError, shapely.errors.GEOSException)
 
 
-def read_shapefile(path: Path) -> MapFile:
-    """Read the polygons of a Shapefile, in any coordinate reference system.
+def read_shapefile(path: Path, crs: str | None = None) -> MapFile:
+    """Read the polygons or multipatches of a Shapefile, in any coordinate reference system.
 
     Args:
         path: `.shp` file with `.dbf` and `.prj` beside it, or `.zip` archive of one or more.
+        crs: coordinate reference system of a file without `.prj`; None: refuse it.
 
     Returns:
         The buildings.
@@ -51,11 +54,19 @@ def read_shapefile(path: Path) -> MapFile:
     found = MapFile([])
     layers = _archived(path) if path.suffix.lower() == ".zip" else [(path.stem, _beside(path))]
     for name, files in layers:
-        for suffix in (".shp", ".dbf", ".prj"):
+        for suffix in (".shp", ".dbf"):
             if suffix not in files:
                 raise BadInput(f"{path}: the Shapefile {name} has no {suffix}; keep its .shp, "
                                ".dbf and .prj together")
-        part = map_file(path, _rows(path, name, files), _text(files[".prj"]))
+        if ".prj" not in files and crs is None:
+            raise BadInput(f"{path}: the Shapefile {name} has no .prj, which names its coordinate "
+                           "reference system; keep it beside the .shp, or declare --crs, such as "
+                           "--crs EPSG:25832")
+        system = chosen_system(path, _text(files[".prj"]) if ".prj" in files else None, crs)
+        assert system is not None
+        is_patch = files[".shp"][32:36] == struct.pack("<i", MULTIPATCH)
+        rows = _rows(path, name, files, patch_surfaces if is_patch else _area)
+        part = (patches_file if is_patch else map_file)(path, rows, system)
         found.features += part.features
         found.left_out += part.left_out
     return found
@@ -106,9 +117,9 @@ def _text(data: bytes) -> str:
     return data.decode("utf-8-sig", "replace").strip("\0 \r\n\t")
 
 
-def _rows(path: Path, name: str, files: Mapping[str, bytes]
-          ) -> Iterator[tuple[str, dict[str, Any], BaseGeometry | None]]:
-    """Yield name, columns and area of each building."""
+def _rows(path: Path, name: str, files: Mapping[str, bytes], convert: Callable[[Any], Any]
+          ) -> Iterator[tuple[str, dict[str, Any], Any]]:
+    """Yield name, columns and converted shape of each building."""
     try:
         import shapefile
     except ImportError:
@@ -129,8 +140,7 @@ def _rows(path: Path, name: str, files: Mapping[str, bytes]
             for number, (shape, record) in enumerate(
                     zip(reader.iterShapes(), reader.iterRecords(deleted_as_None=True)), start=1):
                 if record is not None and shape is not None:
-                    yield (f"{name} {number}", dict(zip(keys, record)),
-                           _area(subject, shape.points, list(shape.parts)))
+                    yield f"{name} {number}", dict(zip(keys, record)), convert(shape)
     except (shapefile.ShapefileException, *_ERRORS) as error:
         raise BadInput(f"{subject} is not a readable Shapefile ({error}); export it again"
                        ) from None
@@ -142,9 +152,10 @@ def _check_records(subject: str, data: bytes) -> int:
         raise BadInput(f"{subject} is not a readable Shapefile (its .shp begins otherwise); export "
                        "it again")
     kind, = struct.unpack("<i", data[32:36])
-    if kind not in _POLYGONS:
+    if kind not in (*_POLYGONS, MULTIPATCH):
         raise BadInput(f"{subject} is a Shapefile of type {kind}, which is none of polygons "
-                       "(5, 15 or 25); export the outlines of buildings as polygons")
+                       "(5, 15 or 25) or multipatches (31); export the outlines of buildings as "
+                       "polygons")
     at, records = _HEADER, 0
     while at < len(data):
         length = 2 * struct.unpack(">i", data[at + 4:at + 8])[0] if at + 8 <= len(data) else 0
@@ -158,9 +169,10 @@ def _check_records(subject: str, data: bytes) -> int:
     return records
 
 
-def _area(subject: str, points: Any, starts: list[int]) -> BaseGeometry | None:
+def _area(shape: Any) -> BaseGeometry | None:
     """Return the polygons of a shape: rings that run clockwise are outlines, others holes [1]."""
-    corners = np.array([point[:2] for point in points], dtype=float).reshape(-1, 2)
+    starts = list(shape.parts)
+    corners = np.array([point[:2] for point in shape.points], dtype=float).reshape(-1, 2)
     if not np.isfinite(corners).all():
         raise ValueError("a coordinate is not finite")
     if starts != sorted(starts) or starts and not 0 <= starts[0] <= starts[-1] <= len(corners):

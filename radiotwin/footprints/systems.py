@@ -86,6 +86,35 @@ def degrees_from(path: Path, system: "CRS") -> Callable[[np.ndarray], np.ndarray
     return convert
 
 
+def chosen_system(path: Path, named: str | None, declared: str | None) -> str | None:
+    """Return the system of a file: the one that it names, else the one that the user declared.
+
+    Args:
+        path: file, for the message.
+        named: by the file; None: nothing.
+        declared: by the user; None: nothing.
+
+    Raises:
+        BadInput: they differ.
+    """
+    if named is None or declared is None:
+        return declared if named is None else named
+    own, other = (plane_of(find_city_system(path, name)) for name in (named, declared))
+    if not own.equals(other, ignore_axis_order=True):
+        raise BadInput(f"{path} is in {own.name[:80]!r}, and --crs says {other.name[:80]!r}; leave "
+                       "--crs out, or correct the file if its system is wrong")
+    return named
+
+
+def check_declared_system(name: str) -> None:
+    """Raise BadInput unless the user's name is that of a coordinate reference system."""
+    try:
+        find_system(Path(), name)
+    except BadInput:
+        raise BadInput(f"--crs {name[:60]!r} is no coordinate reference system that is known; give "
+                       "AUTHORITY:CODE, such as EPSG:25832") from None
+
+
 def find_city_system(path: Path, name: str) -> "CRS":
     """Find the system of a 3D city model, as GML and CityJSON name it.
 

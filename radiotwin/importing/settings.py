@@ -114,6 +114,7 @@ class TrackFile(Table):
 
     file: Spec
     receiver: Spec | None = None
+    topic: Spec | None = Field(None, description="of a ROS bag with several")
     time_offset_s: Number = 0.0
 
 

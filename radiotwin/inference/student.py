@@ -20,7 +20,7 @@ MIN_PROBABILITY = 1e-300  # of which a logarithm is taken
 
 @dataclass(frozen=True, eq=False)
 class Losses:
-    """What becomes of links now and then whatever their level; each (n,), or one for all.
+    """Blanks and drops that befall links whatever their level; each (n,), or one for all.
 
     Attributes:
         blank: probability that a link is blank.

@@ -7,6 +7,8 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.frames import is_same_frame, place
+from radiotwin.links.heights import height_notes
+from radiotwin.links.indoors import POSITION_SD_M, SURE, chance_inside
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 
@@ -137,9 +139,13 @@ def _off_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
             f"which goes from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) m: "
             "give measurements and scene in one frame, in metres; "
             "feet and degrees are not converted")
+    deep = inside.copy()
+    deep[inside] = chance_inside(scene.city, receiver_m[inside]) >= SURE
+    sure = f"{deep.sum():,} of them surely, with positions off by {POSITION_SD_M:g} m"
     return [f"{odd.sum():,} of {len(odd):,} links have their receiver {where}"
-            for odd, where in ((inside, f"inside a building: {INDOORS}"),
-                               (below, f"below the ground: {BURIED}")) if odd.any()]
+            for odd, where in ((inside, f"inside a building ({sure}): {INDOORS}"),
+                               (below, f"below the ground: {BURIED}"))
+            if odd.any()] + height_notes(receiver_m, scene)
 
 
 def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,

@@ -1,4 +1,4 @@
-"""What a regression that knows no physics is told of a link: its ends, and what lies between."""
+"""Features of a link for a regression without physics: its ends, and what lies between."""
 
 from __future__ import annotations
 

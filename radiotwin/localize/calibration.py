@@ -36,7 +36,7 @@ MAX_Z = 6.0  # an outlier counts as this many scales
 
 @dataclass(frozen=True)
 class RadiusCalibration:
-    """What located devices of known position have shown.
+    """Corrections of radii, calibrated by locating devices of known position.
 
     Attributes:
         likelihood_power: to which likelihoods are raised for radii.

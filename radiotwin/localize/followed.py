@@ -1,4 +1,4 @@
-"""What was followed along paths, as arrays that can be kept."""
+"""Followed paths, as arrays that can be kept."""
 
 import numpy as np
 

@@ -92,6 +92,7 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
             ("effect", "would have been named from", "what its size is"),
             [[name_label(each["name"]), f"{words.number(each['size'])} {each['unit']}",
               each["pattern"]] for each in report["detectable"]]),
+        "side_by_side": words.side_by_side(report),
         "trials": f"{len(candidates)} trials in {len({c['step'] for c in candidates})} steps",
         "candidates": _candidate_table(candidates),
         "remaining": Table(

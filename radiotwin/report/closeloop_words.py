@@ -6,6 +6,7 @@ from radiotwin.closeloop.posterior import NONE, OTHER
 from radiotwin.report.labels import INTERPOLATIONS, join_names, name_label, variable_label
 
 MAX_NAMED = 4  # variables or effects in a sentence
+MIN_DIFFERENCE_DB = 0.5  # of two receivers, to be worth a word: instruments' tolerance
 LIKELY = 0.05  # a cause that is less probable is not worth a word
 BADGES = {"effect": "found: ", "none": "no cause found", "unexplained": "unexplained",
           "undecided": "undecided"}
@@ -39,6 +40,8 @@ def closeloop_summary(report: dict) -> str:
     """
     text = {"effect": _effect, "none": _none, "unexplained": _unexplained,
             "undecided": _undecided}[report["verdict"]](report)
+    text += next((f" {_side_by_side(each)}." for each in _largest_first(report)
+                  if _differ(each["difference_db"])), "")
     interpolated = any(each["name"] in INTERPOLATIONS for each in report["effects"])
     if interpolated:
         text += (" Interpolation of what remains, which explains nothing, brings the RMSE to "
@@ -78,6 +81,11 @@ def detectable(report: dict) -> str:
     return "; ".join(sizes)
 
 
+def side_by_side(report: dict) -> list[str]:
+    """Say by how much receivers differ where both have been, the largest differences first."""
+    return [_side_by_side(each) for each in _largest_first(report)]
+
+
 def drivers(report: dict) -> list[str]:
     """Return labels of the variables that the residual depends on."""
     found = report["remaining"]["drivers"] or report.get("dependences_before", [])
@@ -102,6 +110,29 @@ def probability(value: float | None) -> str:
     if value is None:
         return "–"
     return "> 0.99" if value > 0.99 else "< 0.01" if value < 0.01 else f"{value:.2f}"
+
+
+def _largest_first(report: dict) -> list[dict]:
+    return sorted(report.get("receivers_compared", []),
+                  key=lambda each: -abs(each["difference_db"]["value"]))
+
+
+def _differ(difference_db: dict) -> bool:
+    surely = not difference_db["low"] <= 0 <= difference_db["high"]
+    return surely and abs(difference_db["value"]) >= MIN_DIFFERENCE_DB
+
+
+def _side_by_side(found: dict) -> str:
+    value, low, high = (found["difference_db"][key] for key in ("value", "low", "high"))
+    where = (f"where both were, within metres: {found['pairs']:,} pairs of readings at "
+             f"{found['places']:,} places")
+    first, second = found["first"], found["second"]
+    if low <= 0 <= high:
+        return f"{first} and {second} read alike ({number(low)} to {number(high)} dB) {where}"
+    if value < 0:
+        first, second, value, low, high = second, first, -value, -high, -low
+    return (f"{second} reads {number(value)} dB ({number(low)} to {number(high)}) more than "
+            f"{first} {where}")
 
 
 def _effect(report: dict) -> str:

@@ -26,6 +26,7 @@ PARAMETERS = {
     "lean_azimuth_deg": "azimuth of the tilt, from the heading",
     "body_depth_db": "loss through the body", "body_azimuth_deg": "body, from the heading",
     "body_elevation_deg": "body, up from the deck", "entry_loss_db": "building entry loss",
+    "scatter_sd_db": "standard deviation from place to place",
     "hidden_loss_db": "loss behind buildings",
     "limit": "limit of detection", "floor": "noise floor", "saturation_level": "saturation level",
     "strength_db": "strength relative to theory",

@@ -156,7 +156,7 @@ def _safe_names(wanted_names: Sequence[str]) -> tuple[list[str], list[Problem]]:
 
 @dataclass
 class _Loaded:
-    """What was read.
+    """Shapes of a file.
 
     Attributes:
         inside: Indices of the shapes that reach into the box, or whose place is not known.

@@ -8,7 +8,7 @@ from pathlib import Path
 from radiotwin.errors import BadInput
 from radiotwin.scene.models import UP_AXES
 
-MAP_SUFFIXES = ".osm, .osm.pbf, .geojson, .gpkg, .shp, .zip, .city.json, .gml"
+MAP_SUFFIXES = ".osm, .osm.pbf, .geojson, .gpkg, .parquet, .shp, .zip, .city.json, .gml"
 
 
 def sionna_scenes() -> dict[str, Path]:

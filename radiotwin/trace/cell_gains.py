@@ -30,8 +30,8 @@ class CellGains:
                  lattice: Lattice) -> None:
         self.settings = settings
         self.lattice = lattice
-        self._city = load_city(city, frequency_hz)
-        rt = import_sionna()
+        self._city = load_city(city, frequency_hz, settings.compute_device)
+        rt = import_sionna(settings.compute_device)
         self._solver = rt.RadioMapSolver()
         self._transmitter = rt.Transmitter("device", position=[0.0, 0.0, 0.0])
         self._city.add(self._transmitter)

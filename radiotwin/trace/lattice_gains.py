@@ -5,7 +5,7 @@ import numpy as np
 from radiotwin.execution import Executor
 from radiotwin.scene import Scene
 from radiotwin.trace.batches import BatchStore
-from radiotwin.trace.link_job import KeptBatches, Links, link_job
+from radiotwin.trace.link_job import KeptBatches, Links, link_job, link_pieces
 from radiotwin.trace.settings import FINER, SolverSettings
 
 
@@ -28,7 +28,7 @@ def solve_lattice(scene: Scene, settings: SolverSettings, store: BatchStore, ind
         RunFailed: No usable libLLVM.
     """
     pieces = lattice_pieces(scene, settings, index)
-    return _solve(scene, settings, store, pieces, executor, "tracing").reshape(len(index), -1)
+    return _solve(scene, settings, store, pieces, executor, "tracing")
 
 
 def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index: list[int],
@@ -64,7 +64,7 @@ def solve_finer(scene: Scene, settings: SolverSettings, store: BatchStore, index
     finer = settings.finer(FINER)
     pieces = lattice_pieces(scene, finer, index[rows], columns, "finer")
     gain_db = _solve(scene, finer, store, pieces, executor, "numerical noise")
-    return rows, columns, gain_db.reshape(-1, len(columns))
+    return rows, columns, gain_db
 
 
 def _plane(scene: Scene) -> int:
@@ -73,8 +73,9 @@ def _plane(scene: Scene) -> int:
 
 
 def lattice_pieces(scene: Scene, settings: SolverSettings, index: list[int],
-                   columns: np.ndarray | None = None, label: str = "") -> list[Links]:
-    """Return the pieces that a map is traced in.
+                   columns: np.ndarray | None = None, label: str = ""
+                   ) -> tuple[list[Links], np.ndarray]:
+    """Return the pieces that a map is traced in, and the order of the positions in them.
 
     Args:
         scene: City, devices and lattice.
@@ -83,17 +84,21 @@ def lattice_pieces(scene: Scene, settings: SolverSettings, index: list[int],
         columns: Indices of positions; None: all.
         label: Of their names; empty: that of a map's own.
     """
-    step = settings.batch_receivers if settings.solver == "paths" else _plane(scene)
-    label = label or ("batch" if settings.solver == "paths" else "altitude")
     points_m = scene.lattice.positions_m if columns is None else scene.lattice.positions_m[columns]
-    return [Links(f"device-{device:03d}-{label}-{start // step:05d}", scene.device_m[device],
-                  points_m[start:start + step],
-                  (scene.device_antennas[device], scene.uav_antenna), settings.batch_receivers)
-            for device in index for start in range(0, len(points_m), step)]
+    label = label or ("batch" if settings.solver == "paths" else "altitude")
+    devices = [(f"device-{device:03d}-{label}", scene.device_m[device],
+                scene.device_antennas[device]) for device in index]
+    size = settings.batch_receivers if settings.solver == "paths" else _plane(scene)
+    return link_pieces(scene, settings, devices, points_m, size)
 
 
-def _solve(scene: Scene, settings: SolverSettings, store: BatchStore, pieces: list[Links],
-           executor: Executor, description: str) -> np.ndarray:
-    """Return the gains of all pieces, one after the other [dB]."""
+def _solve(scene: Scene, settings: SolverSettings, store: BatchStore,
+           traced: tuple[list[Links], np.ndarray], executor: Executor, description: str
+           ) -> np.ndarray:
+    """Return the (devices, positions) gains of all pieces [dB]."""
+    pieces, order = traced
     job = link_job(scene, settings, description)
-    return np.concatenate(executor.run(job, pieces, KeptBatches(store)))
+    solved_db = np.concatenate(executor.run(job, pieces, KeptBatches(store)))
+    gain_db = np.empty((len(solved_db) // len(order), len(order)))
+    gain_db[:, order] = solved_db.reshape(gain_db.shape)
+    return gain_db

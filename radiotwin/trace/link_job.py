@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from radiotwin.antennas import Antenna
+from radiotwin.cuda import share_of_gpu
 from radiotwin.errors import BadInput
 from radiotwin.execution import Job, Resources
 from radiotwin.scene import Scene
@@ -17,6 +19,9 @@ from radiotwin.trace.batches import BatchStore
 from radiotwin.trace.cell_gains import CellGains
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import Antennas, PathGains
+from radiotwin.trace.tiles import PackedCity, Tile, batches_by_place, longest_path_m, tile_of
+
+GEOMETRY_COPIES = 3  # of a packed city in a worker: as received, unpacked, and a tile of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +37,7 @@ class Links:
         points_m: (n, 3) positions of the receivers [m].
         antennas: Of the device and of the receivers; None: isotropic.
         batch_receivers: As in `SolverSettings`.
+        tile: Part of the city that they are solved in; None: all of it.
     """
 
     name: str
@@ -39,6 +45,7 @@ class Links:
     points_m: np.ndarray
     antennas: Antennas
     batch_receivers: int
+    tile: Tile | None = None
 
     def __len__(self) -> int:
         return len(self.points_m)
@@ -52,6 +59,41 @@ class Links:
                         batch_receivers=step),
                 replace(self, name=f"{self.name}-half-1", points_m=self.points_m[middle:],
                         batch_receivers=step))
+
+
+def link_pieces(scene: Scene, settings: SolverSettings,
+                devices: Sequence[tuple[str, np.ndarray, Antenna | None]], points_m: np.ndarray,
+                size: int | None = None) -> tuple[list[Links], np.ndarray]:
+    """Return the links of some devices to the same points in pieces.
+
+    Points are solved together in their order, or where there are tiles by place.
+
+    Args:
+        scene: City, UAVs' antenna and limit of detection.
+        settings: Of the solver.
+        devices: Name before those of its pieces, (3,) position [m] and antenna of each.
+        points_m: (n, 3) positions of the receivers [m].
+        size: Most points of a piece; None: those of a call of the solver `paths`.
+
+    Returns:
+        The pieces, device by device, and the (n,) index of the points in their order.
+    """
+    size = size or settings.batch_receivers
+    if settings.is_tiled:
+        batches = batches_by_place(points_m, size)
+        longest_m = longest_path_m(scene)
+    else:
+        batches = [np.arange(start, min(start + size, len(points_m)))
+                   for start in range(0, len(points_m), size)]
+    pieces = []
+    for name, device_m, antenna in devices:
+        for number, batch in enumerate(batches):
+            tile = None
+            if settings.radius_m is not None and settings.is_tiled:
+                tile = tile_of(device_m, points_m[batch], settings.radius_m, longest_m)
+            pieces.append(Links(f"{name}-{number:05d}", device_m, points_m[batch],
+                                (antenna, scene.uav_antenna), settings.batch_receivers, tile))
+    return pieces, np.concatenate([np.zeros(0, dtype=int), *batches])
 
 
 class _Solve:
@@ -81,6 +123,44 @@ class SolveLinks(_Solve):
         return self._solver.gains(piece.device_m, piece.points_m, piece.antennas)
 
 
+class SolveTiles:
+    """Gains along paths in the part of the city that a piece reaches.
+
+    The solver of the last tile is kept, as neighbouring pieces may share it.
+
+    Attributes:
+        shapes: Number of shapes in that tile.
+    """
+
+    def __init__(self, scene: Scene, settings: SolverSettings) -> None:
+        self._city = PackedCity.of(read_city(scene.xml_path))
+        self._frequency_hz, self._settings = scene.config.radio.frequency_hz, settings
+        self._solved: tuple[Tile | None, int] | None = None
+        self._solver: Any = None
+        self.shapes = 0
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_solved": None, "_solver": None}
+
+    @property
+    def geometry_bytes(self) -> int:
+        """Memory that the geometry takes beside the solver's own."""
+        return GEOMETRY_COPIES * self._city.nbytes
+
+    def __call__(self, piece: Links) -> np.ndarray:
+        """Return (n,) gains [dB]."""
+        assert piece.tile is not None
+        if self._solved != (piece.tile, piece.batch_receivers):
+            self._solver = None  # frees the last one's memory first
+            settings = replace(self._settings, batch_receivers=piece.batch_receivers)
+            kept = self._city.near(piece.tile)
+            self.shapes = int(kept.sum())
+            part = self._city.part(kept)
+            self._solver = PathGains(part or None, self._frequency_hz, settings)
+            self._solved = piece.tile, piece.batch_receivers
+        return self._solver.gains(piece.device_m, piece.points_m, piece.antennas)
+
+
 class SolveCells(_Solve):
     """Gains averaged over cells, see `CellGains`; a piece is one altitude of the lattice."""
 
@@ -106,7 +186,11 @@ def link_job(scene: Scene, settings: SolverSettings, description: str) -> Job[Li
     Raises:
         BadInput: Antennas, which the solver `map` does not know.
     """
-    resources = Resources(memory_bytes=settings.memory_bytes())
+    if settings.is_tiled:
+        solve = SolveTiles(scene, settings)
+        return Job(description, solve, _resources(settings, solve.geometry_bytes), len,
+                   Links.halves, lambda first, second: np.concatenate([first, second]))
+    resources = _resources(settings)
     if settings.solver == "paths":
         return Job(description, SolveLinks(scene, settings), resources, len, Links.halves,
                    lambda first, second: np.concatenate([first, second]))
@@ -114,6 +198,14 @@ def link_job(scene: Scene, settings: SolverSettings, description: str) -> Job[Li
         raise BadInput(f"{scene.folder / 'scene.toml'} declares antennas, which the solver 'map' "
                        "does not know; use the solver 'paths'")
     return Job(description, SolveCells(scene, settings), resources, len)
+
+
+def _resources(settings: SolverSettings, geometry_bytes: int = 0) -> Resources:
+    memory_bytes = settings.memory_bytes() + geometry_bytes
+    if settings.compute_device == "cpu":
+        return Resources(memory_bytes)
+    # It is the GPU's memory; that of the processor has not been measured.
+    return Resources(memory_bytes, is_bound=False, gpu_share=share_of_gpu(memory_bytes))
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,8 @@ class Rung:
 
 
 def choose_quality(scene: Scene, points_m: np.ndarray, target_db: float,
-                   devices: list[str] | None = None, **others: str | int) -> list[Rung]:
+                   devices: list[str] | None = None, **others: str | int | float | None
+                   ) -> list[Rung]:
     """Find the quality with the fewest rays whose numerical error is within a target.
 
     160 links between the devices and the points outdoors are drawn by the settings' seed, so that

@@ -17,6 +17,7 @@ from radiotwin.trace.lattice_gains import lattice_pieces
 from radiotwin.trace.link_job import KeptBatches, Links, link_job
 from radiotwin.trace.run import device_indices, open_store
 from radiotwin.trace.settings import SolverSettings
+from radiotwin.trace.tiles import with_radius
 
 CALIBRATED = 6  # batches; the first one compiles kernels
 NOISE_SHARE = 0.1  # of the time: 1 % of the links again with ten times the rays
@@ -95,8 +96,9 @@ def plan_trace(scene: Scene, settings: SolverSettings, devices: list[str] | None
         RunFailed: As `trace_map`, or there is not enough memory for one worker.
     """
     index = device_indices(scene, devices)
+    settings = with_radius(scene, settings)
     store = open_store(scene, settings)
-    kept, pieces = KeptBatches(store), lattice_pieces(scene, settings, index)
+    kept, (pieces, _) = KeptBatches(store), lattice_pieces(scene, settings, index)
     missing = [piece for piece in pieces if kept.get(piece) is None]
     job = link_job(scene, settings, "calibrating")
     pool = LocalPool(1)

@@ -19,10 +19,11 @@ from radiotwin.pieces import KeptParts
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
 from radiotwin.tables import MAX_COORDINATE_M, Origin
-from radiotwin.trace.link_job import Links, link_job
+from radiotwin.trace.link_job import Links, link_job, link_pieces
 from radiotwin.trace.run import device_indices
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB
+from radiotwin.trace.tiles import with_radius
 
 
 def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settings: SolverSettings,
@@ -51,20 +52,22 @@ def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settin
     if settings.solver != "paths":
         raise BadInput(f"the solver {settings.solver!r} averages over lattice cells; points need "
                        "the solver 'paths'")
-    step = settings.batch_receivers
-    pieces = [Links("", one_m, points_m[start:start + step], (antenna, scene.uav_antenna), step)
-              for one_m, antenna in zip(device_m, antennas or [None] * len(device_m))
-              for start in range(0, len(points_m), step)]
+    settings = with_radius(scene, settings)
+    pieces, order = link_pieces(scene, settings, [("", *each) for each in zip(
+        device_m, antennas or [None] * len(device_m))], points_m)
     decided_by = scene.content_hash()
 
     def inputs(piece: Links) -> tuple:
         own = replace(settings, batch_receivers=piece.batch_receivers)
-        return (decided_by, own.attributes(), piece.device_m, piece.points_m, piece.antennas)
+        return (decided_by, own.attributes(), piece.device_m, piece.points_m, piece.antennas,
+                *([] if piece.tile is None else [piece.tile]))
 
     gains = (executor or Executor()).run(
         link_job(scene, settings, "tracing"), pieces,
         KeptParts("gains", inputs, lambda found: ({"gain_db": found}, len(found)), _read_gains))
-    return np.concatenate([np.zeros(0), *gains]).reshape(len(device_m), len(points_m))
+    gain_db = np.empty((len(device_m), len(points_m)))
+    gain_db[:, order] = np.concatenate([np.zeros(0), *gains]).reshape(gain_db.shape)
+    return gain_db
 
 
 def _read_gains(arrays: dict[str, np.ndarray], count: Any) -> np.ndarray:

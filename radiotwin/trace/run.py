@@ -22,6 +22,7 @@ from radiotwin.trace.noise import noise_figures
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.sionna_scene import library_versions
 from radiotwin.trace.solver import IMPOSSIBLE_DB
+from radiotwin.trace.tiles import with_radius
 
 
 def truth_path(scene: Scene, devices: list[str] | None = None) -> Path:
@@ -60,7 +61,7 @@ def trace_map(scene: Scene, settings: SolverSettings | None = None,
             be written.
         RunFailed: No usable libLLVM, or gains that physics does not allow. Nothing is written then.
     """
-    settings = settings or SolverSettings.of_quality()
+    settings = with_radius(scene, settings or SolverSettings.of_quality())
     out_path = truth_path(scene, devices) if out_path is None else out_path
     index = device_indices(scene, devices)
     if settings.solver == "map" and scene.lattice.ground_m is not None:

@@ -15,6 +15,7 @@ too high. Depth 3 instead of 4 saves a sixth of the time at a cost of 1.5 dB; pa
 (`refraction`) change one link in ten by 3.5 dB.
 """
 
+import math
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
@@ -55,6 +56,10 @@ class SolverSettings:
             model: a ray that enters one meets no inner walls, floors or furniture.
         combining: `power` adds the powers of paths (the mean over fading), `coherent` their fields.
         seed: Seed of the interactions that rays take.
+        radius_m: Culling radius [m]: what lies farther from the lines of a batch's links is left
+            out (`paths` only, see `radiotwin.trace.tiles`); infinite: nothing is. None: nothing of
+            a city of up to 5,000 shapes, else 400 m.
+        compute_device: `cpu`, or `cuda`: a GPU, whose gains differ from the processor's.
     """
 
     solver: Literal["paths", "map"] = "paths"
@@ -66,9 +71,12 @@ class SolverSettings:
     refraction: bool = False
     combining: Literal["power", "coherent"] = "power"
     seed: int = 1
+    radius_m: float | None = None
+    compute_device: Literal["cpu", "cuda"] = "cpu"
 
     def __post_init__(self) -> None:
-        for name, allowed in (("solver", ("paths", "map")), ("combining", ("power", "coherent"))):
+        for name, allowed in (("solver", ("paths", "map")), ("combining", ("power", "coherent")),
+                              ("compute_device", ("cpu", "cuda"))):
             if getattr(self, name) not in allowed:
                 raise BadInput(f"{name} = {getattr(self, name)!r} is unknown; allowed are "
                                f"{', '.join(allowed)}")
@@ -80,6 +88,17 @@ class SolverSettings:
                                 ("seed", 0, 2**31 - 1)):
             if not low <= getattr(self, name) <= high:
                 raise BadInput(f"{name} = {getattr(self, name)}: allowed is {low} to {high}")
+        if self.radius_m is not None and not self.radius_m > 0:
+            raise BadInput(f"radius_m = {self.radius_m:g}: allowed is a length above 0 m, or inf "
+                           "for the whole city")
+        if self.solver == "map" and self.is_tiled:
+            raise BadInput(f"radius_m = {self.radius_m:g}: the solver `map` follows all rays "
+                           "through the whole city; a culling radius needs the solver `paths`")
+
+    @property
+    def is_tiled(self) -> bool:
+        """Whether a batch is solved in the part of the city that its links reach."""
+        return self.radius_m is not None and math.isfinite(self.radius_m)
 
     @classmethod
     def of_quality(cls, quality: str = "default", **others: Any) -> "SolverSettings":
@@ -112,8 +131,14 @@ class SolverSettings:
         return int(MEMORY_MARGIN * (2**29 + 36 * rays))
 
     def attributes(self) -> dict[str, Any]:
-        """Return all that decides a gain, as attributes of a NetCDF file (without booleans)."""
+        """Return all that decides a gain, as attributes of a NetCDF file (without booleans).
+
+        The processor is not among them: maps of it are the same on every machine.
+        """
         own = {name: int(value) if isinstance(value, bool) else value
-               for name, value in asdict(self).items()}
+               for name, value in asdict(self).items()
+               if name != "radius_m" or self.is_tiled}
+        if self.compute_device == "cpu":
+            del own["compute_device"]
         return own | {"table_size": TABLE_SIZE, "diffraction_probability": DIFFRACTION_PROBABILITY,
                       "paths_counted": "once"}

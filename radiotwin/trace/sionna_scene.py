@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from radiotwin import llvm
-from radiotwin.errors import BadInput
+from radiotwin.cuda import Device
+from radiotwin.errors import BadInput, RunFailed
 from radiotwin.files import scratch_folder
 from radiotwin.scene.materials import permittivity, ranges_text
 from radiotwin.scene.reader import read_city
@@ -20,6 +21,7 @@ from radiotwin.threads import allowed_cores
 log = logging.getLogger(__name__)
 City = Path | str | Sequence[CityShape] | None
 """`city.xml` of a scene folder, or what `read_city` returns; None for free space."""
+_VARIANTS = {"cpu": "llvm_ad_mono_polarized", "cuda": "cuda_ad_mono_polarized"}
 
 
 def library_versions() -> dict[str, str]:
@@ -28,19 +30,27 @@ def library_versions() -> dict[str, str]:
             for name in ("sionna-rt", "mitsuba", "drjit")}
 
 
-def import_sionna() -> Any:
-    """Return the module `sionna.rt`, on a libLLVM that works.
+def import_sionna(device: Device = "cpu") -> Any:
+    """Return the module `sionna.rt`, on a libLLVM that works, or on a GPU.
+
+    A process traces on one of them: Sionna RT cannot change from one to the other.
 
     Mitsuba looks for its plugins in the working directory first, which may be the folder of a
     stranger's scene: from now on it looks for them where it is installed, and nowhere else.
 
+    Args:
+        device: `cpu`, or `cuda` for a GPU.
+
     Raises:
-        RunFailed: No usable libLLVM.
+        RunFailed: No usable libLLVM or GPU, or this process traces on another device already.
     """
-    llvm.prepare()
+    if device == "cpu":
+        llvm.prepare()
     with deferred():  # their compiled parts abort where Python raises while they are loaded
         import drjit
         import mitsuba
+
+        _set_variant(mitsuba, device)
         import sionna.rt
 
     drjit.set_thread_count(allowed_cores())
@@ -51,7 +61,20 @@ def import_sionna() -> Any:
     return sionna.rt
 
 
-def load_city(city: City, frequency_hz: float) -> Any:
+def _set_variant(mitsuba: Any, device: Device) -> None:
+    wanted, used = _VARIANTS[device], mitsuba.variant()
+    if used is None:
+        try:
+            mitsuba.set_variant(wanted)
+        except ImportError as error:
+            raise RunFailed(f"device {device}: {str(error).strip()}; `radiotwin doctor` says what "
+                            "works") from None
+    elif used != wanted:
+        raise RunFailed(f"device {device}: Mitsuba works in its variant {used} in this process "
+                        f"already, and not in {wanted}; begin a new process")
+
+
+def load_city(city: City, frequency_hz: float, device: Device = "cpu") -> Any:
     """Load a city at a frequency, with one vertically polarised isotropic antenna at every end.
 
     Mitsuba's parser, which can load other files and plugins, gets a copy that is written from what
@@ -61,15 +84,16 @@ def load_city(city: City, frequency_hz: float) -> Any:
     Args:
         city: `city.xml` of a scene folder, or what `read_city` returns; None for free space.
         frequency_hz: Frequency [Hz].
+        device: Where it is solved.
 
     Returns:
         The `sionna.rt.Scene`.
 
     Raises:
         BadInput: The file cannot be read.
-        RunFailed: No usable libLLVM.
+        RunFailed: As `import_sionna`.
     """
-    rt = import_sionna()
+    rt = import_sionna(device)
     scene = rt.load_scene(None) if city is None else _load_copy(rt, city)
     for material in scene.radio_materials.values():
         if isinstance(material, rt.ITURadioMaterial):

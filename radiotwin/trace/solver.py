@@ -43,8 +43,8 @@ class PathGains:
     def __init__(self, city: City, frequency_hz: float, settings: SolverSettings) -> None:
         self.settings = settings
         self._calls = 0
-        self._city = load_city(city, frequency_hz)
-        rt = import_sionna()
+        self._city = load_city(city, frequency_hz, settings.compute_device)
+        rt = import_sionna(settings.compute_device)
         self._solver = rt.PathSolver(deterministic=True)
         self._transmitter = rt.Transmitter("device", position=[0.0, 0.0, 0.0])
         self._receivers = [rt.Receiver(f"r{i}", position=[0.0, 0.0, 0.0])

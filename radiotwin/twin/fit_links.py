@@ -15,6 +15,7 @@ from radiotwin.channel.published import PublishedLaw
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkData, LinkGeometry, link_geometry
 from radiotwin.links.checks import BURIED, INDOORS
+from radiotwin.links.heights import height_notes
 from radiotwin.localize import (
     DeviceEstimate,
     LocalizeSettings,
@@ -194,6 +195,8 @@ def _check_positions(links: LinkData, scene: Scene) -> None:
         if odd.any():
             warnings.warn(f"{odd.sum():,} of {len(odd):,} links have their receiver {where}",
                           stacklevel=4)
+    for note in height_notes(links.receiver_m, scene):
+        warnings.warn(note, stacklevel=4)
 
 
 def level_of(links: LinkData) -> str:

@@ -5,6 +5,7 @@ import shutil
 import pandas as pd
 import pytest
 
+from radiotwin import cuda
 from radiotwin.measurements import read_measurements
 
 
@@ -120,6 +121,9 @@ def test_a_device_inside_a_building(run, here):
     ("build-scene preset:small -o measurements.csv", ["measurements.csv is a file"]),
     ("trace scene --quality best", ["quality 'best' is unknown; allowed are"]),
     ("trace scene --devices d99", ["d99"]),
+    ("trace scene --device d3", ["--device 'd3'", "auto, cpu, cuda", "--devices names radios"]),
+    pytest.param("gains scene --points no.csv --device cuda", ["--device cuda", "radiotwin doctor"],
+                 marks=pytest.mark.skipif(cuda.tracing_refusal() is None, reason="there is a GPU")),
 ])
 def test_options_that_cannot_be(run, here, arguments, parts):
     refuse(run, arguments, here, *parts)

@@ -4,7 +4,6 @@ Where the machine allows no mount (only root may), the tests of `tests/test_file
 """
 
 import contextlib
-import io
 import os
 import shlex
 import shutil
@@ -14,13 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marl.fedqmix.__main__ import app as plan
 from radiotwin.errors import RunFailed
-from radiotwin.exits import exit_status
 from radiotwin.export import EXPORTERS
 from radiotwin.survey import fly_survey, segmented_truth
 from radiotwin.trace.batches import BatchStore
-from tests.cli.conftest import as_in_a_process_of_its_own
+from tests.command_line import run_planning
 
 DISK_BYTES = 1024 * 1024
 IMPORT = """length_unit = "m"
@@ -146,11 +143,7 @@ PLANNED = ("config.json", "twin", "checkpoint.safetensors", "metrics.csv", "tens
 def planning(out, inputs):
     arguments = "--scene scene --truth segmented --twin log-distance --algorithm random --real-episodes 1 " \
                 f"--planner-iterations 50 --flights 2 --out {out}"
-    said, error = io.StringIO(), io.StringIO()
-    with as_in_a_process_of_its_own(shlex.split(arguments), inputs), contextlib.redirect_stdout(said), \
-            contextlib.redirect_stderr(error):
-        status = exit_status(plan, "")
-    return subprocess.CompletedProcess(arguments, status, said.getvalue(), error.getvalue())
+    return run_planning(shlex.split(arguments), inputs)
 
 
 @pytest.fixture(scope="module")

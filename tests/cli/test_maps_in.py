@@ -54,3 +54,33 @@ def test_a_broken_map_is_refused(run, tmp_path, what):
     for part in parts:
         assert part in said, said
     assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_crs_is_for_maps_that_name_none(run, tmp_path):
+    """A house in UTM: GeoJSON without its system, and Shapefiles with and without multipatches."""
+    geojson = '{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"height": 9}, "geometry": {"type": \
+"Polygon", "coordinates": [[[477400, 5261000], [477420, 5261000], [477420, 5261020], [477400, 5261000]]]}}]}'
+    (tmp_path / "a.geojson").write_text(geojson)
+    result = run("build-scene a.geojson -o scene", cwd=tmp_path)
+    assert result.returncode == 2 and "declare it with --crs" in result.stderr
+    result = run("build-scene a.geojson -o scene --crs EPSG:32632", cwd=tmp_path)
+    assert result.returncode == 0 and "latitude 47.5" in result.stdout
+    for given, part in ((f"{TOWN} --crs EPSG:32632", "as all of OpenStreetMap; leave --crs out"),
+                        ("a.geojson --crs EPSG:1", "--crs 'EPSG:1' is no coordinate reference system that is known"),
+                        ("a.geojson --crs +init=/etc/passwd", "is no coordinate reference system that is known")):
+        result = run(f"build-scene {given} -o other", cwd=tmp_path)
+        assert result.returncode == 2 and part in result.stderr and not (tmp_path / "other").exists()
+
+
+def test_geoparquet_and_multipatches_become_scenes(run, tmp_path):
+    import pandas as pd
+
+    from tests.footprints import test_geoparquet, test_multipatches
+
+    test_geoparquet.write(tmp_path / "a.parquet", test_geoparquet.UTM, crs={"id": {"authority": "EPSG", "code": 32632}}, height=[12.5])
+    test_multipatches.write(tmp_path, *test_multipatches.house())
+    for name, top_m, source in (("a.parquet", 12.5, "height"), ("a.shp", 15, "model")):
+        result = run(f"build-scene {name} -o scene", cwd=tmp_path)
+        assert result.returncode == 0, result.stderr
+        (row,) = pd.read_csv(tmp_path / "scene" / "buildings.csv").to_dict("records")
+        assert (row["top_m"], row["height_from"]) == (top_m, source)

@@ -1,11 +1,7 @@
 """The tutorial's commands run as they are written, and end in what it says."""
 
 import json
-import re
 import shutil
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -13,27 +9,14 @@ import pytest
 
 from radiotwin.geodesy import to_local
 from radiotwin.scene import Scene
+from tests.walk import ROOT, commands, fences, page, run
 
-ROOT = Path(__file__).parents[2]
-TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+TUTORIAL = page("tutorial.md")
 BUILDING = {"x_m": 59.4, "y_m": 0.3, "length_m": 34.0, "width_m": 36.0, "height_m": 38.0}  # of examples/campaign/make.py
 
 
-def commands(text):
-    """Return the arguments of each radiotwin command in the fences of a page."""
-    lines = "\n".join(re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)).splitlines()
-    return [line.split("#")[0].split()[1:] for line in lines if line.startswith("radiotwin ")]
-
-
-def run(arguments, folder):
-    done = subprocess.run([sys.executable, "-m", "radiotwin.cli", *arguments], cwd=folder, capture_output=True, text=True,
-                          timeout=1800)
-    assert done.returncode == 0, (arguments, done.stderr)
-    return done.stdout + done.stderr
-
-
 def until_the_loop(page):
-    return [each for each in commands(page)[:4] if each[0] != "close-loop"]
+    return [each for each in commands(page)[:4] if each[1] != "close-loop"]
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +29,7 @@ def walked(tmp_path_factory):
 
 def test_the_first_commands_make_a_scene_measurements_and_a_twin(walked):
     folder, said = walked
-    assert [each[0] for each in until_the_loop(TUTORIAL)] == ["build-scene", "import", "fit", "map"]
+    assert [each[1] for each in until_the_loop(TUTORIAL)] == ["build-scene", "import", "fit", "map"]
     assert "39 buildings" in TUTORIAL and "height tag: 39" in said[0]
     assert "3,600 readings" in TUTORIAL and "3600 links, 271 not detected" in said[1]
     assert (folder / "level.png").stat().st_size > 10_000
@@ -55,7 +38,7 @@ def test_the_first_commands_make_a_scene_measurements_and_a_twin(walked):
 
 
 def test_the_settings_shown_are_those_of_the_file():
-    shown = re.search(r"^```toml\n(.*?)^```", TUTORIAL, re.MULTILINE | re.DOTALL)[1]
+    shown, = fences(TUTORIAL, "toml")
     file = (ROOT / "examples" / "campaign" / "log.toml").read_text(encoding="utf-8")
     assert [line.split("#")[0].strip() for line in shown.splitlines()] == \
         [line.split("#")[0].strip() for line in file.splitlines() if not line.startswith("#")]
@@ -64,7 +47,7 @@ def test_the_settings_shown_are_those_of_the_file():
 def test_the_readme_has_the_same_commands():
     readme = commands((ROOT / "README.md").read_text(encoding="utf-8"))
     missing = [each for each in commands(TUTORIAL) if each not in readme]
-    assert {each[0] for each in missing} <= {"close-loop", "map"}
+    assert {each[1] for each in missing} <= {"close-loop", "map"}
 
 
 @pytest.mark.slow

@@ -3,20 +3,11 @@
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.predictor import CombinedPrediction
 from radiotwin.closeloop.result_file import make_report
 from radiotwin.closeloop.run import close_loop
 from radiotwin.errors import BadInput
 
-
-@pytest.fixture(autouse=True)
-def predicted_by_the_model_alone(monkeypatch):
-    """A third of the time goes into what predicts best, which has tests of its own."""
-    def alone(model, *_):
-        mean_db = model.held_out_mean_db
-        return CombinedPrediction(mean_db, ["named"], np.ones((2, 1)), mean_db[:, None], np.zeros(len(mean_db)),
-                                  {"log_distance": mean_db})
-    monkeypatch.setattr("radiotwin.closeloop.run.combined_prediction", alone)
+pytestmark = pytest.mark.usefixtures("predicted_by_the_model_alone")
 
 
 def run(measurements, seed=0):

@@ -65,6 +65,7 @@ def test_what_was_found_is_reported_for_each_receiver(links):
         "body_depth_db[r1]": 8, "body_azimuth_deg[r1]": 60, "body_elevation_deg[r1]": 5}
 
 
+@pytest.mark.whole_loop
 def test_a_body_is_found_in_a_flight(open_ground, loop):
     """One receiver of two loses 9 dB behind, 0 in front; the other is clear."""
     world = open_ground.fly(31)

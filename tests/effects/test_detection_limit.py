@@ -41,6 +41,7 @@ def test_no_limit_is_proposed_for_receivers_as_declared_even_if_they_lose_links(
     assert DetectionLimit().propose(seen([DECLARED_DB] * 2, dropout_probability)) == []
 
 
+@pytest.mark.whole_loop
 def test_close_loop_finds_it(open_ground, loop):
     """Receiver r1 is less sensitive than r0, and the file declares neither's limit."""
     world = open_ground.fly(3, limit_db=-500.0)

@@ -59,10 +59,12 @@ def test_text_of_another_code_page(tmp_path):
     assert read_shapefile(path).features[0].tags["name"] == "Straße"
 
 
-@pytest.mark.parametrize("suffix", [".dbf", ".prj"])
-def test_a_missing_part(town, suffix):
+@pytest.mark.parametrize(("suffix", "message"), [
+    (".dbf", "the Shapefile a has no .dbf; keep its .shp, .dbf and .prj together"),
+    (".prj", "the Shapefile a has no .prj, which names its coordinate reference system")])
+def test_a_missing_part(town, suffix, message):
     town.with_suffix(suffix).unlink()
-    with pytest.raises(BadInput, match=f"the Shapefile a has no {suffix}; keep its .shp, .dbf and .prj together"):
+    with pytest.raises(BadInput, match=message):
         read_shapefile(town)
 
 

@@ -26,6 +26,10 @@ GNETTRACK = ("Timestamp\tLongitude\tLatitude\tSpeed\tOperator\tCGI\tNode\tCellID
 NETMONITOR = ("report;sys_time;sim_state;net_type;tech;mcc;mnc;lac_tac;node_id;cid;psc_pci;rssi;rsrq;rssnr;gps;accuracy;lat;long;band;arfcn;\n"
               "0;20240301100000;READY;LTE;LTE;262;1;100;7;1;12;-95;-9;100;1;3;48.1;11.5;1800;1300;\n"
               "1;20240301100001;READY;LTE;LTE;262;1;100;7;1;12;0;0;2147483647;1;3;48.1001;11.5;1800;1300;\n")
+GMON = ("BSSID;LAT;LON;SSID;Crypt;Beacon Interval;Connection Mode;Channel;RXL;Date;Time\n"
+        "00:01:E3:A8:1B:A8;48.10000;11.50000;cafe;?;-88;Infra;6;-86;2014/01/12;16:39:58\n"
+        "00:02:6F:5F:EA:76;NaN;NaN;bnet;WpaPsk;-5089;Infra;4;-90;2012/09/23;20:15:00\n"
+        "00:14:A9:74:FA:40;48.10010;11.50000;((o)) city;Open;-70;Infra;6;-68;2014/01/04;15:12:53\n")
 TEMS = ("Time\tMS\tAll-Latitude Decimal Degree (Text)\tAll-Longitude Decimal Degree (Text)\tServing Cell RSRP (dBm)[1]\t"
         "Serving Cell DL EARFCN[1]\tServing Physical Cell ID[1]\n"
         "10:00:00\tMS1\t48.1\t11.5\t-95\t1300\t12\n10:00:01\tMS1\t48.1001\t11.5\t\t1300\t12\n")
@@ -108,6 +112,14 @@ def test_netmonitor(bring_in):
     result, table, formats = imported(bring_in, NETMONITOR, time_zone="UTC")
     assert formats == ["netmonitor"] and list(table["rssi_dbm"]) == [-95] and list(table["device"]) == ["LTE 262-1-100-7-1"]
     assert result.report["left_out"][0]["reason"] == "not measured"
+
+
+def test_g_mon_logs_wi_fi_networks(bring_in):
+    result, table, formats = imported(bring_in, GMON, "gmon_wlan.txt", time_zone="Europe/Berlin")
+    assert formats == ["g-mon"] and list(table["rssi_dbm"]) == [-86, -68]
+    assert list(table["device"]) == ["00:01:E3:A8:1B:A8", "00:14:A9:74:FA:40"]
+    assert table["time_s"].iloc[0] == pd.Timestamp("2014-01-12 15:39:58Z").timestamp()
+    assert [each["readings"] for each in result.report["left_out"]] == [1]  # one without a position
 
 
 def test_tems(bring_in):
@@ -200,8 +212,8 @@ def test_what_is_declared_overrules_the_format(bring_in):
     assert formats == ["ttn-mapper"] and set(table["device"]) == {"node1"} and list(table["rssi_dbm"]) == [-84, -119]
     with pytest.raises(BadInput, match=r"is not of format ttn-mapper, which has the columns .*; it has MAC"):
         imported(bring_in, WIGLE, format="ttn-mapper")
-    with pytest.raises(BadInput, match="format 'gmon' is unknown; allowed are wigle, "):
-        imported(bring_in, WIGLE, format="gmon")
+    with pytest.raises(BadInput, match="format 'nemo' is unknown; allowed are wigle, "):
+        imported(bring_in, WIGLE, format="nemo")
 
 
 @pytest.mark.parametrize("each", FORMATS, ids=lambda each: each.name)

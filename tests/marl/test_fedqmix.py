@@ -14,6 +14,7 @@ import pytest
 
 from marl.checkpoint import load_checkpoint
 from marl.options import settings_of
+from radiotwin import cuda
 
 SMALL = ("--truth segmented --real-episodes 2 --episodes 40 --batch 8 --replay 40 --flights 8 "
          "--planner-iterations 300 ")
@@ -120,6 +121,8 @@ def flat(value):
     ("--fly-again true", ["No such option: --fly-again"]),
     ("--batch 64 --replay 32", ["replay 32", "64"]),
     ("--guide planner --algorithm greedy", ["guide planner", "greedy does not learn"]),
+    pytest.param("--device cuda", ["--device cuda: ", "radiotwin doctor"], marks=pytest.mark.skipif(
+        cuda.torch_refusal() is None, reason="there is a GPU")),
     ("--device tpu", ["--device tpu", "auto|cpu|cuda"]),
     ("--out result --resume", ["nothing to resume"])])
 def test_bad_input_is_one_message_and_leaves_nothing(words, parts, small_scene, tmp_path):

@@ -28,7 +28,7 @@ from marl.checkpoint import load_checkpoint  # noqa: E402
 from marl.fedqmix import flower_client  # noqa: E402
 from marl.fedqmix.client import Party  # noqa: E402
 from marl.fedqmix.flower_records import arrays_of  # noqa: E402
-from marl.fedqmix.flower_run import Federation, free_port  # noqa: E402
+from marl.fedqmix.flower_run import Federation, Processes, free_port  # noqa: E402
 from marl.fedqmix.flower_server import Record, make_strategy  # noqa: E402
 from marl.fedqmix.keys import make_node_key  # noqa: E402
 from marl.fedqmix.session import FederatedSession, federate  # noqa: E402
@@ -307,6 +307,18 @@ def test_a_party_that_is_killed_comes_back(shared, parties, tmp_path):
     assert done == {"rounds": 12, "evaluated": 3}
     [table] = [pd.read_csv(path) for path in parties[1].folder.glob("run-[0-9]*/metrics.csv")]
     assert 4 <= table["simulated_episodes"].iloc[-1] < 48
+
+
+def test_what_a_process_that_ended_has_left_is_ended_too(tmp_path):
+    """As a SuperNode that was refused: what it had started looks only now and then whether it is still there."""
+    processes = Processes(tmp_path, tmp_path, {"MARK_OF_TEST": str(tmp_path)})
+    processes.start("short", ["sh", "-c", "sleep 300 & sleep 300 & exit 3"])
+    end = time.monotonic() + 20
+    while processes.is_running("short") and time.monotonic() < end:
+        time.sleep(0.05)
+    assert len(left_over(tmp_path)) == 2
+    processes.close()
+    assert not left_over(tmp_path)
 
 
 @pytest.mark.slow

@@ -103,6 +103,20 @@ def test_how_probable_it_is_and_what_would_have_been_seen_is_said(tmp_path):
     assert "belong to places" in closeloop_summary(report("none"))
 
 
+@pytest.mark.parametrize("ends, sentence, in_lead", [
+    ((-4.0, -4.8, -3.1), "A reads 4.00 dB (3.10 to 4.80) more than B", True),
+    ((2.7, 0.4, 4.9), "B reads 2.70 dB (0.40 to 4.90) more than A", True),
+    ((0.4, 0.1, 0.7), "B reads 0.40 dB (0.10 to 0.70) more than A", False),
+    ((0.2, -0.5, 0.9), "A and B read alike (−0.50 to 0.90 dB)", False)])
+def test_receivers_that_were_at_the_same_places_are_compared(tmp_path, ends, sentence, in_lead):
+    difference_db = dict(zip(("value", "low", "high"), ends), unit="dB")
+    content = report(receivers_compared=[
+        {"first": "A", "second": "B", "difference_db": difference_db, "pairs": 1234, "places": 56}])
+    sentence += " where both were, within metres: 1,234 pairs of readings at 56 places"
+    assert f"<li>{sentence}</li>" in page(content, tmp_path)
+    assert (sentence in closeloop_summary(content)) == in_lead
+
+
 def test_numbers_that_are_not_known_are_dashes(tmp_path):
     unknown = report("none", baselines={"log_distance": NOTHING}, dependences_before=[])
     unknown["error"] |= {"before": NOTHING, "after": NOTHING}

@@ -4,9 +4,10 @@ import pytest
 
 from radiotwin.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
+from tests.command_line import run
 from tests.worlds import narrow_street, open_ground
 
-__all__ = ["narrow_street", "open_ground"]
+__all__ = ["narrow_street", "open_ground", "run"]
 
 
 @pytest.fixture(scope="session")

@@ -1,9 +1,6 @@
 """Devices in a file: few links of many receivers and blanks count, and bad input is one message."""
 
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -20,7 +17,6 @@ from radiotwin.measurements import Measurements
 from radiotwin.twin import Twin, TwinDevice
 from radiotwin.twin import locate as module
 
-COMMAND = Path(sys.executable).with_name("radiotwin")
 LIMIT_DB, GATEWAYS, PACKETS = -115.0, 30, 3
 
 
@@ -53,11 +49,7 @@ def test_a_device_is_found_by_three_packets_of_each_gateway_and_by_the_silence_o
     assert np.hypot(found["x_m"][0] - there_m[0], found["y_m"][0] - there_m[1]) < 100
 
 
-def run(*words):
-    return subprocess.run([str(word) for word in (COMMAND, *words)], capture_output=True, text=True, timeout=300)
-
-
-def test_the_command_finds_an_unknown_device_and_says_how_far_off_it_is(tmp_path, open_ground):
+def test_the_command_finds_an_unknown_device_and_says_how_far_off_it_is(run, tmp_path, open_ground):
     world = open_ground.fly(12)
     world.gain_db[world.receiver == 0] -= 6.0
     data = open_ground.measured(world)
@@ -66,12 +58,11 @@ def test_the_command_finds_an_unknown_device_and_says_how_far_off_it_is(tmp_path
     hidden.loc[4, "role"] = "unknown"
     Measurements(data.table, hidden).write(tmp_path / "flight" / "measurements.csv")
     data.devices.to_csv(tmp_path / "truth.csv", index=False)
-    done = run("close-loop", tmp_path / "flight" / "measurements.csv", "-o", tmp_path / "loop")
+    done = run("close-loop flight/measurements.csv -o loop", tmp_path)
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "loop" / "closeloop.json").read_text())
     assert report["effects"][0]["name"] == "receiver_gain_offset"
-    done = run("locate", tmp_path / "flight" / "measurements.csv", "--twin", tmp_path / "loop" / "twin",
-                   "--truth", tmp_path / "truth.csv", "-o", tmp_path / "located.csv")
+    done = run("locate flight/measurements.csv --twin loop/twin --truth truth.csv -o located.csv", tmp_path)
     assert done.returncode == 0, done.stderr
     located = pd.read_csv(tmp_path / "located.csv").iloc[0]
     assert located["device"] == "d4" and located["links"] == 720
@@ -81,14 +72,14 @@ def test_the_command_finds_an_unknown_device_and_says_how_far_off_it_is(tmp_path
 
 @pytest.mark.parametrize("role, twin, message", [
     ("anchor", "loop/twin", "role unknown"), ("unknown", "nowhere", "not a twin")])
-def test_bad_input_is_one_message(tmp_path, open_ground, role, twin, message):
+def test_bad_input_is_one_message(run, tmp_path, open_ground, role, twin, message, monkeypatch):
     data = open_ground.measured(open_ground.fly(13))
     data.write(tmp_path / "flight" / "measurements.csv")
     if role == "anchor":
+        monkeypatch.setattr("radiotwin.closeloop.run.catalogue", list)  # whatever the loop would find
         loop = close_loop(data, base="log-distance")
         corrected_twin(loop, None).save(tmp_path / "loop" / "twin")
-    done = run("locate", tmp_path / "flight" / "measurements.csv", "--twin", tmp_path / twin,
-                   "-o", tmp_path / "located.csv")
+    done = run(f"locate flight/measurements.csv --twin {twin} -o located.csv", tmp_path)
     assert done.returncode == 2 and message in done.stderr and "Traceback" not in done.stderr
     assert not (tmp_path / "located.csv").exists()
 

@@ -73,7 +73,7 @@ def case(family: str, seed: int) -> Case:
     if family not in GROUP:
         raise ValueError(f"family {family!r} does not exist; there are {', '.join(GROUP)}")
     where = world_of(family, seed)
-    plain_db, effects = tables.load(tables.world_key(where), where)
+    plain_db, effects = tables.load(tables.world_key(where.group, where.seed), where)
     traced_db = plain_db
     if is_traced(family, seed):
         traced_db, effects = tables.load(tables.case_key(family, seed), where)
@@ -91,7 +91,7 @@ def case(family: str, seed: int) -> Case:
 
 def stored(family: str, seed: int) -> bool:
     """Return whether the tables of a case are there."""
-    needed = {tables.world_key(world_of(family, seed))}
+    needed = {tables.world_key(GROUP[family], seed)}
     if is_traced(family, seed):
         needed.add(tables.case_key(family, seed))
     return needed <= tables.keys()

@@ -94,7 +94,7 @@ def main() -> None:
 def make_table(group: str, seed: int, family: str | None, again: bool = False) -> None:
     """Trace a world, or a case in it, and store the table, unless it is there; a case's world comes first."""
     where = world(group, seed)
-    key = tables.case_key(family, seed) if family else tables.world_key(where)
+    key = tables.case_key(family, seed) if family else tables.world_key(where.group, where.seed)
     if key in tables.keys() and not again:
         return
     if family is not None:
@@ -104,7 +104,7 @@ def make_table(group: str, seed: int, family: str | None, again: bool = False) -
         effects, gain_db = [], trace_world(where)
     else:
         effects = traced_effects(family, seed)
-        gain_db = trace_case(where, effects, tables.load(tables.world_key(where), where)[0])
+        gain_db = trace_case(where, effects, tables.load(tables.world_key(where.group, where.seed), where)[0])
     tables.save(key, where, gain_db, effects)
     print(f"{key}: {time.monotonic() - started:.0f} s", flush=True)
 

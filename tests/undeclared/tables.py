@@ -1,6 +1,7 @@
 """Traced gains in one archive: steps of 0.02 dB in 16 bits, a case as the difference from its world."""
 
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,9 @@ STEP_DB = 0.02
 NO_PATH = -32768
 
 
-def world_key(world: World) -> str:
+def world_key(group: str, seed: int) -> str:
     """Return the archive's name of a world with nothing hidden."""
-    return f"world-{world.group}-{world.seed}"  # a group may be called as a family is
+    return f"world-{group}-{seed}"  # a group may be called as a family is
 
 
 def case_key(family: str, seed: int) -> str:
@@ -23,12 +24,13 @@ def case_key(family: str, seed: int) -> str:
     return f"{family}-{seed}"
 
 
-def keys() -> set[str]:
+@cache
+def keys() -> frozenset[str]:
     """Return the names of all tables in the archive."""
     if not PATH.is_file():
-        return set()
+        return frozenset()
     with np.load(PATH, allow_pickle=False) as archive:
-        return {name.split("/")[0] for name in archive.files}
+        return frozenset(name.split("/")[0] for name in archive.files)
 
 
 def save(key: str, world: World, gain_db: np.ndarray, effects: list[dict]) -> None:
@@ -46,11 +48,12 @@ def save(key: str, world: World, gain_db: np.ndarray, effects: list[dict]) -> No
         with np.load(PATH, allow_pickle=False) as archive:
             content = dict(archive.items())
     if effects:
-        steps = steps - content[f"{world_key(world)}/steps"]  # overflows, and `load` undoes it
+        steps = steps - content[f"{world_key(world.group, world.seed)}/steps"]  # overflows, and `load` undoes it
     content |= {f"{key}/steps": steps, f"{key}/positions_m": _positions_m(world),
                 f"{key}/effects": np.array(json.dumps(effects))}
     with atomic_path(PATH) as temporary, open(temporary, "wb") as file:
         np.savez_compressed(file, **content)
+    keys.cache_clear()
 
 
 def load(key: str, world: World) -> tuple[np.ndarray, list[dict]]:
@@ -69,7 +72,7 @@ def load(key: str, world: World) -> tuple[np.ndarray, list[dict]]:
                              f"`python -m tests.undeclared.make --only {key.rsplit('-', 1)[0]} --again`")
         steps, effects = archive[f"{key}/steps"], json.loads(str(archive[f"{key}/effects"]))
         if effects:
-            steps = steps + archive[f"{world_key(world)}/steps"]
+            steps = steps + archive[f"{world_key(world.group, world.seed)}/steps"]
     return np.where(steps == NO_PATH, np.nan, steps * STEP_DB), effects
 
 

@@ -242,7 +242,7 @@ def test_the_declared_folder_is_the_generated_city(city):
 
 def test_a_table_of_another_draw_is_refused():
     with pytest.raises(ValueError, match="earlier draw"):
-        tables.load(tables.world_key(world("receivers", 0)), world("receivers", 1))
+        tables.load(tables.world_key("receivers", 0), world("receivers", 1))
 
 
 def test_unknown_families_are_named():

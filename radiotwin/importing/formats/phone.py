@@ -66,4 +66,17 @@ FORMATS = (
          "not_measured": ["empty", "null", 0, _UNKNOWN]},
         caution="times are those of the telephone: give its --time-zone. "
                 "gps = 0 is a row without a fix: --only gps=1. " + _MIXED.format("tech")),
+    Format(
+        "g-mon", "G-MoN, text log of Wi-Fi networks",
+        {"level": "RXL", "device": "BSSID", "time": "{Date} {Time}", "latitude": "LAT",
+         "longitude": "LON"},
+        ("BSSID", "LAT", "LON", "SSID", "Crypt", "Beacon Interval", "Connection Mode", "Channel",
+         "RXL", "Date", "Time"),
+        "RXL of the network, dBm",
+        "header and rows as in public readers of its files; no description by its author was found",
+        {"level_unit": "dBm", "time_format": "%Y/%m/%d %H:%M:%S",
+         "not_measured": ["empty", "?"]},
+        caution="times are those of the telephone: give its --time-zone. The files that are known "
+                "have few rows of a network, over months: a fit needs many. Its log of cells is "
+                "not known, and needs --columns"),
 )

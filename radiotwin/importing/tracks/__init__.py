@@ -1,4 +1,4 @@
-"""Positions of a receiver over time: GPX, NMEA, PX4 ULog, or a table; joined with a log in time."""
+"""Positions of a receiver over time: from files of its own, joined with a log in time."""
 
 from radiotwin.importing.tracks.join import add_tracks
 

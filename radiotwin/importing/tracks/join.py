@@ -17,6 +17,7 @@ from radiotwin.importing.times import ISO, seconds
 from radiotwin.importing.tracks.fixes import COLUMNS, Fixes, make_fixes
 from radiotwin.importing.tracks.gpx import read_gpx
 from radiotwin.importing.tracks.nmea import read_nmea
+from radiotwin.importing.tracks.rosbag import is_rosbag, read_rosbag
 from radiotwin.importing.tracks.ulog import read_ulog
 
 _READERS = {".gpx": read_gpx, ".nmea": read_nmea, ".nma": read_nmea, ".ulg": read_ulog}
@@ -74,6 +75,11 @@ def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
 
 def _read(track: TrackFile) -> Fixes:
     path = Path(track.file)
+    if is_rosbag(path):
+        return read_rosbag(path, track.topic)
+    if track.topic is not None:
+        raise BadInput(f"{path} is no ROS bag, and has no topic {track.topic!r}; leave the topic "
+                       "out, or give a .bag, .mcap or .db3 file")
     if path.suffix.lower() in _READERS:
         return _READERS[path.suffix.lower()](path)
     source = read_source(path)

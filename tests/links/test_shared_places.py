@@ -1,0 +1,76 @@
+"""Receivers compared where both were, in walks whose places confound a regression over all links."""
+
+import numpy as np
+import pytest
+
+from radiotwin.links import LinkData
+from radiotwin.links.shared_places import receiver_differences
+
+OFFSET_DB, SQUARE_M = -4.0, 100.0
+
+
+def walked(seed, offset_db=OFFSET_DB, limit_db=-np.inf, devices=4):
+    """Two phones on the same streets, apart by GPS; the second is also where levels are 8 dB higher."""
+    rng = np.random.default_rng(seed)
+    device_m = np.column_stack([rng.uniform(0, 1000, (devices, 2)), np.full(devices, 20.0)])
+    street_m = np.arange(0.0, 1000.0, 2.0)
+    shadow_db = rng.normal(0, 8, (devices, 2, 11))  # of a device in each piece of a street
+
+    def levels(place_m, device, street):
+        distance_m = np.linalg.norm(place_m - device_m[device], axis=1)
+        return -40 - 30 * np.log10(distance_m) + shadow_db[device, street, (place_m[:, 0] // SQUARE_M).astype(int)]
+
+    rows = []
+    for receiver, streets in ((0, (0,)), (1, (0, 1))):
+        for street in streets:
+            for device in range(devices):
+                there_m = np.column_stack([street_m, np.full((len(street_m), 1), 400.0 * street),
+                                           np.full(len(street_m), 1.5)])
+                level_db = levels(there_m, np.full(len(street_m), device), np.full(len(street_m), street))
+                level_db += receiver * offset_db + 8.0 * street + rng.normal(0, 2, len(street_m))
+                told_m = there_m + np.append(rng.normal(0, 0.5, (len(street_m), 2)), np.zeros((len(street_m), 1)), 1)
+                rows.append((told_m, np.full(len(street_m), device), np.full(len(street_m), receiver), level_db))
+    receiver_m, device, receiver, level_db = (np.concatenate(part) for part in zip(*rows))
+    level_db = np.where(level_db < limit_db, np.nan, level_db)
+    n, unknown = len(level_db), np.full(len(level_db), np.nan)
+    return LinkData(level_db, np.full(n, limit_db), receiver_m, device_m, device, receiver, np.zeros(n, int), unknown,
+                    unknown, [f"d{i}" for i in range(devices)], ["A", "B"], ["walk"], 3.6e9, None, False,
+                    frozenset(range(devices)))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_difference_is_that_of_shared_places(seed):
+    links = walked(seed)
+    (found,) = receiver_differences(links)
+    assert found.low_db < OFFSET_DB < found.high_db
+    assert found.difference_db == pytest.approx(OFFSET_DB, abs=0.4) and found.high_db - found.low_db < 2.0
+    assert found.pairs > 1500 and found.places > 100
+    over_all_db = np.mean(links.level_db[links.receiver == 1]) - np.mean(links.level_db[links.receiver == 0])
+    assert abs(over_all_db - OFFSET_DB) > 2.0
+
+
+def test_intervals_hold_as_often_as_they_say():
+    hits = [found.low_db <= OFFSET_DB <= found.high_db for seed in range(20)
+            for found in receiver_differences(walked(seed, devices=2))]
+    assert len(hits) == 20 and np.mean(hits) >= 0.75
+
+
+def test_devices_that_differ_by_themselves_widen_the_interval():
+    links = walked(0)
+    each_db = np.array([-6.0, -2.0, 3.0, 6.0])
+    links.level_db[links.receiver == 1] += each_db[links.device[links.receiver == 1]]
+    (found,) = receiver_differences(links)
+    assert found.high_db - found.low_db > 6.0
+
+
+def test_a_limit_of_detection_does_not_choose_the_pairs():
+    links = walked(1, limit_db=-130.0)
+    assert 0.1 < np.isnan(links.level_db).mean() < 0.6
+    (found,) = receiver_differences(links)
+    assert found.difference_db == pytest.approx(OFFSET_DB, abs=0.6)
+
+
+def test_receivers_that_never_met_are_not_compared():
+    links = walked(0)
+    links.receiver_m[links.receiver == 1] += [0.0, 50.0, 0.0]
+    assert receiver_differences(links) == []
