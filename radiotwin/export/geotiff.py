@@ -94,7 +94,7 @@ def _write_parts(radio_map: RadioMap | MapStream, path: Path, profile: dict[str,
                                                                                          height)
                 indexes = list(range(bands.start + 1, bands.stop + 1))
                 file.write(values, indexes=indexes, window=Window.from_slices(*window))
-                sums.append((indexes, window, zlib.crc32(values)))
+                sums.append((indexes, window, zlib.crc32(values.data)))
             describe(file)
         try:
             with rasterio.open(temporary) as file:
