@@ -17,6 +17,8 @@ from radiotwin.scene.lattice import Lattice
 from radiotwin.tables import Origin
 
 DIMS = ("device", "z", "y", "x")
+NETCDF, ZARR = ".nc", ".zarr"  # suffixes of radio maps
+VARIABLES = ("gain_db", "los", "sigma_db")
 SCHEMA = "radiotwin.radiomap/1"
 CONVENTIONS = "CF-1.11"  # https://cfconventions.org
 GRID_MAPPING = "crs"
@@ -200,6 +202,16 @@ def write_blocks(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[
                     break  # the disk is full: the rest would be made for nothing
                 for name, values in block.values.items():
                     opened[name][block.where] = values.astype(opened[name].dtype, copy=False)
+
+
+def is_zarr(path: Path | str) -> bool:
+    """Return whether the name of a radio map is that of a Zarr folder."""
+    return Path(path).suffix == ZARR
+
+
+def is_map(path: Path | str) -> bool:
+    """Return whether a path has the suffix of a radio map."""
+    return Path(path).suffix in (NETCDF, ZARR)
 
 
 def with_cf(dataset: xr.Dataset) -> xr.Dataset:
