@@ -98,6 +98,11 @@ class MapStream:
         """Return the map of some of its devices on some levels of its lattice."""
         return replace(self, devices=devices, lattice=lattice)
 
+    def thinned(self, step: int) -> "MapStream":
+        """Return the map of every n-th position in x and in y."""
+        every = slice(None, None, step)
+        return replace(self, lattice=self.lattice.part(slice(None), every, every))
+
     @property
     def header(self) -> xr.Dataset:
         """Coordinates and attributes of the dataset that it would be."""

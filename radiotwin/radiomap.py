@@ -71,8 +71,10 @@ class RadioMap(OverDevices):
         return cls(dataset)
 
     @classmethod
-    def collect(cls, stream: MapStream) -> "RadioMap":
-        """Make all blocks of a stream and keep them in memory."""
+    def collect(cls, stream: "MapStream | RadioMap") -> "RadioMap":
+        """Return a map in memory: all blocks of a stream, or all values of an opened map."""
+        if isinstance(stream, RadioMap):
+            return cls(stream.dataset.load())
         shape = (len(stream.devices), *stream.lattice.shape)
         arrays = {name: np.empty(shape, bool if name == "los" else np.float32)
                   for name in stream.variables}
@@ -181,9 +183,14 @@ class RadioMap(OverDevices):
         levels, rows, columns = self.lattice.shape
         source = str(self.attributes.get("source", "")) or "unknown source"
         size = f"{columns} × {rows} × {levels} positions (x, y, z)"
-        seen = np.isfinite(self.gain_db)
-        values_db = self.gain_db[seen]
-        gains = span(float(values_db.min()), float(values_db.max()), "dB") if seen.any() else "–"
+        seen, low_db, high_db = 0, np.inf, -np.inf
+        for block in self.blocks():  # of an opened map: it may be larger than the memory
+            values_db = block.values["gain_db"]
+            seen += int(np.isfinite(values_db).sum())
+            low_db = min(low_db, float(np.fmin.reduce(values_db, axis=None, initial=np.inf)))
+            high_db = max(high_db, float(np.fmax.reduce(values_db, axis=None, initial=-np.inf)))
+        gains = span(low_db, high_db, "dB") if seen else "–"
+        missing = 1 - seen / self.dataset["gain_db"].size
         origin = self.origin
         frequency_hz = self.attributes.get("frequency_hz")
         return Summary("RadioMap", f"{source}, {count(len(self), 'device')}, {size}, "
@@ -192,7 +199,7 @@ class RadioMap(OverDevices):
             ("step", f"{self.lattice.step_m:g} m"),
             ("altitudes", some(f"{z:g}" for z in self.lattice.z_m) + " m"),
             ("frequency", "–" if frequency_hz is None else f"{frequency_hz / 1e9:g} GHz"),
-            ("gain", gains), ("without a gain", f"{1 - seen.mean():.1%}"),
+            ("gain", gains), ("without a gain", f"{missing:.1%}"),
             ("standard deviation", "sigma_db" if "sigma_db" in self.variables else "none"),
             ("origin", "not known" if origin is None else
              f"latitude {origin.latitude_deg:g}°, longitude {origin.longitude_deg:g}°")))
@@ -219,6 +226,11 @@ class RadioMap(OverDevices):
     def selected(self, devices: list[str], lattice: Lattice) -> "RadioMap":
         """Return the map of some of its devices on some levels of its lattice."""
         return RadioMap(self.dataset.sel(device=devices, z=lattice.z_m))
+
+    def thinned(self, step: int) -> "RadioMap":
+        """Return the map of every n-th position in x and in y."""
+        every = slice(None, None, step)
+        return RadioMap(self.dataset.isel(y=every, x=every))
 
     @property
     def header(self) -> xr.Dataset:
