@@ -57,6 +57,8 @@ def check_zarr_target(path: Path) -> None:
         BadInput: zarr is not installed, or `path` is a file, or a folder with something else.
     """
     require_zarr(path)
+    if path.exists() and not path.is_dir():
+        raise BadInput(f"{path} is a file; a radio map in Zarr is a folder: choose another name")
     if path.is_dir() and any(path.iterdir()) and not (path / METADATA).is_file():
         raise BadInput(f"{path} is a folder with other content than a radio map; choose another "
                        "name")

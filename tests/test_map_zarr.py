@@ -14,6 +14,7 @@ from radiotwin.errors import BadInput
 from radiotwin.map_file import BLOCK_VALUES, MapStream
 from radiotwin.map_writing import write_parts
 from radiotwin.radiomap import RadioMap
+from radiotwin.report import export_map
 from radiotwin.scene.lattice import Lattice
 
 zarr = pytest.importorskip("zarr", reason="the package zarr is not installed")
@@ -84,6 +85,18 @@ def test_a_large_map_is_written_a_block_a_piece(tmp_path):
     xr.testing.assert_identical(RadioMap.load(tmp_path / "map.zarr").dataset, RadioMap.collect(stream).dataset)
 
 
+def test_the_size_is_said_before_a_large_map_is_written(small_scene, tmp_path, monkeypatch):
+    lattice, said = small_scene.lattice, []
+    gain_db = np.full((2, *lattice.shape), -80.0)
+    radio_map = RadioMap.build(["a", "b"], lattice, gain_db, gain_db < 0)
+    export_map(radio_map, small_scene, tmp_path / "map.zarr", tell=said.append)
+    assert not said
+    monkeypatch.setattr("radiotwin.report.map_export.TOLD_LINKS", 100)
+    export_map(radio_map, small_scene, tmp_path / "map.zarr", tell=said.append)
+    links = int(np.prod(lattice.shape))
+    assert f"{2 * links:,} links in 2 parts, of which one ({links:,} links) is in memory" in said[0]
+
+
 def test_a_run_that_fails_leaves_the_older_map(folder):
     def broken():
         yield next(example().blocks())
@@ -103,6 +116,9 @@ def test_a_folder_with_other_things_is_not_replaced(tmp_path):
     assert (tmp_path / "map.zarr" / "diary.txt").read_text() == "dear"
     with pytest.raises(BadInput, match="no part of a radio map"):
         RadioMap.load(tmp_path / "map.zarr")
+    (tmp_path / "file.zarr").touch()
+    with pytest.raises(BadInput, match="is a file; a radio map in Zarr is a folder"):
+        example().save(tmp_path / "file.zarr")
 
 
 def piece(folder):

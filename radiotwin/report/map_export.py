@@ -1,5 +1,6 @@
 """Write the radio map of a file or of a twin in the format of another program, or as a picture."""
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,6 +16,7 @@ from radiotwin.scene import Scene
 from radiotwin.twin import Twin
 
 FORMATS: dict[str, Callable[[RadioMap, Scene, Path], None]] = EXPORTERS | {".png": write_picture}
+TOLD_LINKS = 1_000_000
 MAX_ORIGIN_DIFFERENCE = 1e-6  # [degrees, or metres of altitude] of one place, after rounding
 
 
@@ -48,7 +50,7 @@ def export_map(source: RadioMap | Twin, scene: Scene, path: Path | str, *,
         devices: names, in the order wanted; None: all.
         altitudes_m: altitudes of the lattice [m]; None: all.
         name: of the source in messages.
-        tell: called with the size of a Zarr map before it is written.
+        tell: called with the size of a Zarr map of over `TOLD_LINKS` before it is written.
 
     Returns:
         What was written.
@@ -65,8 +67,9 @@ def export_map(source: RadioMap | Twin, scene: Scene, path: Path | str, *,
         whole = source.map_stream(scene)
     selected = select(whole, None if devices is None else list(devices),
                       None if altitudes_m is None else list(altitudes_m))
-    if tell is not None and is_zarr(path):
-        tell(f"{path}: {size_of(selected.lattice.shape, len(selected.devices))}")
+    shape = selected.lattice.shape
+    if tell is not None and is_zarr(path) and len(selected.devices) * math.prod(shape) > TOLD_LINKS:
+        tell(f"{path}: {size_of(shape, len(selected.devices))}")
     write_map(selected, scene, path, FORMATS)
     return selected
 

@@ -121,7 +121,7 @@ def test_bad_requests(run, folder, arguments):
 
 def test_a_map_in_parts(run, folder):
     result = run("map map.nc --scene scene -o out/map.zarr", cwd=folder)
-    assert result.returncode == 0 and "of which one" in result.stderr, result.stderr
+    assert result.returncode == 0, result.stderr
     result = run("map out/map.zarr --scene scene -o again.nc", cwd=folder)
     assert result.returncode == 0, result.stderr
     again, whole = (RadioMap.load(folder / name) for name in ("again.nc", "out/map.zarr"))
