@@ -120,7 +120,10 @@ TOUCHING_CORNERS = Budget("TOUCHING_CORNERS", 5_000_000,
 # Radio maps
 MAP_VALUES = Budget("MAP_VALUES", 500_000_000, "values", "one variable of a radio map")
 MAP_AXIS = Budget("MAP_AXIS", 20_000_000, "coordinates", "one axis of a radio map")
-MAP_CHUNKS = Budget("MAP_CHUNKS", 1_000_000, "pieces", "a variable as HDF5 stores it")
+MAP_STREAM_VALUES = Budget("MAP_STREAM_VALUES", 100_000_000_000, "values",
+                           "one variable of a radio map in Zarr that is read in parts")
+MAP_CHUNKS = Budget("MAP_CHUNKS", 1_000_000, "pieces", "a variable as HDF5 or Zarr stores it")
+MAP_PIECE_BYTES = Budget("MAP_PIECE_BYTES", 2**27, "bytes", "one piece of a radio map in Zarr")
 MAP_ATTRIBUTES = Budget("MAP_ATTRIBUTES", 1_000, "attributes", "one variable")
 COVERAGE_CELLS = Budget("COVERAGE_CELLS", 25_000_000, "cells",
                         "a coverage map: 40 bytes each in memory")

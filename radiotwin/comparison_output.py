@@ -23,6 +23,7 @@ from radiotwin.compare import (
 from radiotwin.errors import BadInput
 from radiotwin.execution import Executor
 from radiotwin.files import atomic_path
+from radiotwin.map_file import is_zarr
 from radiotwin.measurements import Measurements
 from radiotwin.radiomap import RadioMap
 from radiotwin.records import Number, Record, Whole, read_record, validated
@@ -120,7 +121,7 @@ def judge_also(paths: list[Path], truth: RadioMap | None, held_out: list[str],
     """
     twins, maps = {}, {}
     for path in paths:
-        if path.is_dir():
+        if path.is_dir() and not is_zarr(path):
             twins[str(path)] = Twin.load(path)
             fitted_to = set(twins[str(path)].provenance.get("flights", []))
             seen = sorted(fitted_to & set(held_out))

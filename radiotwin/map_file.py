@@ -17,6 +17,8 @@ from radiotwin.scene.lattice import Lattice
 from radiotwin.tables import Origin
 
 DIMS = ("device", "z", "y", "x")
+NETCDF, ZARR = ".nc", ".zarr"  # suffixes of radio maps
+VARIABLES = ("gain_db", "los", "sigma_db")
 SCHEMA = "radiotwin.radiomap/1"
 CONVENTIONS = "CF-1.11"  # https://cfconventions.org
 GRID_MAPPING = "crs"
@@ -95,6 +97,11 @@ class MapStream:
     def selected(self, devices: list[str], lattice: Lattice) -> "MapStream":
         """Return the map of some of its devices on some levels of its lattice."""
         return replace(self, devices=devices, lattice=lattice)
+
+    def thinned(self, step: int) -> "MapStream":
+        """Return the map of every n-th position in x and in y."""
+        every = slice(None, None, step)
+        return replace(self, lattice=self.lattice.part(slice(None), every, every))
 
     @property
     def header(self) -> xr.Dataset:
@@ -200,6 +207,16 @@ def write_blocks(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[
                     break  # the disk is full: the rest would be made for nothing
                 for name, values in block.values.items():
                     opened[name][block.where] = values.astype(opened[name].dtype, copy=False)
+
+
+def is_zarr(path: Path | str) -> bool:
+    """Return whether the name of a radio map is that of a Zarr folder."""
+    return Path(path).suffix == ZARR
+
+
+def is_map(path: Path | str) -> bool:
+    """Return whether a path has the suffix of a radio map."""
+    return Path(path).suffix in (NETCDF, ZARR)
 
 
 def with_cf(dataset: xr.Dataset) -> xr.Dataset:

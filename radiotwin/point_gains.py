@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import xarray as xr
 
 from radiotwin.budgets import ROWS
 from radiotwin.errors import BadInput
@@ -62,9 +63,10 @@ def gains_at(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray,
     points_m = np.asarray(points_m, dtype=float).reshape(-1, 3)
     inside = scene.city.inside(points_m)
     if isinstance(source, RadioMap):
-        rows = [source.devices.index(name) for name in devices]
-        flat = source.gain_db.reshape(len(source.devices), -1).astype(float)
-        gain_db = flat[rows][:, source.lattice.index_of(points_m)]
+        places = np.unravel_index(source.lattice.index_of(points_m), source.lattice.shape)
+        z, y, x = (xr.DataArray(place, dims="point") for place in places)
+        gain_db = source.dataset["gain_db"].sel(device=list(devices)).isel(
+            z=z, y=y, x=x).transpose("device", "point").values.astype(float)
     else:
         source.require_map(scene)
         row_of = {each.device: row for row, each in enumerate(source.devices)}

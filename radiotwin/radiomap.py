@@ -1,7 +1,7 @@
 """The radio map: channel gain at every lattice position for every device."""
 
-import math
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,41 +9,30 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import xarray as xr
 
-from radiotwin.budgets import DEVICES, MAP_AXIS
 from radiotwin.display.style import GAIN_COLOURS, level_range_db, plain
 from radiotwin.display.summary import Summary, count, some, span
-from radiotwin.errors import BadInput
-from radiotwin.hdf5 import check_hdf5
-from radiotwin.inputs import open_input
 from radiotwin.map_difference import MapDifference
 from radiotwin.map_file import (
     ATTRIBUTES,
     DIMS,
-    GAIN_RANGE_DB,
     GROUND,
-    MAX_SIGMA_DB,
+    VARIABLES,
     MapBlock,
     MapStream,
     header,
     parts_of,
     placed_attributes,
-    without_cf,
-    write_blocks,
 )
+from radiotwin.map_reading import load_dataset, open_dataset
 from radiotwin.map_view import OverDevices, map_table, pick, plot_values
-from radiotwin.measurement_columns import MAX_COORDINATE_M
+from radiotwin.map_writing import write_parts
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
-from radiotwin.tables import MAX_NAME, Origin
+from radiotwin.tables import Origin
 
 if TYPE_CHECKING:
     from geopandas import GeoDataFrame
     from matplotlib.axes import Axes
-
-_VARIABLES = ("gain_db", "los", "sigma_db")
-MIN_STEP_M = 1e-3
-_NUMBERS = ("frequency_hz", "gain_limit_db", "origin_latitude_deg", "origin_longitude_deg",
-            "origin_altitude_m", "shadowing_share", "shadowing_length_m")  # among the attributes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -82,8 +71,10 @@ class RadioMap(OverDevices):
         return cls(dataset)
 
     @classmethod
-    def collect(cls, stream: MapStream) -> "RadioMap":
-        """Make all blocks of a stream and keep them in memory."""
+    def collect(cls, stream: "MapStream | RadioMap") -> "RadioMap":
+        """Return a map in memory: all blocks of a stream, or all values of an opened map."""
+        if isinstance(stream, RadioMap):
+            return cls(stream.dataset.load())
         shape = (len(stream.devices), *stream.lattice.shape)
         arrays = {name: np.empty(shape, bool if name == "los" else np.float32)
                   for name in stream.variables}
@@ -95,53 +86,50 @@ class RadioMap(OverDevices):
 
     @classmethod
     def load(cls, path: Path | str) -> "RadioMap":
-        """Read a NetCDF-4 file.
+        """Read a NetCDF-4 file, or a Zarr folder, into memory.
 
         Args:
-            path: of the file, as `save` makes it.
+            path: as `save` makes it; `NAME.zarr` is a Zarr folder.
 
         Raises:
-            BadInput: no such file, not NetCDF-4, or not a radio map.
+            BadInput: no such file, damaged, not a radio map, or too large for the memory.
         """
-        path = Path(path)
-        if not path.exists():
-            raise BadInput(f"{path} does not exist; `radiotwin trace` or `radiotwin map` makes a "
-                           "radio map")
-        with open_input(path, "radio map (.nc)") as file:
-            try:
-                check_hdf5(file, path)
-                with xr.open_dataset(file, engine="h5netcdf") as opened:
-                    problem = _form_problem(opened)
-                    names = [*(name for name in _VARIABLES if name in opened), *DIMS,
-                             *([GROUND] if GROUND in opened.variables else [])]
-                    dataset = opened if problem else opened[names].load().set_coords(
-                        [name for name in names if name == GROUND])
-            except BadInput:
-                raise
-            except Exception as error:  # h5py raises OSError, KeyError or ValueError, by the damage
-                raise BadInput(f"{path} is not a readable NetCDF-4 file ({error}); make it again"
-                               ) from None
-        problem = problem or _value_problem(dataset)
-        if problem:
-            raise BadInput(f"{path} is not a radio map: {problem}; `radiotwin trace` or "
-                           "`radiotwin map` makes one")
-        dataset["los"] = dataset["los"].astype(bool)
-        return cls(without_cf(dataset.drop_encoding()))
+        return cls(load_dataset(Path(path)))
 
     read = load  # the name of version 0.1
 
-    def save(self, path: Path | str) -> None:
-        """Write compressed NetCDF-4 by the CF conventions, atomically.
+    @classmethod
+    @contextmanager
+    def open(cls, path: Path | str) -> Iterator["RadioMap"]:
+        """Open a NetCDF-4 file, or a Zarr folder, whose values stay there until they are used.
+
+        It has been read once, in parts, and checked. `save`, `blocks` and `selected` keep one part
+        in memory, `dataset.isel` what it selects; `gain_db` and `los` read everything.
 
         Args:
-            path: of the file.
+            path: as `save` makes it.
+
+        Yields:
+            The map; its values can be read until the context ends.
+
+        Raises:
+            BadInput: as `load`.
+        """
+        with open_dataset(Path(path)) as dataset:
+            yield cls(dataset)
+
+    def save(self, path: Path | str) -> None:
+        """Write the map by the CF conventions, atomically and part by part.
+
+        Args:
+            path: `NAME.zarr` for a Zarr folder; any other name for compressed NetCDF-4.
 
         Raises:
             BadInput: `path` cannot be written.
-            RunFailed: the disk is full or failed; an older file is unchanged.
+            RunFailed: the disk is full or failed; an older map is unchanged.
         """
-        dtypes = {name: self.dataset[name].dtype for name in self.variables}
-        write_blocks(self.header, dtypes, self.blocks(), path)
+        write_parts(self.header, {name: self.dataset[name].dtype for name in self.variables},
+                    self.blocks(), path)
 
     write = save  # the name of version 0.1
 
@@ -195,9 +183,14 @@ class RadioMap(OverDevices):
         levels, rows, columns = self.lattice.shape
         source = str(self.attributes.get("source", "")) or "unknown source"
         size = f"{columns} × {rows} × {levels} positions (x, y, z)"
-        seen = np.isfinite(self.gain_db)
-        values_db = self.gain_db[seen]
-        gains = span(float(values_db.min()), float(values_db.max()), "dB") if seen.any() else "–"
+        seen, low_db, high_db = 0, np.inf, -np.inf
+        for block in self.blocks():  # of an opened map: it may be larger than the memory
+            values_db = block.values["gain_db"]
+            seen += int(np.isfinite(values_db).sum())
+            low_db = min(low_db, float(np.fmin.reduce(values_db, axis=None, initial=np.inf)))
+            high_db = max(high_db, float(np.fmax.reduce(values_db, axis=None, initial=-np.inf)))
+        gains = span(low_db, high_db, "dB") if seen else "–"
+        missing = 1 - seen / self.dataset["gain_db"].size
         origin = self.origin
         frequency_hz = self.attributes.get("frequency_hz")
         return Summary("RadioMap", f"{source}, {count(len(self), 'device')}, {size}, "
@@ -206,18 +199,19 @@ class RadioMap(OverDevices):
             ("step", f"{self.lattice.step_m:g} m"),
             ("altitudes", some(f"{z:g}" for z in self.lattice.z_m) + " m"),
             ("frequency", "–" if frequency_hz is None else f"{frequency_hz / 1e9:g} GHz"),
-            ("gain", gains), ("without a gain", f"{1 - seen.mean():.1%}"),
+            ("gain", gains), ("without a gain", f"{missing:.1%}"),
             ("standard deviation", "sigma_db" if "sigma_db" in self.variables else "none"),
             ("origin", "not known" if origin is None else
              f"latitude {origin.latitude_deg:g}°, longitude {origin.longitude_deg:g}°")))
 
     def blocks(self) -> Iterator[MapBlock]:
         """Return the map in parts, as `MapStream.blocks` makes them."""
-        arrays = {name: self.dataset[name].values for name in self.variables}
+        arrays = {name: self.dataset[name].variable for name in self.variables}
         for row in range(self.dataset.sizes["device"]):
             for part in parts_of(self.lattice.shape):
                 where = (slice(row, row + 1), *part)
-                yield MapBlock(where, {name: array[where] for name, array in arrays.items()})
+                yield MapBlock(where, {name: array[where].values
+                                       for name, array in arrays.items()})
 
     def placed(self, origin: Origin | None) -> "RadioMap":
         """Return the same map with another origin of the local frame.
@@ -233,6 +227,11 @@ class RadioMap(OverDevices):
         """Return the map of some of its devices on some levels of its lattice."""
         return RadioMap(self.dataset.sel(device=devices, z=lattice.z_m))
 
+    def thinned(self, step: int) -> "RadioMap":
+        """Return the map of every n-th position in x and in y."""
+        every = slice(None, None, step)
+        return RadioMap(self.dataset.isel(y=every, x=every))
+
     @property
     def header(self) -> xr.Dataset:
         """Coordinates and attributes."""
@@ -241,7 +240,7 @@ class RadioMap(OverDevices):
     @property
     def variables(self) -> tuple[str, ...]:
         """`gain_db`, `los` and, of a learned map, `sigma_db`."""
-        return tuple(name for name in _VARIABLES if name in self.dataset)
+        return tuple(name for name in VARIABLES if name in self.dataset)
 
     @property
     def lattice(self) -> Lattice:
@@ -259,72 +258,3 @@ class RadioMap(OverDevices):
     def los(self) -> np.ndarray:
         """Line of sight by the 3D map, (device, z, y, x) bool."""
         return self.dataset["los"].values
-
-
-def _form_problem(dataset: xr.Dataset) -> str | None:
-    """Return the first reason why a dataset is not a radio map that is seen without its values."""
-    for name in _VARIABLES:
-        if name not in dataset.data_vars:
-            if name == "sigma_db":
-                continue
-            return f"it lacks {name}; it has {list(dataset.data_vars)[:20]}"
-        if dataset[name].dims != DIMS:
-            return f"{name} has the dims {dataset[name].dims}, it needs {DIMS}"
-        if dataset[name].dtype.kind not in ("biuf" if name == "los" else "iuf"):
-            return f"{name} holds {dataset[name].dtype}, not numbers"
-    for axis in DIMS:
-        if (axis not in dataset.coords or dataset[axis].dims != (axis,)
-                or dataset.sizes[axis] == 0):
-            return f"the coordinate {axis} is missing or empty"
-        budget = DEVICES if axis == "device" else MAP_AXIS
-        budget.check(dataset.sizes[axis], f"axis {axis} of the radio map")
-    if GROUND in dataset.variables and (
-            dataset[GROUND].dims != ("y", "x") or dataset[GROUND].dtype.kind not in "iuf"):
-        return f"{GROUND} is not numbers with the dims ('y', 'x')"
-    for name in _NUMBERS:
-        value = dataset.attrs.get(name, 0.0)
-        if not isinstance(value, int | float | np.number) or not math.isfinite(value):
-            return f"the attribute {name} is {str(value)[:60]!r}, not a finite number"
-    for name, most in (("latitude", 90), ("longitude", 180)):
-        if abs(dataset.attrs.get(f"origin_{name}_deg", 0.0)) > most:
-            return f"the attribute origin_{name}_deg is not within {most} degrees of 0"
-    return None
-
-
-def _value_problem(dataset: xr.Dataset) -> str | None:
-    """Return the first reason why the values of a dataset cannot be those of a radio map."""
-    for axis in "xyz":
-        values = dataset[axis].values
-        if (values.dtype.kind not in "iuf" or not np.isfinite(values).all()
-                or not (np.diff(values) > 0).all()):
-            return f"the coordinate {axis} must hold finite numbers in ascending order [m]"
-        if max(-float(values[0]), float(values[-1])) > MAX_COORDINATE_M or (
-                len(values) > 1 and np.diff(values).min() < MIN_STEP_M):
-            return (f"the coordinate {axis} must lie within {MAX_COORDINATE_M:,.0f} m of 0, with "
-                    f"steps of at least {MIN_STEP_M:g} m")
-    if GROUND in dataset and not (np.abs(dataset[GROUND].values) <= MAX_COORDINATE_M).all():
-        return f"{GROUND} must hold finite heights within {MAX_COORDINATE_M:,.0f} m of 0"
-    names = dataset["device"].values.astype(str)
-    unique, count = np.unique(names, return_counts=True)
-    if len(unique) < len(names):
-        return f"two devices have one name, {str(unique[count > 1][0])[:MAX_NAME]!r}"
-    for name in names.tolist():
-        if not name.isprintable() or not 0 < len(name) <= MAX_NAME:
-            return (f"device name {name[:MAX_NAME]!r} is empty, longer than {MAX_NAME} "
-                    "characters, or has some that cannot be printed")
-    gain_db = dataset["gain_db"].values
-    low_db, high_db = np.fmin.reduce(gain_db, axis=None), np.fmax.reduce(gain_db, axis=None)
-    if np.isinf(low_db) or np.isinf(high_db):
-        return "gain_db is infinite somewhere; where nothing is detected it must be NaN"
-    if low_db < GAIN_RANGE_DB[0] or high_db > GAIN_RANGE_DB[1]:
-        return (f"gain_db goes from {low_db:g} to {high_db:g} dB; allowed is "
-                f"{GAIN_RANGE_DB[0]:g} to {GAIN_RANGE_DB[1]:g}")
-    if dataset["los"].dtype != bool and not np.isin(dataset["los"].values, (0, 1)).all():
-        return "los holds other values than 0 and 1"
-    if "sigma_db" in dataset:
-        sigma_db = dataset["sigma_db"].values
-        if np.fmin.reduce(sigma_db, axis=None) < 0:
-            return "sigma_db is negative somewhere"
-        if np.fmax.reduce(sigma_db, axis=None) > MAX_SIGMA_DB:
-            return f"sigma_db is above {MAX_SIGMA_DB:g} dB somewhere"
-    return None

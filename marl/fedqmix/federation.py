@@ -1,6 +1,6 @@
 """FedQMIX: one QMIX replica for each UAV, averaged from time to time (the paper, Sec. III-C)."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from typing_extensions import override
@@ -13,15 +13,25 @@ Weights = dict[str, np.ndarray]
 
 
 def average(replicas: list[Weights]) -> Weights:
-    """Return the mean of each weight over the replicas, in new memory (paper, Eq. 14).
+    """Return the mean of each weight over the replicas, in new memory (paper, Eq. 14)."""
+    mean = weighted_mean(replicas, [1] * len(replicas))
+    return {name: mean[name].astype(first.dtype) for name, first in replicas[0].items()}
 
-    Federated averaging (McMahan et al., AISTATS 2017).
+
+def weighted_mean(replicas: Sequence[Weights], counts: Sequence[int]) -> Weights:
+    """Return the mean of each weight in double precision, whatever the order of the replicas.
+
+    Federated averaging (McMahan et al., AISTATS 2017). Products and sums of a few weights in single
+    precision are exact in double precision, but for weights of very different sizes.
 
     Args:
         replicas: the same names and shapes in each.
+        counts: of the episodes behind each.
     """
-    return {name: np.mean([weights[name] for weights in replicas], axis=0, dtype=float)
-            .astype(first.dtype) for name, first in replicas[0].items()}
+    return {name: sum((weights[name].astype(float) * count
+                       for weights, count in zip(replicas, counts, strict=True)),
+                      np.zeros_like(first, dtype=float)) / sum(counts)
+            for name, first in replicas[0].items()}
 
 
 def require_weights(given: Mapping[str, np.ndarray], like: Weights) -> None:

@@ -20,7 +20,7 @@ from flwr.serverapp.strategy import FedAvg, FedAvgM, FedProx
 
 from marl.checkpoint import save_checkpoint
 from marl.fedqmix.client import rounds_of
-from marl.fedqmix.federation import Weights, require_weights
+from marl.fedqmix.federation import Weights, require_weights, weighted_mean
 from marl.fedqmix.flower_records import arrays_of, weights_of
 from marl.fedqmix.shared import Shared, initial_weights
 from radiotwin.cells import write_csv
@@ -102,7 +102,14 @@ class _Checked(FedAvg):
             log(WARNING, "round %d: %d parties have answered, %d are needed; the mean stays",
                 server_round, len(usable), self.min_train_nodes)
             return None, None
-        return super().aggregate_train(server_round, usable)
+        # Flower multiplies before it adds. Where weights of both signs cancel, the rounding of that
+        # shows in single precision, depends on the order of the replies, and grows over rounds.
+        counts = [_episodes(reply) for reply in usable]
+        mean = weighted_mean([weights_of(reply) for reply in usable], counts)
+        merged = Message(RecordDict({"arrays": arrays_of(mean),
+                                     "metrics": MetricRecord({"num-examples": sum(counts)})}),
+                         reply_to=usable[0])
+        return super().aggregate_train(server_round, [merged])
 
     def _usable(self, reply: Message, most: int) -> bool:
         if reply.has_error():

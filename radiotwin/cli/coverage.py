@@ -1,5 +1,7 @@
 """The command that predicts the coverage of a network: coverage."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -8,6 +10,7 @@ import typer
 from radiotwin.cli.options import (
     OnlyDevices,
     OptionalScene,
+    open_model,
     parse_bounds,
     parse_numbers,
     split_names,
@@ -29,9 +32,9 @@ def add_commands(app: typer.Typer) -> None:
 
 def coverage(
     source: Annotated[Path, typer.Argument(
-        metavar="SOURCE", help="Where gains are from: a twin's folder, a radio map (.nc), or a "
-                               "scene's folder for a published law, or paths, "
-                               "over its map.")],
+        metavar="SOURCE", help="Where gains are from: a twin's folder, a radio map (.nc, "
+                               ".zarr), or a scene's folder for a published law, or paths, over "
+                               "its map.")],
     scene: OptionalScene = None,
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="Folder for tables, rasters, vectors and pictures.")
@@ -95,13 +98,14 @@ def coverage(
         classes_dbm=tuple(parse_numbers("--classes", classes)),
         rate=RateModel(*parse_numbers("--rate", rate, 3)))
     settings.check()
-    gains, world = _source(source, scene, model)
+    world = _world(source, scene, model)
     usable, notes = available_formats(world, split_names(formats))
     check_target(out, FILES)
     require_writable(out / "coverage.json")
     areas = read_areas(polygon, world) if polygon else []
     table = read_transmitters(transmitters, world) if transmitters else None
-    found = predict_coverage(gains, world, table, settings, areas, split_names(devices))
+    with _gains(source, world, model) as gains:
+        found = predict_coverage(gains, world, table, settings, areas, split_names(devices))
     with atomic_folder(out) as folder:
         write_tables(found, folder)
         write_formats(found, world, folder, usable)
@@ -113,33 +117,39 @@ def coverage(
     say(f"wrote {out}: {', '.join(sorted(path.name for path in out.iterdir()))}")
 
 
-def _source(source: Path, scene: Path | None, model: str | None,
-            ) -> "tuple[Twin | RadioMap | str, Scene]":
-    """Return the twin, the radio map, or the name of the law; and the scene."""
-    from radiotwin.radiomap import RadioMap
-    from radiotwin.report import check_map_place
+def _world(source: Path, scene: Path | None, model: str | None) -> "Scene":
+    """Return the scene of a source, once the options that go with it are checked."""
+    from radiotwin.map_file import is_map
     from radiotwin.scene import Scene
-    from radiotwin.twin import Twin
 
-    is_map, is_scene = source.suffix == ".nc", (source / "scene.toml").exists()
-    if is_scene:
+    if (source / "scene.toml").exists():
         if scene is not None:
             raise BadInput(f"{source} is a scene already; leave --scene out")
-        return model or "p1411", Scene.load(source)
+        return Scene.load(source)
     if model is not None:
         raise BadInput(f"--model is for a scene without measurements, and {source} is none; leave "
                        "it out, or give the scene's folder in place of it")
-    if not is_map and not source.is_dir():
-        raise BadInput(f"{source} is neither a folder nor a radio map (.nc); give a twin's folder, "
-                       "a radio map, or a scene's folder")
+    if not is_map(source) and not source.is_dir():
+        raise BadInput(f"{source} is neither a folder nor a radio map (.nc, .zarr); give a twin's "
+                       "folder, a radio map, or a scene's folder")
     if scene is None:
         raise BadInput(f"{source} needs the scene's 3D map; give its folder with --scene")
-    world = Scene.load(scene)
-    if not is_map:
-        return Twin.load(source), world
-    radio_map = RadioMap.read(source)
-    check_map_place(str(source), radio_map.attributes, world)
-    return radio_map, world
+    return Scene.load(scene)
+
+
+@contextmanager
+def _gains(source: Path, world: "Scene", model: str | None) -> "Iterator[Twin | RadioMap | str]":
+    """Open the twin or the radio map, or give the name of the law."""
+    from radiotwin.radiomap import RadioMap
+    from radiotwin.report import check_map_place
+
+    if (source / "scene.toml").exists():
+        yield model or "p1411"
+        return
+    with open_model(source) as opened:
+        if isinstance(opened, RadioMap):
+            check_map_place(str(source), opened.attributes, world)
+        yield opened
 
 
 def _print(found: "Coverage") -> None:

@@ -16,6 +16,7 @@ from radiotwin.cli.options import (
     Shift,
     Workers,
     in_frame_of,
+    open_model,
     split_names,
 )
 from radiotwin.console import notice, print_rows, result, say
@@ -91,12 +92,12 @@ def _note(device: "TwinDevice") -> str:
 
 def map_(
     twin: Annotated[Path, typer.Argument(
-        metavar="TWIN", help="Folder of a twin, as `fit` makes it, or a radio map (.nc), as "
-                             "`trace` makes it.")],
+        metavar="TWIN", help="Folder of a twin, as `fit` makes it, or a radio map (.nc, "
+                             ".zarr), as `trace` makes it.")],
     scene: SceneOption,
     out: Annotated[Path | None, typer.Option(
-        "--out", "-o", help="Radio map: .nc (all), .csv (a row per link), .npz (NumPy), .tif "
-                            "(GeoTIFF), .kmz (Google Earth) or .png (a picture of the lowest "
+        "--out", "-o", help="Radio map: .nc or .zarr (all), .csv (a row per link), .npz (NumPy), "
+                            ".tif (GeoTIFF), .kmz (Google Earth) or .png (a picture of the lowest "
                             "altitude) [TWIN.nc].")] = None,
     devices: OnlyDevices = None,
     altitudes: Annotated[str | None, typer.Option(
@@ -106,21 +107,19 @@ def map_(
 
     It holds the gain of every device over the scene's lattice.
     """
-    from radiotwin.radiomap import RadioMap
+    from radiotwin.map_file import is_map
     from radiotwin.report import check_map_target, export_map
     from radiotwin.scene import Scene
-    from radiotwin.twin import Twin
 
-    is_map = twin.suffix == ".nc"
-    if out is None and is_map:
+    if out is None and is_map(twin):
         raise BadInput(f"{twin} is a radio map already; give the file to write with --out")
     place = Path(os.path.realpath(twin))  # unlike resolve, it takes links in a circle
     out = out or place.with_name(f"{place.name}.nc")
     world = Scene.load(scene)
     check_map_target(out, world)
-    source = RadioMap.read(twin) if is_map else Twin.load(twin)
-    written = export_map(source, world, out, devices=split_names(devices),
-                         altitudes_m=_altitudes(altitudes), name=str(twin))
+    with open_model(twin) as source:
+        written = export_map(source, world, out, devices=split_names(devices),
+                             altitudes_m=_altitudes(altitudes), name=str(twin), tell=notice)
     say(f"wrote {out}: {len(written.devices)} devices on {written.lattice.shape} positions "
         "(z, y, x)")
 

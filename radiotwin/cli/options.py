@@ -1,6 +1,8 @@
 """Arguments and options that several commands share."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,8 +12,10 @@ from radiotwin.errors import BadInput
 
 if TYPE_CHECKING:
     from radiotwin.measurements import Measurements
+    from radiotwin.radiomap import RadioMap
     from radiotwin.scene import Scene
     from radiotwin.tables import Origin
+    from radiotwin.twin import Twin
 
 MeasurementFile = Annotated[Path, typer.Argument(
     metavar="MEASUREMENTS", help="measurements.csv, .csv.gz or .parquet, with devices.csv in the "
@@ -54,6 +58,27 @@ ComputeDevice = Annotated[str, typer.Option(
 Cluster = Annotated[str | None, typer.Option(
     metavar="auto|ADDRESS", help="Run on Ray: auto starts a cluster on this machine and ends it "
                                  "again, ADDRESS (HOST:PORT) joins one. Needs radiotwin[ray].")]
+
+
+@contextmanager
+def open_model(path: Path) -> "Iterator[RadioMap | Twin]":
+    """Open a radio map, whose values stay in its file, or load a twin.
+
+    Args:
+        path: of a radio map (.nc, .zarr), or of a twin's folder.
+
+    Raises:
+        BadInput: it is neither.
+    """
+    from radiotwin.map_file import is_map
+    from radiotwin.radiomap import RadioMap
+    from radiotwin.twin import Twin
+
+    if not is_map(path):
+        yield Twin.load(path)
+        return
+    with RadioMap.open(path) as radio_map:
+        yield radio_map
 
 
 def split_names(text: str | None) -> list[str] | None:

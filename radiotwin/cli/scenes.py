@@ -11,6 +11,7 @@ from radiotwin.cli.options import (
     PointsFile,
     SceneFolder,
     SceneOption,
+    open_model,
     parse_bounds,
     parse_numbers,
     parse_origin,
@@ -133,8 +134,8 @@ def export_scene(
 
 def export(
     source: Annotated[Path, typer.Argument(
-        metavar="TWIN", help="Folder of a twin, or a radio map (.nc) whose lattice has the "
-                             "points.")],
+        metavar="TWIN", help="Folder of a twin, or a radio map (.nc, .zarr) whose lattice "
+                             "has the points.")],
     scene: SceneOption,
     points: PointsFile,
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for nodes.csv and losses.csv.")],
@@ -146,17 +147,15 @@ def export(
     One loss for each pair: nothing moves.
     """
     from radiotwin.point_gains import export_ns3
-    from radiotwin.radiomap import RadioMap
     from radiotwin.scene import Scene
     from radiotwin.trace import read_points
-    from radiotwin.twin import Twin
 
     if to != "ns3":
         raise BadInput(f"--to {to!r} is unknown; allowed is ns3")
     world = Scene.load(scene)
-    model = RadioMap.load(source) if source.suffix == ".nc" else Twin.load(source)
-    pairs = export_ns3(model, world, read_points(points, world.config.origin, world.city), out,
-                       devices=split_names(devices))
+    ends_m = read_points(points, world.config.origin, world.city)
+    with open_model(source) as model:
+        pairs = export_ns3(model, world, ends_m, out, devices=split_names(devices))
     say(f"wrote {out / 'nodes.csv'}, {out / 'losses.csv'}: {pairs:,} pairs of a device and a point")
 
 

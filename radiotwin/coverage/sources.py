@@ -228,20 +228,26 @@ class MapSource(GainSource):
 
     def __init__(self, radio_map: RadioMap, altitude_m: float,
                  transmitters: Sequence[Transmitter]) -> None:
-        level = int(np.flatnonzero(radio_map.lattice.z_m == altitude_m)[0])
-        rows = [radio_map.devices.index(each.name) for each in transmitters]
-        self._gain_db = radio_map.gain_db[rows, level].reshape(len(rows), -1)
-        self._sd_db = None
-        if "sigma_db" in radio_map.dataset:
-            sd_db = radio_map.dataset["sigma_db"].values
-            self._sd_db = sd_db[rows, level].reshape(len(rows), -1)
+        self._level = int(np.flatnonzero(radio_map.lattice.z_m == altitude_m)[0])
+        row_of = {name: row for row, name in enumerate(radio_map.devices)}
+        self._rows = [row_of[each.name] for each in transmitters]
+        self._dataset = radio_map.dataset
         self.description = f"radio map: {radio_map.attributes.get('source', 'unknown source')}"
 
     @override
     def predict(self, row: int, receiver_m: np.ndarray, index: np.ndarray,
                 ) -> tuple[np.ndarray, np.ndarray | None]:
-        sd_db = None if self._sd_db is None else self._sd_db[row, index].astype(float)
-        return self._gain_db[row, index].astype(float), sd_db
+        sd_db = self._at("sigma_db", row, index) if "sigma_db" in self._dataset else None
+        return self._at("gain_db", row, index), sd_db
+
+    def _at(self, name: str, row: int, index: np.ndarray) -> np.ndarray:
+        """Return a variable at cells (n,); only the rows with them are read."""
+        if not len(index):
+            return np.empty(0)
+        columns = self._dataset.sizes["x"]
+        first, last = int(index.min()) // columns, int(index.max()) // columns
+        part = self._dataset[name].variable[self._rows[row], self._level, first:last + 1]
+        return part.values.ravel()[index - first * columns].astype(float)
 
 
 def over_scene(model: str, scene: Scene, transmitters: Sequence[Transmitter]) -> GainSource:

@@ -10,16 +10,16 @@ from radiotwin.budgets import MAP_VALUES
 from radiotwin.errors import BadInput
 from radiotwin.export.geotiff import write_geotiff
 from radiotwin.export.kmz import write_kmz
-from radiotwin.export.tables import write_csv, write_netcdf, write_numpy
+from radiotwin.export.tables import write_csv, write_dataset, write_numpy
 from radiotwin.map_file import MapStream
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 
 EXPORTERS: dict[str, Callable[[RadioMap, Scene, Path], None]] = {
-    ".nc": write_netcdf, ".csv": write_csv, ".npz": write_numpy, ".tif": write_geotiff,
-    ".kmz": write_kmz}
+    ".nc": write_dataset, ".zarr": write_dataset, ".csv": write_csv, ".npz": write_numpy,
+    ".tif": write_geotiff, ".kmz": write_kmz}
 STREAMED: dict[str, Callable[[RadioMap | MapStream, Scene, Path], None]] = {
-    ".nc": write_netcdf, ".csv": write_csv, ".tif": write_geotiff}
+    ".nc": write_dataset, ".zarr": write_dataset, ".csv": write_csv, ".tif": write_geotiff}
 """Formats that a map is written to while it is made."""
 _NAMED = 20  # devices, or altitudes, in a message
 
@@ -40,9 +40,9 @@ def write_map(radio_map: RadioMap | MapStream, scene: Scene, path: Path,
     if path.suffix in STREAMED:
         STREAMED[path.suffix](radio_map, scene, path)
         return
+    MAP_VALUES.check(len(radio_map.devices) * np.prod(radio_map.lattice.shape, dtype=float),
+                     f"{path}: the map, which only {', '.join(STREAMED)} take in parts")
     if isinstance(radio_map, MapStream):
-        MAP_VALUES.check(len(radio_map.devices) * np.prod(radio_map.lattice.shape, dtype=float),
-                         f"{path}: the map, which only {', '.join(STREAMED)} take in parts")
         radio_map = RadioMap.collect(radio_map)
     exporters[path.suffix](radio_map, scene, path)
 

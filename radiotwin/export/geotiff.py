@@ -1,12 +1,15 @@
 """Radio maps as GeoTIFF: one band for each device and altitude, for GIS programs."""
 
+import errno
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_file
+from radiotwin.files import atomic_file, atomic_path
 from radiotwin.geodesy import local_crs
 from radiotwin.map_file import MapBlock, MapStream
 from radiotwin.radiomap import RadioMap
@@ -44,25 +47,63 @@ def write_geotiff(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> 
     place = georeference(lattice.x_m, lattice.y_m, step_m, scene.config.origin)
     above = "" if lattice.ground_m is None else " above the ground"
     attributes = {name: str(value) for name, value in radio_map.header.attrs.items()}
-    is_large = len(names) * height * width > _WHOLE_VALUES
-    # GDAL hides errors of a full disk: it writes to memory, and we to the disk.
-    with rasterio.Env(**GDAL_OPTIONS), rasterio.MemoryFile(ext=".tif") as memory:
-        with memory.open(
-                driver="GTiff", dtype="float32", count=len(names), nodata=np.nan,
-                height=height, width=width, compress="deflate", **place,
-                **({"interleave": "band", "bigtiff": "if_safer"} if is_large else {})) as file:
-            bands = None if is_large else np.empty((len(names), height, width), np.float32)
-            for block in radio_map.blocks():
-                _put(file, bands, block, levels)
-            if bands is not None:
+    profile = {"driver": "GTiff", "dtype": "float32", "count": len(names), "nodata": np.nan,
+               "height": height, "width": width, "compress": "deflate", **place}
+
+    def describe(file: Any) -> None:
+        file.update_tags(**attributes)
+        file.units = ["dB"] * len(names)
+        for number, (device, altitude_m) in enumerate(names, start=1):
+            file.set_band_description(number, f"{device} at {altitude_m:g} m{above}")
+            file.update_tags(number, device=device, z_m=f"{altitude_m:g}")
+
+    with rasterio.Env(**GDAL_OPTIONS):
+        if len(names) * height * width > _WHOLE_VALUES:
+            _write_parts(radio_map, path, profile, describe)
+            return
+        bands = np.empty((len(names), height, width), np.float32)
+        for block in radio_map.blocks():
+            bands[_bands(block, levels), *_window(block, height)] = _north_up(block)
+        # GDAL hides errors of a full disk: it writes to memory, and we to the disk.
+        with rasterio.MemoryFile(ext=".tif") as memory:
+            with memory.open(**profile) as file:
                 file.write(bands)
-            file.update_tags(**attributes)
-            file.units = ["dB"] * len(names)
-            for number, (device, altitude_m) in enumerate(names, start=1):
-                file.set_band_description(number, f"{device} at {altitude_m:g} m{above}")
-                file.update_tags(number, device=device, z_m=f"{altitude_m:g}")
-        with atomic_file(path) as out:
-            out.write(memory.getbuffer())
+                describe(file)
+            with atomic_file(path) as out:
+                out.write(memory.getbuffer())
+
+
+def _write_parts(radio_map: RadioMap | MapStream, path: Path, profile: dict[str, Any],
+                 describe: Callable[[Any], None]) -> None:
+    """Write a large map part by part to the disk.
+
+    GDAL hides errors of a full disk: what it wrote is read again and compared by its checksums.
+
+    Raises:
+        RunFailed: the disk is full or failed.
+    """
+    import rasterio
+    from rasterio.windows import Window
+
+    levels, height, sums = len(radio_map.lattice.z_m), profile["height"], []
+    with atomic_path(path) as temporary:
+        with rasterio.open(temporary, "w", interleave="band", bigtiff="if_safer",
+                           **profile) as file:
+            for block in radio_map.blocks():
+                values, bands, window = _north_up(block), _bands(block, levels), _window(block,
+                                                                                         height)
+                indexes = list(range(bands.start + 1, bands.stop + 1))
+                file.write(values, indexes=indexes, window=Window.from_slices(*window))
+                sums.append((indexes, window, zlib.crc32(values.data)))
+            describe(file)
+        try:
+            with rasterio.open(temporary) as file:
+                is_whole = all(zlib.crc32(file.read(indexes, window=Window.from_slices(*window)))
+                               == expected for indexes, window, expected in sums)
+        except rasterio.errors.RasterioIOError:
+            is_whole = False
+        if not is_whole:
+            raise OSError(errno.ENOSPC, "the file could not be written as a whole")
 
 
 def require_rasterio(path: Path) -> Any:
@@ -100,19 +141,24 @@ def georeference(x_m: np.ndarray, y_m: np.ndarray, step_m: float,
                                                      0, -step_m, y_m[-1] + step_m / 2)}
 
 
-def _put(file: Any, bands: np.ndarray | None, block: MapBlock, levels: int) -> None:
-    """Put a block, north up, to the bands in memory, or to those of a file that is large."""
-    row, z, y, x = block.where
+def _north_up(block: MapBlock) -> np.ndarray:
+    """Return the gains (bands, rows, columns) of a block [dB], its first row in the north."""
+    gain_db = block.values["gain_db"]
+    values = gain_db.reshape(-1, *gain_db.shape[2:])[:, ::-1]
+    return np.ascontiguousarray(values, dtype=np.float32)
+
+
+def _bands(block: MapBlock, levels: int) -> slice:
+    """Return the bands of a block, counted from 0: devices first, then levels."""
+    row, z, _, _ = block.where
     first = row.start * levels + z.start
-    values = block.values["gain_db"].reshape(-1, y.stop - y.start, x.stop - x.start)
-    height = file.height if bands is None else bands.shape[1]
-    rows = slice(height - y.stop, height - y.start)
-    if bands is not None:
-        bands[first:first + len(values), rows, x] = values[:, ::-1]
-        return
-    window = ((rows.start, rows.stop), (x.start, x.stop))
-    file.write(values[:, ::-1].astype(np.float32),
-               indexes=list(range(first + 1, first + 1 + len(values))), window=window)
+    return slice(first, first + z.stop - z.start)
+
+
+def _window(block: MapBlock, height: int) -> tuple[slice, slice]:
+    """Return rows and columns of a block in a raster of so many rows, north up."""
+    _, _, y, x = block.where
+    return slice(height - y.stop, height - y.start), x
 
 
 def cell_size_m(radio_map: RadioMap | MapStream, scene: Scene) -> float:

@@ -1,4 +1,4 @@
-"""Radio maps as numbers: NetCDF, CSV and NumPy."""
+"""Radio maps as numbers: NetCDF, Zarr, CSV and NumPy."""
 
 from pathlib import Path
 
@@ -7,26 +7,27 @@ import pandas as pd
 
 from radiotwin.cells import write_csv as write_table
 from radiotwin.files import atomic_file
-from radiotwin.map_file import MapBlock, MapStream, write_blocks
+from radiotwin.map_file import MapBlock, MapStream
+from radiotwin.map_writing import write_parts
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.scene.lattice import Lattice
 
 
-def write_netcdf(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> None:
-    """Write NetCDF-4 after the CF conventions, for `xarray.open_dataset` and `RadioMap.read`.
+def write_dataset(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> None:
+    """Write NetCDF-4 or Zarr after the CF conventions, for xarray and `RadioMap.load`.
 
     Args:
         radio_map: map to write.
         scene: whose origin places the map on the globe.
-        path: of the .nc file.
+        path: of the .nc file, or the .zarr folder.
     """
     placed = radio_map.placed(scene.config.origin)
     if isinstance(placed, RadioMap):
         placed.write(path)
         return
     dtypes = {name: np.dtype(bool if name == "los" else np.float32) for name in placed.variables}
-    write_blocks(placed.header, dtypes, placed.blocks(), path)
+    write_parts(placed.header, dtypes, placed.blocks(), path)
 
 
 def write_csv(radio_map: RadioMap | MapStream, scene: Scene, path: Path) -> None:

@@ -195,7 +195,7 @@ def _thinning(run: Run) -> int:
     """Return n where every n-th position of the lattice is shown; adds a note to the run."""
     values = sum(3 * radio_map.gain_db.size for radio_map in run.maps.values())
     step = max(int(np.ceil(np.sqrt(values / MAX_VALUES))), 1)
-    if step > 1:
-        run.notes.append(f"Of the maps every {step}th position in x and in y is shown, to keep the "
-                         "page small.")
+    if step * run.map_step > 1:
+        run.notes.append(f"Of the maps every {step * run.map_step}th position in x and in y is "
+                         "shown, to keep the page small.")
     return step

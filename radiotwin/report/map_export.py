@@ -1,5 +1,6 @@
 """Write the radio map of a file or of a twin in the format of another program, or as a picture."""
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -7,14 +8,15 @@ from typing import Any
 
 from radiotwin.errors import BadInput
 from radiotwin.export import EXPORTERS, check_format, select, write_map
-from radiotwin.files import require_writable
-from radiotwin.map_file import MapStream
+from radiotwin.map_file import MapStream, is_zarr
+from radiotwin.map_writing import check_target, size_of
 from radiotwin.radiomap import RadioMap
 from radiotwin.report.map_figures import write_picture
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin
 
 FORMATS: dict[str, Callable[[RadioMap, Scene, Path], None]] = EXPORTERS | {".png": write_picture}
+TOLD_LINKS = 1_000_000
 MAX_ORIGIN_DIFFERENCE = 1e-6  # [degrees, or metres of altitude] of one place, after rounding
 
 
@@ -30,13 +32,14 @@ def check_map_target(path: Path | str, scene: Scene) -> None:
             that cannot be written.
     """
     check_format(Path(path), scene, FORMATS)
-    require_writable(path)
+    check_target(path)
 
 
 def export_map(source: RadioMap | Twin, scene: Scene, path: Path | str, *,
                devices: Sequence[str] | None = None, altitudes_m: Sequence[float] | None = None,
-               name: str = "the radio map") -> RadioMap | MapStream:
-    """Write a radio map as `.nc`, `.csv`, `.npz`, `.tif`, `.kmz` or `.png`.
+               name: str = "the radio map",
+               tell: Callable[[str], None] | None = None) -> RadioMap | MapStream:
+    """Write a radio map as `.nc`, `.zarr`, `.csv`, `.npz`, `.tif`, `.kmz` or `.png`.
 
     The map of a twin is made block by block where the format allows it.
 
@@ -47,6 +50,7 @@ def export_map(source: RadioMap | Twin, scene: Scene, path: Path | str, *,
         devices: names, in the order wanted; None: all.
         altitudes_m: altitudes of the lattice [m]; None: all.
         name: of the source in messages.
+        tell: called with the size of a Zarr map of over `TOLD_LINKS` before it is written.
 
     Returns:
         What was written.
@@ -63,6 +67,9 @@ def export_map(source: RadioMap | Twin, scene: Scene, path: Path | str, *,
         whole = source.map_stream(scene)
     selected = select(whole, None if devices is None else list(devices),
                       None if altitudes_m is None else list(altitudes_m))
+    shape = selected.lattice.shape
+    if tell is not None and is_zarr(path) and len(selected.devices) * math.prod(shape) > TOLD_LINKS:
+        tell(f"{path}: {size_of(shape, len(selected.devices))}")
     write_map(selected, scene, path, FORMATS)
     return selected
 

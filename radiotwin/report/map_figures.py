@@ -19,6 +19,7 @@ BUILDING_M = 2.0  # lowest height that is outlined
 OUTLINE_CELLS = 400  # along the longer side
 MAX_COLUMNS = 5
 MAX_PANELS = 100
+MAX_CELLS = 1_000  # along the longer side of a panel; of larger maps every n-th is drawn
 MAX_RATIO = 5  # of the sides of a panel
 ERROR_RANGE_DB = 25.0
 HeightGrid = tuple[np.ndarray, tuple[float, float, float, float]]
@@ -50,7 +51,9 @@ def radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
         scene: whose buildings are outlined.
     """
     names = radio_map.devices[:MAX_PANELS]
-    gain_db = radio_map.gain_db[:len(names), 0]
+    _, rows, columns = radio_map.lattice.shape
+    radio_map = radio_map.thinned(max(-(-max(rows, columns) // MAX_CELLS), 1))
+    gain_db = radio_map.dataset["gain_db"].variable[:len(names), 0].values
     columns = min(len(names), MAX_COLUMNS)
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     figure, axes = panels(-(-len(names) // columns), columns, 2.6,

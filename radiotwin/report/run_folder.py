@@ -1,20 +1,22 @@
 """Read the folder of a run: of a demo, a twin, a close-loop, a planning run, or a scene."""
 
+import math
 import os
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pandas as pd
 
 from radiotwin.alignment import in_known_frame
-from radiotwin.budgets import MAP_VALUES, PAGE_MAPS, PAGE_VALUES
+from radiotwin.budgets import PAGE_MAPS, PAGE_VALUES
 from radiotwin.closeloop.result_file import read_report
 from radiotwin.compare import Comparison
 from radiotwin.comparison_output import read_comparison
 from radiotwin.errors import BadInput
 from radiotwin.inputs import is_within, require_within
+from radiotwin.map_file import NETCDF, ZARR, MapStream
 from radiotwin.measurements import read_measurements
 from radiotwin.radiomap import RadioMap
 from radiotwin.records import Record, read_record, validated
@@ -24,6 +26,8 @@ from radiotwin.survey import segmented_truth
 from radiotwin.twin import Twin
 
 TRUTH = "truth"
+TRUTH_MAPS = (f"truth{NETCDF}", f"truth{ZARR}")  # of a scene's folder
+OVERVIEW_LINKS = 20_000_000  # of all maps of a page that are in memory: 9 bytes each
 MEASUREMENTS = tuple(f"{folder}measurements{suffix}" for folder in ("", "survey/")
                      for suffix in (".csv", ".csv.gz", ".parquet"))
 CONTENT = ("scene.toml, twin.json, closeloop.json, compare.json, config.json of a planning run, or "
@@ -45,6 +49,7 @@ class Run:
         folder: folder of the run.
         scene: 3D map and radio.
         maps: name -> radio map; the truth is called `truth`.
+        map_step: n where of the maps every n-th position in x and in y was read.
         twin: twin with the estimates of the devices' positions.
         tracks: flight, uav, time_s, x_m, y_m, z_m: one row for each UAV and time.
         residuals: held-out links of a close-loop, see `radiotwin.closeloop.residual_table`.
@@ -59,6 +64,7 @@ class Run:
     folder: Path
     scene: Scene | None = None
     maps: dict[str, RadioMap] = field(default_factory=dict)
+    map_step: int = 1
     twin: Twin | None = None
     tracks: pd.DataFrame | None = None
     residuals: pd.DataFrame | None = None
@@ -137,47 +143,63 @@ def _scene(run: Run, given: Path | None, named: str | None) -> Scene | None:
     return None
 
 
-
 def _read_maps(run: Run, truth: str | None) -> None:
-    """Read the truth, the twin's map and those in the folder, all over the scene's lattice."""
+    """Read the truth, the twin's map and those in the folder, all over the scene's lattice.
+
+    Of large maps every n-th position is read; the whole is never in memory.
+    """
+    with ExitStack() as stack:
+        maps = _open_maps(run, truth, stack)
+        links = sum(len(each.devices) * math.prod(each.lattice.shape) for each in maps.values())
+        run.map_step = max(math.ceil(math.sqrt(links / OVERVIEW_LINKS)), 1)
+        thinned = {name: each.thinned(run.map_step) for name, each in maps.items()}
+        PAGE_VALUES.check(sum(len(each.devices) * math.prod(each.lattice.shape)
+                              for each in thinned.values()), f"the radio maps of {run.folder}")
+        run.maps = {name: RadioMap.collect(each) for name, each in thinned.items()}
+
+
+def _open_maps(run: Run, truth: str | None, stack: ExitStack) -> dict[str, RadioMap | MapStream]:
+    """Return all maps of a run by name; their values are still in their files, or not made."""
+    maps: dict[str, RadioMap | MapStream] = {}
     if truth is not None and truth != "segmented":
-        run.maps[TRUTH] = RadioMap.read(truth)
-        if run.scene is not None and not run.scene.over_lattice(run.maps[TRUTH]):
+        given = stack.enter_context(RadioMap.open(truth))
+        if run.scene is not None and not run.scene.over_lattice(given):
             raise BadInput(f"{truth} is not over the lattice of {run.scene.folder}, so it cannot "
                            "be compared with the run; give a map of that scene")
+        maps[TRUTH] = given
     elif truth == "segmented" and run.scene is not None:
-        run.maps[TRUTH] = segmented_truth(run.scene)
-    elif run.scene is not None and (path := _first(run.scene.folder, "truth.nc")):
-        found = _read_map(path, run)
+        maps[TRUTH] = segmented_truth(run.scene)
+    elif run.scene is not None and (path := _first_map(run.scene.folder)):
+        found = stack.enter_context(RadioMap.open(path))
         try:
             run.scene.check_map(found)
-            run.maps[TRUTH] = found
+            maps[TRUTH] = found
         except BadInput as error:
-            run.notes.append(f"{run.scene.folder / 'truth.nc'} is not shown: {error}.")
+            run.notes.append(f"{path} is not shown: {error}.")
     if run.twin is not None and run.scene is not None:
-        MAP_VALUES.check(len(run.twin.devices) * int(np.prod(run.scene.lattice.shape)),
-                         f"the twin's map over the lattice of {run.scene.folder}")
-        corrected = run.twin.is_corrected
-        run.maps["twin, corrected" if corrected else "twin"] = run.twin.radio_map(run.scene)
-    truth_path = run.scene and os.path.realpath(run.scene.folder / "truth.nc")
-    paths = sorted(run.folder.glob("*.nc"))
+        name = "twin, corrected" if run.twin.is_corrected else "twin"
+        maps[name] = run.twin.map_stream(run.scene)
+    truths = [] if run.scene is None else [os.path.realpath(run.scene.folder / name)
+                                           for name in TRUTH_MAPS]
+    paths = sorted([*run.folder.glob(f"*{NETCDF}"), *run.folder.glob(f"*{ZARR}")])
     PAGE_MAPS.check(len(paths), run.folder)
     for path in paths:
-        if path.stem in run.maps or os.path.realpath(path) == truth_path:
+        if path.stem in maps or os.path.realpath(path) in truths:
             continue
-        found = _read_map(path, run)
+        found = stack.enter_context(
+            RadioMap.open(require_within(path.parent, path, str(path.parent))))
         if run.scene is not None and not run.scene.over_lattice(found):
             run.notes.append(
                 f"{path} is not shown: it is not over the lattice of {run.scene.folder}.")
         else:
-            run.maps[path.stem] = found
+            maps[path.stem] = found
+    return maps
 
 
-def _read_map(path: Path, run: Run) -> RadioMap:
-    found = RadioMap.read(require_within(path.parent, path, str(path.parent)))
-    values = sum(each.gain_db.size for each in (found, *run.maps.values()))
-    PAGE_VALUES.check(values, f"the radio maps of {run.folder}")
-    return found
+def _first_map(folder: Path) -> Path | None:
+    """Return the traced map of a scene's folder, which no link may lead elsewhere."""
+    found = next((folder / name for name in TRUTH_MAPS if os.path.exists(folder / name)), None)
+    return None if found is None else require_within(folder, found, str(folder))
 
 
 def _tracks(run: Run, measurements: Path | None) -> pd.DataFrame | None:

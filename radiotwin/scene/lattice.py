@@ -66,6 +66,16 @@ class Lattice:
         ground_m = None if self.ground_m is None else self.ground_m[y, x]
         return Lattice(self.x_m[x], self.y_m[y], self.z_m[z], ground_m)
 
+    def equals(self, other: "Lattice") -> bool:
+        """Return whether another lattice has the same positions, but for rounding."""
+        axes = ((self.x_m, other.x_m), (self.y_m, other.y_m), (self.z_m, other.z_m))
+        if any(ours.shape != theirs.shape or not np.allclose(ours, theirs)
+               for ours, theirs in axes):
+            return False
+        ours_m, theirs_m = (0.0 if each.ground_m is None else each.ground_m
+                            for each in (self, other))
+        return bool(np.allclose(ours_m, theirs_m))
+
     @property
     def above(self) -> str:
         """Reference of the altitudes, as people read it: `ground` or `datum`."""

@@ -295,8 +295,7 @@ class Scene(Summarised):
 
     def over_lattice(self, radio_map: "RadioMap") -> bool:
         """Return whether a map is over this scene's lattice."""
-        return (radio_map.gain_db.shape[1:] == self.lattice.shape
-                and np.allclose(radio_map.lattice.positions_m, self.lattice.positions_m))
+        return radio_map.lattice.equals(self.lattice)
 
     def content_hash(self) -> str:
         """Return the SHA-256 of all inputs of a gain map.

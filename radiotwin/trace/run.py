@@ -11,8 +11,8 @@ import numpy as np
 from radiotwin.budgets import MAP_VALUES
 from radiotwin.errors import BadInput
 from radiotwin.execution import Executor
-from radiotwin.files import require_writable
 from radiotwin.inputs import require_within
+from radiotwin.map_writing import check_target
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.trace.batches import BatchStore
@@ -47,7 +47,7 @@ def trace_map(scene: Scene, settings: SolverSettings | None = None,
     Args:
         scene: City, devices and lattice.
         settings: Settings of the solver; None: those of quality `default`.
-        out_path: NetCDF file to write; None: `truth_path`.
+        out_path: NetCDF file or Zarr folder to write; None: `truth_path`.
         devices: Names, in the map's order; None: all devices of the scene.
         executor: Where it runs; None: in this process. The map is the same to the bit.
 
@@ -70,7 +70,7 @@ def trace_map(scene: Scene, settings: SolverSettings | None = None,
                        f"{scene.folder / 'scene.toml'}")
     MAP_VALUES.check(len(index) * math.prod(scene.lattice.shape),
                      f"{scene.folder}: lattice positions times devices")
-    require_writable(out_path)
+    check_target(out_path)
     names = [scene.config.devices[i].device for i in index]
     store = open_store(scene, settings)
     finished = _finished(Path(out_path), store.hash, names)
@@ -140,7 +140,7 @@ def _antenna_gains(scene: Scene, index: list[int]) -> tuple[np.ndarray, np.ndarr
 
 def _finished(path: Path, trace_hash: str, devices: list[str]) -> RadioMap | None:
     """Return the map at `path` if it is the requested one."""
-    if not path.is_file():
+    if not path.exists():
         return None
     try:
         radio_map = RadioMap.read(path)

@@ -106,7 +106,7 @@ COMMANDS = [
     "survey scene --truth segmented -o {disk}/new/m.csv", "survey scene --truth segmented -o {disk}/new/m.parquet",
     "survey scene --truth segmented -o {disk}/new/m.csv.gz",
     "import m.csv --devices devices.csv --columns import.toml -o {disk}/new", "fit m.csv --scene scene --model log_distance -o {disk}/new",
-    *(f"map twin --scene scene -o {{disk}}/old{suffix}" for suffix in (*EXPORTERS, ".png")),
+    *(f"map twin --scene scene -o {{disk}}/{name}" for name in ("new.zarr", *(f"old{suffix}" for suffix in (*EXPORTERS, ".png") if suffix != ".zarr"))),
     *(f"export-scene scene -o {{disk}}/{name}" for name in ("new", "old.glb", "old.gltf", "old.obj")),
     "report twin --scene scene -o {disk}/old.html", "locate links/measurements.csv --twin corrected -o {disk}/old.csv",
     "demo -o {disk}/new",

@@ -117,3 +117,16 @@ def test_bad_requests(run, folder, arguments):
     result = run(arguments, cwd=folder)
     assert result.returncode == 2 and re.search(BAD[arguments], result.stderr), result.stderr
     assert result.stderr.count("radiotwin:") == 1 and sorted(folder.rglob("*")) == before
+
+
+def test_a_map_in_parts(run, folder):
+    result = run("map map.nc --scene scene -o out/map.zarr", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    result = run("map out/map.zarr --scene scene -o again.nc", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    again, whole = (RadioMap.load(folder / name) for name in ("again.nc", "out/map.zarr"))
+    xr.testing.assert_identical(again.dataset, whole.dataset)
+    np.testing.assert_array_equal(again.gain_db, RadioMap.load(folder / "map.nc").gain_db)
+    (folder / "out" / "map.zarr" / ".zgroup").write_text("{}")
+    result = run("map out/map.zarr --scene scene -o bad.nc", cwd=folder)
+    assert result.returncode == 2 and "format 2" in result.stderr and not (folder / "bad.nc").exists()

@@ -3,7 +3,7 @@ import pytest
 import rasterio
 from pyproj import CRS, Transformer
 
-from radiotwin.errors import BadInput
+from radiotwin.errors import BadInput, RunFailed
 from radiotwin.export.geotiff import write_geotiff
 from radiotwin.export.tables import write_csv
 from radiotwin.geodesy import to_geographic
@@ -72,6 +72,16 @@ def test_a_large_map_is_written_in_parts(scene, tmp_path, monkeypatch):
                           np.zeros((70_000, 1)), np.ones((70_000, 1)))
     with pytest.raises(BadInput, match="at most 65,535 bands, and the map has 70,000"):
         write_geotiff(many, scene, tmp_path / "many.tif")
+
+
+def test_a_large_file_that_is_not_what_was_written_is_not_kept(radio_map, scene, tmp_path, monkeypatch):
+    """As on a full disk, of which GDAL says nothing."""
+    sums = iter(range(1000))
+    monkeypatch.setattr("radiotwin.export.geotiff._WHOLE_VALUES", 0)
+    monkeypatch.setattr("radiotwin.export.geotiff.zlib.crc32", lambda data: next(sums))
+    with pytest.raises(RunFailed, match="cannot write .*map.tif"):
+        write_geotiff(radio_map, scene, tmp_path / "map.tif")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_large_table_is_written_in_parts(radio_map, scene, tmp_path, monkeypatch):

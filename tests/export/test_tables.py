@@ -73,7 +73,7 @@ def test_no_such_part(radio_map, devices, altitudes_m, message):
 
 
 def test_names_of_files(scene, small_scene, tmp_path):
-    with pytest.raises(BadInput, match=r"unknown format '.xlsx'; allowed are .nc, .csv, .npz, .tif, .kmz, .png"):
+    with pytest.raises(BadInput, match=r"unknown format '.xlsx'; allowed are .nc, .zarr, .csv, .npz, .tif, .kmz, .png"):
         check_format(tmp_path / "map.xlsx", scene, [*EXPORTERS, ".png"])
     with pytest.raises(BadInput, match=r"has no \[origin\]; add one"):
         check_format(tmp_path / "map.kmz", small_scene)

@@ -27,6 +27,7 @@ import marl.replicas  # noqa: E402
 from marl.checkpoint import load_checkpoint  # noqa: E402
 from marl.fedqmix import flower_client  # noqa: E402
 from marl.fedqmix.client import Party  # noqa: E402
+from marl.fedqmix.federation import average  # noqa: E402
 from marl.fedqmix.flower_records import arrays_of  # noqa: E402
 from marl.fedqmix.flower_run import Federation, Processes, free_port  # noqa: E402
 from marl.fedqmix.flower_server import Record, make_strategy  # noqa: E402
@@ -101,6 +102,19 @@ def test_the_mean_is_weighted_by_episodes(shared, tmp_path):
                     for weights, count in zip(parties, (10, 30, 40))) / 80
         np.testing.assert_allclose(mean[name], exact.astype(float), rtol=1e-12)
     assert (strategy.record.heard, strategy.record.episodes) == (3, 80)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 2, 0)])
+def test_the_mean_is_that_of_one_process_to_the_bit_where_weights_cancel(shared, tmp_path, order):
+    strategy, like = strategy_of(shared, tmp_path)
+    parties = [drawn(like, seed) for seed in range(2)]
+    parties.append({name: (value * np.float32(1 - 1e-5) - parties[0][name] - parties[1][name]).astype(np.float32)
+                    for name, value in parties[0].items()})
+    parties = [{name: np.abs(value) if name.startswith("square.") else value for name, value in each.items()}
+               for each in parties]
+    mean, expected = mean_of([answer(parties[i], 40) for i in order], strategy), average(parties)
+    for name in like:
+        np.testing.assert_array_equal(mean[name].astype(np.float32), expected[name])
 
 
 def test_a_round_goes_on_with_two_of_three_and_not_with_one(shared, tmp_path):
