@@ -31,6 +31,7 @@ MODULES = {"models": "models", "curve": "learning", "federation": "learning", "t
            "campus": "campus", "readings": "campus_learning",
            "away": "campus_learning", "terms": "campus_terms",
            "workers": "execution", "scheduler": "execution", "regions": "regions",
+           "nested": "nested",
            "maps": "wrong_maps", "foreign": "foreign", "calibration": "calibration"}
 """Name of a study -> its module in this package."""
 Run = Callable[[int, dict], dict]

@@ -71,18 +71,22 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
     for score in scores:
         if score.gain_by_fold.size:
             held_out = score.held_out_nats
+            # What makes links blank has no rival among what changes levels, nor among curves.
+            by_levels = bool(np.isfinite(score.evidence_nats))
             others = [each.held_out_nats for each in scores if each.name != score.name
-                      and each.gain_by_fold.size]
+                      and each.gain_by_fold.size
+                      and (by_levels or not np.isfinite(each.evidence_nats))]
             fall = np.log(before_db / score.rmse_db) if score.rmse_db > 0 else 0.0
-            nats = (score.nats, score.nats - best_unnamed, held_out,
+            nats = (score.nats, score.nats - by_levels * best_unnamed, held_out,
                     held_out - max([0.0, *others]))
             score = replace(score, features=features(nats, float(np.nan_to_num(fall)),
                                                      rest_db / noise_db))
             probability = probability_of(score.name, score.features)
-            low = not score.reason and probability < criteria.min_probability
+            low = probability < criteria.min_probability
             why = (f"it is not probable enough ({probability:.2f}; "
-                   f"{criteria.min_probability:g} is needed)")
-            score = replace(score, probability=probability, reason=why if low else score.reason)
+                   f"{criteria.min_probability:g} is needed)") if low else ""
+            score = replace(score, probability=probability,
+                            reason=why if score.passed else score.reason)
         judged.append(score)
     return judged, replace(step, probabilities=_probabilities(judged, best_unnamed, rest_db,
                                                               noise_db))

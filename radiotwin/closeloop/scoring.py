@@ -15,6 +15,8 @@ from radiotwin.effects.fold_model import FoldModel
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.evidence import cross_fit_p_value, sign_flip_p_value
 
+MIN_MOVED = 0.05  # of how much a candidate moves likelihoods in the fold where it does most
+
 
 @dataclass(frozen=True, eq=False)
 class CandidateScore:
@@ -155,6 +157,9 @@ def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score
     total, shares = float(gain[usable].sum()), by_fold(usable)
     per_link = max(gain[rows].mean() for rows in (usable, usable & los) if rows.any())
     p_value, after_db = min(tried * cross_fit_p_value(shares), 1.0), extended.rmse_db(usable)
+    # A receiver, or a device, is not in every fold.
+    moved = np.bincount(model.index[usable], np.abs(gain[usable]), len(model.folds))
+    touched = moved >= MIN_MOVED * moved.max()
     few_p = 0.0
     if block is not None:
         few_p = sign_flip_p_value(np.bincount(block[usable], weights=gain[usable]), seed)
@@ -169,8 +174,9 @@ def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score
         reason = f"its gain may be chance (p = {p_value:.2g} after correction)"
     elif few_p > criteria.max_sign_flip_p_value:
         reason = f"its gain hangs on a few places (p = {few_p:.2g} if signs are flipped)"
-    elif (shares > 0).mean() < criteria.min_gaining_folds:
-        reason = f"gains in {(shares > 0).sum()} of {len(shares)} folds only"
+    elif (shares[touched] > 0).mean() < criteria.min_gaining_folds:
+        reason = (f"gains in {(shares[touched] > 0).sum()} of the {touched.sum()} folds only that "
+                  "it acts on")
     elif per_link < criteria.min_gain_per_link_nats \
             and after_db > criteria.max_rmse_ratio * model.rmse_db(usable):
         reason = (f"gains {per_link:.3f} nats a link only, {criteria.min_gain_per_link_nats} are "

@@ -32,6 +32,9 @@ from radiotwin.execution import Executor
 from radiotwin.links import evidence_blocks
 from radiotwin.links.sites import site_of
 
+Outdone = list[tuple[Candidate, CandidateScore]]
+"""Candidates that were not scored, and why not."""
+
 
 @dataclass(eq=False)
 class SelectionResult:
@@ -108,10 +111,18 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
         if causes:
             on_progress(f"step {step + 1}: what the base may be wrong in")
             hypotheses = result.hypotheses(seed)
-        passed = _score_all(result, available, block, hypotheses, seed, on_progress)
+        passed, outdone = _score_all(result, available, block, hypotheses, seed, on_progress)
         if hypotheses is not None:
             judged = _judged(result, passed, hypotheses, step)
             passed = [each for each in judged if not each.score.reason]
+            if not passed and outdone:
+                # What gains most is not probable; what it has outdone may be.
+                unasked = {id(score) for _, score in outdone}
+                result.scores = [each for each in result.scores if id(each) not in unasked]
+                judged += _score(result, [candidate for candidate, _ in outdone], available, block,
+                                 seed, on_progress)[0]
+                judged = _judged(result, judged, hypotheses, step)
+                passed = [each for each in judged if not each.score.reason]
             if not passed:
                 pair = probable_pair(judged, result.model, result.steps[-1], block, len(available),
                                      seed, result.criteria, on_progress)
@@ -130,8 +141,12 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
 
 def _score_all(result: SelectionResult, available: list[Effect], block: np.ndarray,
                hypotheses: Hypotheses | None, seed: int,
-               on_progress: Callable[[str], None]) -> list[Passed]:
-    """Score every available effect in one step; return those that pass."""
+               on_progress: Callable[[str], None]) -> tuple[list[Passed], Outdone]:
+    """Score every available effect in one step.
+
+    Returns:
+        those that pass, and those beside which a better one made it needless to ask held-out links.
+    """
     step = len(result.model.whole.effects)
     candidates: list[Candidate] = []
     here = [each.effect for each in result.model.whole.effects]
@@ -145,11 +160,20 @@ def _score_all(result: SelectionResult, available: list[Effect], block: np.ndarr
             result.scores.append(candidate)
         else:
             candidates.append(candidate)
+    return _score(result, candidates, available, block, seed, on_progress, needless=_beyond)
+
+
+def _score(result: SelectionResult, candidates: list[Candidate], available: list[Effect],
+           block: np.ndarray, seed: int, on_progress: Callable[[str], None],
+           needless: Callable[..., bool] = lambda *_: False) -> tuple[list[Passed], Outdone]:
+    """Score candidates of one step, but for those that are `needless` beside one that passed."""
+    step = len(result.model.whole.effects)
     passed: list[Passed] = []
+    outdone: Outdone = []
     for candidate in sorted(candidates, key=lambda candidate: -candidate.gain):
         effect = candidate.effect
         better = next((each for each in passed
-                       if _beyond(each, candidate, result.model, result.criteria)), None)
+                       if needless(each, candidate, result.model, result.criteria)), None)
         if better is None:
             on_progress(f"step {step + 1}: {effect.name}, held out")
             # One more of a kind needs no correction: that there is such a thing has been shown.
@@ -164,10 +188,11 @@ def _score_all(result: SelectionResult, available: list[Effect], block: np.ndarr
                    f"is fitted to ({candidate.gain:.0f} nats)")
             score, extended = CandidateScore(effect.name, reason=why, step=step,
                                              evidence_nats=candidate.evidence), None
+            outdone.append((candidate, score))
         result.scores.append(score)
         if extended is not None:
             passed.append(Passed(effect, score, extended))
-    return passed
+    return passed, outdone
 
 
 def _judged(result: SelectionResult, passed: list[Passed], hypotheses: Hypotheses,
@@ -176,7 +201,7 @@ def _judged(result: SelectionResult, passed: list[Passed], hypotheses: Hypothese
     here = [i for i, entry in enumerate(result.scores) if entry.step == step]
     judged, summary = judge([result.scores[i] for i in here], result.model,
                             hypotheses, result.criteria)
-    result.steps.append(summary)
+    result.steps = [*(each for each in result.steps if each.number < step), summary]
     old = {id(result.scores[i]): score for i, score in zip(here, judged, strict=True)}
     found = [replace(each, score=old[id(each.score)]) for each in passed]
     for i, score in zip(here, judged, strict=True):

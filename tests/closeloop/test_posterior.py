@@ -107,6 +107,18 @@ def test_probabilities_sum_to_one_and_a_weak_candidate_is_refused(open_ground):
         assert refused == ("is not probable enough" in score.reason)
 
 
+def test_what_makes_links_blank_has_no_rival_among_what_changes_levels(open_ground):
+    """Its evidence is of held-out links only, as no residual of a level shows it."""
+    model, hypotheses = looked_at(open_ground, 5)
+    lost, offset = (CandidateScore(name, passed=True, nll_gain=nats, rmse_db=model.rmse_db(), evidence_nats=evidence,
+                                   gain_by_fold=np.full(4, nats / 4))
+                    for name, nats, evidence in (("lock_loss", 30.0, np.nan), ("foliage", 90.0, 80.0)))
+    alone, beside = (judge(scores, model, hypotheses, CRITERIA)[0][0] for scores in ([lost], [lost, offset]))
+    assert beside.probability == pytest.approx(alone.probability) and beside.features[0] == beside.features[1]
+    (weaker,) = (score for score in judge([lost, offset, lost], model, hypotheses, CRITERIA)[0] if score.name == "foliage")
+    assert weaker.features[3] < judge([offset], model, hypotheses, CRITERIA)[0][0].features[3]
+
+
 def test_more_evidence_is_never_less_probable():
     nats = np.arange(0.0, 300.0, 10.0)
     found = [probability_of("foliage", features((each,) * 4, 0.01 * each, 1.0)) for each in nats]

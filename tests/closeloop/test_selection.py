@@ -1,7 +1,9 @@
 """Candidates are scored on held-out links, and refused where those do not support them."""
 
 import numpy as np
+import pytest
 
+from radiotwin.closeloop import posterior
 from radiotwin.closeloop.bases import LogDistanceBase
 from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import CrossValidatedModel, cross_validate, training_parts
@@ -30,3 +32,37 @@ def test_a_candidate_that_no_held_out_link_can_judge_is_refused(open_ground):
     extended.held_out_nll = np.full(len(links), np.nan)
     score = score_model(model, extended, CandidateScore("device_gain_offset"), None, 1, 0, SelectionCriteria())
     assert "no held-out link" in score.reason
+
+
+@pytest.mark.parametrize(("gains", "passes"), [((40, 30, 0, 0, 0, 0), True), ((40, -8, 0, 0, 0, 0), False),
+                                               ((40, 30, -8, -8, -8, 0), False)])
+def test_folds_that_a_candidate_does_not_act_on_do_not_vote(open_ground, gains, passes):
+    """A receiver that was on two of six flights shows its fault on these two."""
+    links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
+    folds = make_folds(links, 0)
+    model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
+    index = np.arange(len(links)) % 6
+    six = CrossValidatedModel(model.whole, model.folds[:1] * 6, model.fits[:1] * 7, index, model.twin)
+    per_link = np.array(gains)[index] / np.bincount(index)[index] * model.whole.view(model.fits[0]).design_effect
+    six.held_out_nll = model.held_out_nll
+    extended = CrossValidatedModel(six.whole, six.folds, six.fits, index, six.twin)
+    extended.held_out_nll = model.held_out_nll - per_link
+    score = score_model(six, extended, CandidateScore("lock_loss"), None, 1, 0, SelectionCriteria())
+    assert ("folds" in score.reason) == (not passes)
+
+
+def test_what_an_improbable_candidate_has_outdone_is_asked_as_well(open_ground, monkeypatch):
+    """A receiver that is 6 dB off gains so much that nothing else is scored, unless it is not believed."""
+    world = open_ground.fly(3)
+    world.gain_db[world.receiver == 1] += 6.0
+    measurements = open_ground.measured(world)
+    loop = close_loop(measurements, base="log-distance")
+    assert [each.effect.name for each in loop.after.whole.effects][:1] == ["receiver_gain_offset"]
+    outdone = {score.name for score in loop.selection.scores if score.step == 0 and "gains more on" in score.reason}
+    believed = posterior.probability_of
+    monkeypatch.setattr(posterior, "probability_of", lambda name, values: (
+        0.1 if name == "receiver_gain_offset" else believed(name, values)))
+    again = close_loop(measurements, base="log-distance")
+    first = [score for score in again.selection.scores if score.step == 0 and score.name != "unexplained_trend"]
+    assert outdone and outdone <= {score.name for score in first if score.gain_by_fold.size}
+    assert len(first) == len([score for score in loop.selection.scores if score.step == 0])  # none twice
