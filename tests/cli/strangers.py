@@ -85,14 +85,18 @@ def forked(run, command, folder, until=None):
             os._exit(status)
         finally:
             os._exit(71)
-    started = time.monotonic()
+    # What this process holds already is the child's, too, and is no fault of the command's.
+    held, started = resident_bytes(os.getpid()), time.monotonic()
     while not (done := os.wait4(child, os.WNOHANG))[0]:
         with contextlib.suppress(OSError, ValueError, IndexError):
-            resident = int(Path(f"/proc/{child}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-            if resident > MAX_BYTES or time.monotonic() - started > MAX_S or (until and until.exists()):
+            if resident_bytes(child) - held > MAX_BYTES or time.monotonic() - started > MAX_S or (until and until.exists()):
                 os.kill(child, signal.SIGKILL)
         time.sleep(0.005)
     return os.waitstatus_to_exitcode(done[1]), said.read_text(encoding="utf-8")
+
+
+def resident_bytes(process):
+    return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def planning(command, folder, file):

@@ -41,7 +41,8 @@ def test_gains(run, folder, asked, monkeypatch):
     monkeypatch.setattr("radiotwin.trace.points.trace_gains", traced)
     done = run("gains scene --points points.csv --devices d0,d1 --sum coherent --seed 3 --target-db 1 -o g.csv", folder)
     assert done.returncode == 0, done.stderr
-    assert asked == [(2, 1.0, ["d0", "d1"], {"combining": "coherent", "seed": 3})]
+    [(*what, others)] = asked
+    assert what == [2, 1.0, ["d0", "d1"]] and others.items() >= {"combining": "coherent", "seed": 3}.items()
     assert used == [SolverSettings.of_quality("default", combining="coherent", seed=3)]
     assert "99 links" in done.stdout and "minutes for 4 links" in done.stdout and "--target-db 1: quality default" in done.stdout
 
@@ -55,7 +56,8 @@ def test_trace(run, folder, asked, monkeypatch):
     done = run("trace scene --devices d0 --target-db 1 -o map.nc", folder)
     assert done.returncode == 0, done.stderr
     assert RadioMap.read(folder / "map.nc").dataset.attrs["samples_per_src"] == 100_000
-    assert asked[0][1:] == (1.0, ["d0"], {"solver": "paths", "combining": "power", "seed": 1})
+    assert asked[0][1:3] == (1.0, ["d0"])
+    assert asked[0][3].items() >= {"solver": "paths", "combining": "power", "seed": 1}.items()
 
 
 @pytest.mark.parametrize(("options", "message"), [
