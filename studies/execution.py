@@ -30,7 +30,7 @@ SAMPLE_S = 0.2
 
 def worker_cases(seed: int) -> dict[str, dict]:
     """Return places; each has one core a process, so that speeds are comparable."""
-    return {name: {"scene": "rbm", "quality": "fast", "devices": 2, "points": 1000, "place": name}
+    return {name: {"scene": "rbm", "quality": "fast", "devices": 5, "points": 3000, "place": name}
             for name in PLACES}
 
 
