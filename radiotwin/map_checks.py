@@ -1,4 +1,4 @@
-"""What a dataset of a stranger must have to be a radio map: its form, then its values by parts."""
+"""Checks that a stranger's dataset is a radio map: of its form, then of its values by parts."""
 
 import math
 from collections.abc import Iterator

@@ -43,7 +43,7 @@ _ADVICE = ("write it again with radiotwin, or with xarray's to_zarr(…, zarr_fo
 
 @dataclass(frozen=True)
 class _Array:
-    """What the description of an array says about its pieces."""
+    """Pieces of an array, by its description."""
 
     grid: tuple[int, ...]
     piece_bytes: int

@@ -30,8 +30,13 @@ SAMPLE_S = 0.2
 
 def worker_cases(seed: int) -> dict[str, dict]:
     """Return places; each has one core a process, so that speeds are comparable."""
-    return {name: {"scene": "rbm", "quality": "fast", "devices": 5, "points": 3000, "place": name}
-            for name in PLACES}
+    def case(place: str, devices: int, points: int) -> dict:
+        return {"scene": "rbm", "quality": "fast", "devices": devices, "points": points,
+                "place": place}
+
+    return {**{name: case(name, 5, 3000) for name in PLACES},
+            **{f"{name}, whole map": case(name, 10, 3813)
+               for name in ("2 local workers", "2 workers on Ray")}}
 
 
 def measure_workers(seed: int, settings: dict) -> dict:
@@ -105,16 +110,19 @@ def _processor_time() -> Iterator[Any]:
 
 def worker_table(rows: pd.DataFrame) -> str:
     """Return times by place, and how they compare."""
-    local = rows[rows["name"] == "2 local workers"].set_index("seed")
-    one = rows[rows["name"] == "1 local worker"].set_index("seed")
+    def seconds(place: str, kind: str) -> dict[tuple, float]:
+        return {(row["seed"], row["links"]): row[kind] for _, row in rows.iterrows()
+                if row["name"].split(",")[0] == place}
+
+    local, one = seconds("2 local workers", "processor_s"), seconds("1 local worker", "wall_s")
     lines = []
     for _, row in rows.iterrows():
-        seed = row["seed"]
+        of = row["seed"], row["links"]
+        faster = f"{one[of] / row['wall_s']:.2f}" if of in one else "–"
         lines.append([
-            row["name"], str(seed), f"{row['links']:,}", f"{row['wall_s']:.1f}",
+            row["name"], str(row["seed"]), f"{row['links']:,}", f"{row['wall_s']:.1f}",
             f"{row['processor_s']:.1f}",
-            f"{row['processor_s'] / local['processor_s'].get(seed, np.nan):.2f}",
-            f"{one['wall_s'].get(seed, np.nan) / row['wall_s']:.2f}",
+            f"{row['processor_s'] / local.get(of, np.nan):.2f}", faster,
             f"{row['load_before']:.1f}", f"`{row['sha256']}`"])
     return markdown(["place", "seed", "links", "wall [s]", "processor [s]",
                      "processor time against 2 local", "speed against 1 local", "load before",

@@ -90,7 +90,7 @@ class CrossValidatedModel:
         reading = self.held_out_reading
         return self.held_out(lambda model, fit: np.where(
             model.usable, mean_if_detected(*reading, model.limit_db, model.dof,
-                                           model.regression().losses), np.nan))
+                                           model.losses), np.nan))
 
     def rmse_db(self, rows: np.ndarray | None = None) -> float:
         """Return the held-out RMSE of the detected links of a mask (n,), or of all [dB]."""

@@ -242,7 +242,7 @@ def physics_db(model: FoldModel, fit: FitResult, rest: CorrelatedShadowing | Non
     reading = model.predict(fit)
     mean_db, scale_db, limit_db = (each[test] for each in (
         reading.mean_db, reading.scale_db, model.limit_db))
-    losses = model.regression(test).losses
+    losses = model.losses.select(test)
     forests = residual_forests(model, fit, part, seed, trees)
     added: list[tuple] = [(0.0, 1.0), *((forest.predict(part.common[test]), 1.0)
                                         for forest in forests.values())]

@@ -134,7 +134,7 @@ class FoldModel:
             censored_regression.design([term.columns[rows] for term in terms], n),
             np.concatenate([self.level_prior_sd_db, *(term.prior_sd_db for term in terms)]),
             self.group[rows], response(self.effects, "receiver", rows), self.dof,
-            self._losses(rows), self._random_effect_sd_db(rows))
+            self.losses.select(rows), self._random_effect_sd_db(rows))
 
     @cached_property
     def training(self) -> CensoredRegression:
@@ -178,9 +178,10 @@ class FoldModel:
         return tuple(FittedEffect(each.effect, each.params, result.coefficients[own])
                      for each, own in zip(self.effects, self.coefficient_slices, strict=True))
 
-    def _losses(self, rows: np.ndarray | slice) -> Losses:
-        """Return what becomes of links whatever their level."""
-        every = [each.effect.losses(self.links, each.params).select(rows)
+    @cached_property
+    def losses(self) -> Losses:
+        """Losses of all links whatever their level."""
+        every = [each.effect.losses(self.links, each.params)
                  for each in self.effects if isinstance(each.effect, DetectionEffect)]
         if not every:
             return NO_LOSSES

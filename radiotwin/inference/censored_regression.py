@@ -23,6 +23,8 @@ MIN_SCALE_DB = 0.05
 FIRST_SCALE_DB = 5.0  # where the search for the error scales begins
 MAX_ITERATIONS = 40
 TOLERANCE = 1e-3  # of the objective, at which the search ends [nats]
+MIN_STEP = 1e-3  # share of a Newton step, below which none is taken
+MAX_GROWTH = float(np.log(2.0))  # of a scale's logarithm in one step
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(7)  # over the levels that may arrive
 MAX_DENSITY = 0.2  # share of entries that are not zero, up to which a design is kept sparse
 OWN_SHARE = 0.5  # of the error scale: the instrument's own noise where it passes nothing on
@@ -196,21 +198,21 @@ def fit(problem: CensoredRegression, start: FitResult | None = None) -> FitResul
     predicted = problem.linearise(beta, scale_db)
     objective = _objective(problem, predicted, beta, precision)
     for _ in range(MAX_ITERATIONS):
-        before = objective
-        slope, hessian = _slope_and_hessian(problem, predicted, precision)
-        step = np.linalg.solve(hessian, slope - precision * beta)
-        size = 1.0
-        while size > 1e-3:
-            there = problem.linearise(beta + size * step, scale_db)
-            tried = _objective(problem, there, beta + size * step, precision)
+        slope, hessian, growth, grown_nats = _slope_and_hessian(problem, predicted, precision)
+        slope = slope - precision * beta
+        step = np.linalg.solve(hessian, slope)
+        if 0.5 * slope @ step + grown_nats < TOLERANCE:
+            break
+        size, before = 1.0, objective
+        while size > MIN_STEP:
+            there = beta + size * step, np.maximum(scale_db * np.exp(size * growth), MIN_SCALE_DB)
+            reached = problem.linearise(*there)
+            tried = _objective(problem, reached, there[0], precision)
             if tried <= objective + 1e-9:
-                beta, objective, predicted = beta + size * step, tried, there
+                (beta, scale_db), predicted, objective = there, reached, tried
                 break
             size *= 0.5
-        scale_db = _scales(problem, predicted, scale_db)
-        predicted = problem.linearise(beta, scale_db)
-        objective = _objective(problem, predicted, beta, precision)
-        if abs(before - objective) < TOLERANCE:
+        if before - objective < TOLERANCE:
             break
     return FitResult(beta, scale_db, objective)
 
@@ -250,33 +252,26 @@ def _objective(problem: CensoredRegression, predicted: Linearisation, beta: np.n
 
 
 def _slope_and_hessian(problem: CensoredRegression, predicted: Linearisation,
-                       precision: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the log-likelihood's slope (p,) and the posterior's curvature (p, p)."""
-    slope, curvature, scale_slope = _derivatives(problem, predicted)
-    growth, dof = predicted.growth, problem.dof
-    pull = slope * predicted.slope + scale_slope * growth
-    # Of the scale the Fisher information (Lange et al. 1989).
-    bending = curvature * predicted.slope**2 + 2 * dof / (dof + 3) * growth**2
-    toward, hessian = _moments(problem, predicted, pull, bending)
-    return toward, hessian + np.diag(precision + 1e-9)
+                       precision: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return how the posterior changes with the coefficients and the scales.
 
-
-def _derivatives(problem: CensoredRegression, predicted: Linearisation,
-                 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    return student.derivatives(problem.level_db, problem.limit_db, predicted.mean_db,
-                               predicted.scale_db, problem.dof, problem.losses)
-
-
-def _scales(problem: CensoredRegression, predicted: Linearisation,
-            scale_db: np.ndarray) -> np.ndarray:
-    """Return one step towards the best scales (groups,).
-
-    Rows of which the receiver passes little on count little.
+    Returns:
+        the log-likelihood's slope (p,), the posterior's curvature (p, p); a step towards the best
+        scales (groups,) [logarithm], for which rows count little of which the receiver passes
+        little on; and about what that step gains [nats].
     """
-    _, _, scale_slope = _derivatives(problem, predicted)
-    groups, seen = len(scale_db), np.isfinite(problem.level_db)
+    slope, curvature, scale_slope = student.derivatives(
+        problem.level_db, problem.limit_db, predicted.mean_db, predicted.scale_db, problem.dof,
+        problem.losses)
+    # Of the logarithm of a scale, a link's Fisher information (Lange et al. 1989).
+    growth, information = predicted.growth, 2 * problem.dof / (problem.dof + 3)
+    toward, hessian = _moments(problem, predicted, slope * predicted.slope + scale_slope * growth,
+                               curvature * predicted.slope**2 + information * growth**2)
+    seen = np.isfinite(problem.level_db)
     passed = np.broadcast_to(predicted.passed, seen.shape)
-    detected = np.bincount(problem.group, weights=passed * seen, minlength=groups)
-    total = np.bincount(problem.group, weights=passed * scale_slope, minlength=groups)
-    factor = np.clip(1.0 + total / np.maximum(detected, 1), 0.25, 4.0) ** 0.5
-    return np.maximum(scale_db * np.where(detected > 1, factor, 1.0), MIN_SCALE_DB)
+    detected = np.bincount(problem.group, weights=passed * seen)
+    total = np.bincount(problem.group, weights=passed * scale_slope)
+    change = np.where(detected > 1, total / np.maximum(detected, 1) / information, 0.0)
+    change = np.clip(change, -MAX_GROWTH, MAX_GROWTH)
+    return (toward, hessian + np.diag(precision + 1e-9), change,
+            0.5 * information * float(detected @ change**2))

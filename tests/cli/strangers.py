@@ -21,6 +21,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.fuzz.sandbox import resident_bytes
+
 MAX_S, MAX_BYTES = 20, 2 * 2**30
 HERE = Path(__file__).parents[1]
 TWIN_1, CLOSELOOP_1 = HERE / "twin" / "version_1", HERE / "closeloop" / "version_1" / "closeloop.json"
@@ -93,10 +95,6 @@ def forked(run, command, folder, until=None):
                 os.kill(child, signal.SIGKILL)
         time.sleep(0.005)
     return os.waitstatus_to_exitcode(done[1]), said.read_text(encoding="utf-8")
-
-
-def resident_bytes(process):
-    return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
 def planning(command, folder, file):

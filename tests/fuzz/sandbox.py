@@ -48,7 +48,7 @@ def run_watched(command: str, case: Path, listener: socket.socket) -> Outcome:
     for name in ("home", "tmp"):
         (case / name).mkdir(exist_ok=True)
     started = time.monotonic()
-    inherited = _resident_bytes(os.getpid())  # a child begins with what this process holds
+    inherited = resident_bytes(os.getpid())  # a child begins with what this process holds
     pid = os.fork()
     if pid == 0:
         _child(command, case)
@@ -89,7 +89,8 @@ def _leaks(case: Path, listener: socket.socket) -> list[str]:
     return sorted(set(found))
 
 
-def _resident_bytes(pid: int) -> int:
+def resident_bytes(pid: int) -> int:
+    """Return the memory that a process holds [bytes]."""
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
@@ -100,7 +101,7 @@ def _wait(pid: int, started: float, inherited: int) -> tuple[int, resource.struc
         if done:
             return os.waitstatus_to_exitcode(status), usage, killed
         with contextlib.suppress(OSError, IndexError, ValueError):
-            if _resident_bytes(pid) - inherited > MAX_PEAK_BYTES:
+            if resident_bytes(pid) - inherited > MAX_PEAK_BYTES:
                 killed = killed or f"memory above {MAX_PEAK_BYTES // 2**20} MiB"
             if _cpu_s(pid) > MAX_CPU_S:
                 killed = killed or f"longer than {MAX_CPU_S} s"
