@@ -22,7 +22,7 @@ from radiotwin.links import LinkData
 from radiotwin.pieces import KeptParts, Piece, keeps, kept
 
 EVALUATIONS = 25  # of the objective for each number, in one descent
-DESCENTS = 2  # a simplex that has collapsed too early starts anew
+DESCENTS = 2  # a simplex that has collapsed too early starts anew; one for a fold, which is near
 MAX_LINKS, MAX_LINKS_OF_MEMBER = 5000, 1500  # that numbers are refined on
 EXACT_EVALUATIONS, MAX_EXACT_LINKS = 8, 1500  # the same where each follows paths, which is slow
 MIN_EXACT_GAIN_NATS = 10.0  # that exact levels must gain to be refined on, and each descent
@@ -138,7 +138,7 @@ def _best_addition(model: FoldModel, effect: Effect, result: FitResult,
             best = tried, fitted
     if best is None or result.objective - best[1].objective < MIN_GAIN_NATS:
         return best
-    refined = _refine(*best)
+    refined = _refine(*best, descents=DESCENTS if like is None else 1)
     if not effect.always_exact:
         return refined
     exact = with_exact_levels(*refined)
@@ -308,10 +308,12 @@ def _descend(objective: Callable[[np.ndarray], float], values: np.ndarray, steps
         around = (values[0] - steps[0], values[0] + steps[0])
         return minimize_scalar(lambda value: objective(np.array([value])), around, method="brent",
                                options={"xtol": 1e-3, "maxiter": evaluations}).x[None]
-    simplex = np.vstack([values, values + np.diag(steps)])
-    options = {"initial_simplex": simplex, "maxfev": evaluations * len(simplex), "xatol": 1e-2,
+    simplex = np.vstack([values / steps, values / steps + np.eye(len(values))])
+    options = {"initial_simplex": simplex, "maxfev": evaluations * len(simplex), "xatol": 2e-2,
                "fatol": 0.1}
-    return minimize(objective, values, method="Nelder-Mead", options=options).x
+    found = minimize(lambda shares: objective(shares * steps), simplex[0], method="Nelder-Mead",
+                     options=options)
+    return found.x * steps
 
 
 def _better(model: FoldModel, result: FitResult, last: AppliedEffect, variation: Variation,
