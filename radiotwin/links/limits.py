@@ -33,6 +33,7 @@ ROUNDS = 2  # of levels and limits in turn
 QUANTILE_90 = 1.645  # of the normal distribution
 MIN_OFF_DB = 0.5  # a declared limit that is off by less is right
 MIN_BELOW, BELOW_SHARE = 3, 0.002  # readings below a declared limit that contradict it
+FAR_DB = 20.0  # below every reading, from which on a declared limit says nothing
 DIFFER_DB = 3.0  # between receivers, from which on it is told
 DEAF_DB, DEAF_SDS = 6.0, 4.5  # above the usual limit: a receiver that stands out
 MAX_NAMED = 5
@@ -136,6 +137,9 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
         declared that they allow. And notes on what is odd, a sentence each.
     """
     declared = -np.inf if declared_db is None else declared_db
+    apart = _says_nothing(links.level_db, declared)
+    if apart:
+        declared = -np.inf
     count = np.bincount(links.receiver, minlength=len(links.receiver_names))
     rows = np.split(np.argsort(links.receiver, kind="stable"), np.cumsum(count)[:-1])
     found, together = _estimates(links, rows, declared)
@@ -155,7 +159,24 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
             own_db[receiver] = usual_db  # its own blanks do not tell
         else:
             lost.append(receiver)
-    return own_db[links.receiver], _notes(links, rows, own_db, found, declared, lost)
+    notes = _notes(links, rows, own_db, found, declared, lost)
+    return own_db[links.receiver], [*apart, *notes]
+
+
+def _says_nothing(level_db: np.ndarray, declared_db: float) -> list[str]:
+    """Return why a declared limit is not looked at, a sentence; empty where it may be right.
+
+    Signals of all levels arrive, so where some are too weak others are just strong enough. A limit
+    far below all readings stands for "not known", and blanks below it would be impossible.
+    """
+    read_db, blanks = level_db[np.isfinite(level_db)], int(np.isnan(level_db).sum())
+    if not np.isfinite(declared_db) or not len(read_db) or blanks < MIN_BLANKS:
+        return []
+    if read_db.min() - declared_db < FAR_DB:
+        return []
+    return [f"the declared limit of detection, {declared_db:g}, is not used: the weakest of "
+            f"{len(read_db):,} readings is {read_db.min():g}, far above it, though {blanks:,} "
+            "links are blank"]
 
 
 def _usual_db(links: LinkData, rows: list[np.ndarray], found: list[LimitEstimate | None],
@@ -251,10 +272,13 @@ def _notes(links: LinkData, rows: list[np.ndarray], own_db: np.ndarray,
                      for end in (known_db.min(), known_db.max()))
         notes.append(f"limits of detection differ between receivers: from {known_db.min():.1f} "
                      f"{unit} ({low}) to {known_db.max():.1f} {unit} ({high}), by their readings")
-    if lost:
-        names = ", ".join(links.receiver_names[r] for r in lost[:MAX_NAMED])
-        notes.append(f"links of receiver {names}{_more(lost)} are blank at any level: they count "
-                     "as lost, not as weak")
+    open_ones = [r for r in lost if (each := found[r]) is not None and each.nats > 0]
+    for receivers, what in ((sorted({*lost} - {*open_ones}), "are blank at any level"),
+                            (open_ones, "may be blank at any level, or below a limit")):
+        if receivers:
+            names = ", ".join(links.receiver_names[r] for r in receivers[:MAX_NAMED])
+            notes.append(f"links of receiver {names}{_more(receivers)} {what}: they count as lost, "
+                         "not as weak")
     return notes
 
 

@@ -79,6 +79,16 @@ def test_a_declared_limit_that_readings_allow_stays_to_the_bit(seed, given):
     assert np.all(limits_db == -110.0) and notes == []
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("lost", [0.0, 0.3])
+def test_a_limit_far_below_all_readings_stands_for_none(seed, lost):
+    links = fly(seed, lost=lost)
+    limits_db, notes = estimated(links, -250.0)
+    assert notes[0].startswith("the declared limit of detection, -250, is not used: the weakest of")
+    np.testing.assert_array_equal(limits_db, estimated(links)[0])
+    np.testing.assert_allclose(limits_db, -110.0, atol=0.8)
+
+
 @pytest.mark.parametrize("declared_db", [None, -110.0])
 def test_links_that_are_lost_at_any_level_show_no_limit(declared_db):
     for seed in SEEDS:
