@@ -15,6 +15,8 @@ NEIGHBOURS = 24  # nearest links that are looked at, of which some are of other 
 MIN_OTHERS = 2  # links of other flights, for a comparison
 MIN_STEPS = 2.0  # between positions, that still count as one place
 MAX_REACH_M = 60.0
+MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal errors
+MAX_Z, MIN_SD_DB = 4.0, 0.3  # of a value, over the scatter of its class; of that scatter
 
 
 def compared_db(view: ResidualView) -> np.ndarray:
@@ -60,22 +62,54 @@ def compared_where_possible_db(view: ResidualView) -> tuple[np.ndarray, np.ndarr
     return np.where(known, rest_db, view.residual_db), known
 
 
-def share_alike(label: np.ndarray, value_db: np.ndarray, minimum: int, least_db: float) -> float:
-    """Return the share of members whose median is beyond a level, with its sign.
+def by_precision(view: ResidualView, rest_db: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return values (n,) [dB] without outliers, and what each counts (n,) [1/dB²].
+
+    Links with line of sight scatter by one or two decibels, others by ten: what all have in common
+    shows in the former, and a median over both hides it. A link counts by the scatter of its class
+    and as `MAX_Z` times that at most; links that err alike count as one.
+
+    Args:
+        view: n links.
+        rest_db: (n,) compared residuals; NaN = unknown, which counts nothing.
+    """
+    value_db, weight = np.zeros((2, len(rest_db)))
+    says = np.isfinite(view.links.level_db) | (view.residual_db < 0)  # a blank that was due
+    for members in (view.links.los, ~view.links.los):
+        rows = np.flatnonzero(members & says & np.isfinite(rest_db))
+        if len(rows):
+            centred_db = rest_db[rows] - np.median(rest_db[rows])
+            sd_db = max(MAD_SD * float(np.median(np.abs(centred_db))), MIN_SD_DB)
+            value_db[rows] = np.clip(centred_db, -MAX_Z * sd_db, MAX_Z * sd_db)
+            weight[rows] = 1.0 / sd_db**2 / view.design_effect
+    return value_db, weight
+
+
+def mean_by_precision(value_db: np.ndarray, weight: np.ndarray) -> float:
+    """Return the weighted mean [dB]; 0 where nothing counts."""
+    total = weight.sum()
+    return float(weight @ value_db / total) if total > 0 else 0.0
+
+
+def share_alike(label: np.ndarray, value_db: np.ndarray, weight: np.ndarray, minimum: int,
+                least_db: float) -> float:
+    """Return the share of members whose weighted mean is beyond a level, with its sign.
 
     Args:
         label: (n,) device or receiver.
         value_db: (n,) [dB].
+        weight: (n,) of each.
         minimum: values of a member, to count.
-        least_db: level; negative: medians below it count.
+        least_db: level; negative: means below it count.
 
     Returns:
         from 0 to 1; 0 where no member has values enough.
     """
-    medians = [float(np.median(value_db[label == member])) for member, count in
-               zip(*np.unique(label, return_counts=True), strict=True) if count >= minimum]
-    return float(np.mean([np.sign(least_db) * each > abs(least_db) for each in medians])) \
-        if medians else 0.0
+    means = [mean_by_precision(value_db[label == member], weight[label == member])
+             for member, count in zip(*np.unique(label, return_counts=True), strict=True)
+             if count >= minimum]
+    return float(np.mean([np.sign(least_db) * each > abs(least_db) for each in means])) \
+        if means else 0.0
 
 
 def flight_mask(links: LinkData, receiver: int | None, flight: str | None) -> np.ndarray:

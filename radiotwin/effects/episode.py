@@ -17,7 +17,13 @@ from typing_extensions import override
 from radiotwin.effects.arrays import frequent_labels
 from radiotwin.effects.atmosphere import max_gas_db_km, max_rain_db_km
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.comparison import compared_where_possible_db, flight_mask, share_alike
+from radiotwin.effects.comparison import (
+    by_precision,
+    compared_where_possible_db,
+    flight_mask,
+    mean_by_precision,
+    share_alike,
+)
 from radiotwin.effects.params import (
     EffectParams,
     Estimate,
@@ -31,13 +37,14 @@ from radiotwin.links import LinkData
 MIN_LINKS = 60  # with a time, of a receiver or a flight
 MIN_INSIDE = 20  # links between the two times, and outside
 MAX_INSIDE = 0.5  # share of the links between the two times: more are the usual state
-MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal errors
 MIN_NATS = 10.0  # that an episode must gain to be proposed
 MIN_DB = 1.5  # mean change; a smaller one changes no decision
 INTERVAL_NATS = 2.0  # below the best: a change point's 90 % interval is wider than a mean's (1.35)
 BINS = 160  # of times, whose ends are tried
-MIN_WINDOWS = 4  # of the same length elsewhere, to compare with
+FEW_WINDOWS = 6  # of the same length elsewhere: too few to say how much they differ
+APART = 2.5  # then it must explain so many times what any other window does
 MAX_P_VALUE = 0.01  # that one of the windows differs like that by chance
+MIN_DEVIATION_SD = 0.3  # between windows; independent links have 1
 MIN_MEMBER_LINKS = 5  # of a device or receiver in the episode, to be asked whether it agrees
 MIN_KNOWN, MIN_DEVICES = 0.5, 4  # share that is compared, or else devices that must be there
 MIN_MEMBERS = 0.7  # share of them that must agree: it acts on all
@@ -96,12 +103,13 @@ class Episode(GainEffect):
     def propose(self, view: ResidualView) -> list[Params]:
         links, found = view.links, []
         rest_db, known = compared_where_possible_db(view)
+        value_db, weight = by_precision(view, rest_db)
         receivers: list[int | None] = list(frequent_labels(links.receiver, MIN_LINKS))
         flights = [str(links.flight_names[number]) for number in np.unique(links.flight)] \
             if links.time_restarts else [None]
         for receiver in receivers if len(receivers) < 2 else [None, *receivers]:
             for flight in flights:
-                params = self._proposed(view, rest_db, known, receiver, flight)
+                params = self._proposed(links, value_db, weight, known, receiver, flight)
                 if params is not None:
                     found.append(params)
         return [each for _, each in sorted(found, key=lambda each: -each[0])[:2]]
@@ -109,19 +117,20 @@ class Episode(GainEffect):
     @override
     def propose_like(self, view: ResidualView, params: Params) -> list[Params]:
         # The times are found anew: those of all links would be known from what is held out.
-        rest_db, _ = compared_where_possible_db(view)
+        value_db, weight = by_precision(view, compared_where_possible_db(view)[0])
         rows = _timed_rows(view.links, params.receiver, params.flight)
-        window = _strongest(view, rest_db, rows) if len(rows) >= MIN_LINKS else None
+        window = _strongest(view.links, value_db, weight, rows) \
+            if len(rows) >= MIN_LINKS else None
         if window is None or window.start_s > params.end_s or window.end_s < params.start_s:
             return []
         return [params.model_copy(update={key: value for key, value in window._asdict().items()
                                           if key not in ("nats", "form")})]
 
-    def _proposed(self, view: ResidualView, rest_db: np.ndarray, known: np.ndarray,
-                  receiver: int | None, flight: str | None) -> tuple[float, Params] | None:
-        links = view.links
+    def _proposed(self, links: LinkData, value_db: np.ndarray, weight: np.ndarray,
+                  known: np.ndarray, receiver: int | None, flight: str | None,
+                  ) -> tuple[float, Params] | None:
         rows = _timed_rows(links, receiver, flight)
-        window = _strongest(view, rest_db, rows) if len(rows) >= MIN_LINKS else None
+        window = _strongest(links, value_db, weight, rows) if len(rows) >= MIN_LINKS else None
         if window is None or window.nats < MIN_NATS:
             return None
         known_hz = float(links.frequency_hz) if np.isfinite(links.frequency_hz) else None
@@ -129,8 +138,9 @@ class Episode(GainEffect):
                              **{key: value for key, value in window._asdict().items()
                                 if key != "nats"})
         inside = _inside(links, params)
-        stands_out = _agrees(links, rest_db, known, rows, inside) \
-            and not _is_another(links, params, inside) and _is_alone(links, rest_db, rows, inside)
+        stands_out = _agrees(links, value_db, weight, known, rows, inside) \
+            and not _is_another(links, params, inside) \
+            and _is_alone(links, value_db, weight, rows, inside, window.nats)
         return (window.nats, params) if stands_out else None
 
     @override
@@ -179,21 +189,20 @@ def _timed_rows(links: LinkData, receiver: int | None, flight: str | None) -> np
     return np.flatnonzero(flight_mask(links, receiver, flight) & np.isfinite(links.time_s))
 
 
-def _strongest(view: ResidualView, every_db: np.ndarray, rows: np.ndarray) -> _Window | None:
+def _strongest(links: LinkData, every_db: np.ndarray, weights: np.ndarray,
+               rows: np.ndarray) -> _Window | None:
     """Return the window in which a loss, or an attenuation, explains most.
 
     Twice: over the whole time, then over finer ends around what was found.
 
     Args:
-        view: the training links.
+        links: n links.
         every_db: (n,) compared residuals [dB].
+        weights: (n,) what each counts [1/dB²].
         rows: (r,) links that it may be among.
     """
-    time_s, rest_db = view.links.time_s[rows], every_db[rows]
-    distance_km = view.links.distance_m[rows] / 1000
-    # Others' errors are in a comparison, too.
-    scatter = MAD_SD * np.median(np.abs(rest_db - np.median(rest_db))) / view.scale_db[rows]
-    weight = view.weight[rows] / np.maximum(scatter, 1.0) ** 2
+    time_s, rest_db, weight = links.time_s[rows], every_db[rows], weights[rows]
+    distance_km = links.distance_m[rows] / 1000
     times_s = np.unique(time_s)
     ends = times_s[np.unique(np.linspace(0, len(times_s) - 1, BINS).round().astype(int))]
     best = _best_window(ends, time_s, rest_db, weight, distance_km)
@@ -255,22 +264,22 @@ def _last_s(cell: np.ndarray, time_s: np.ndarray, cells: int) -> np.ndarray:
     return last_s
 
 
-def _agrees(links: LinkData, rest_db: np.ndarray, known: np.ndarray, rows: np.ndarray,
-            inside: np.ndarray) -> bool:
+def _agrees(links: LinkData, value_db: np.ndarray, weight: np.ndarray, known: np.ndarray,
+            rows: np.ndarray, inside: np.ndarray) -> bool:
     """Return whether most devices, and most receivers, show the change.
 
     Where no other flight was, there must be several: what a map lacks hides few at once.
     """
-    mine = rows[inside[rows]]
+    mine, others = rows[inside[rows]], rows[~inside[rows]]
     if known[mine].mean() < MIN_KNOWN and len(
             frequent_labels(links.device[mine], MIN_MEMBER_LINKS)) < MIN_DEVICES:
         return False
-    outside_db = float(np.median(rest_db[rows[~inside[rows]]]))
-    change_db = float(np.median(rest_db[mine])) - outside_db
+    outside_db = mean_by_precision(value_db[others], weight[others])
+    change_db = mean_by_precision(value_db[mine], weight[mine]) - outside_db
     if abs(change_db) < MIN_DB:
         return False
-    return all(share_alike(label[mine], rest_db[mine] - outside_db, MIN_MEMBER_LINKS,
-                           0.3 * change_db) >= MIN_MEMBERS
+    return all(share_alike(label[mine], value_db[mine] - outside_db, weight[mine],
+                           MIN_MEMBER_LINKS, 0.3 * change_db) >= MIN_MEMBERS
                for label in (links.device, links.receiver)
                if np.bincount(label[mine]).max() >= MIN_MEMBER_LINKS)
 
@@ -289,17 +298,28 @@ def _is_another(links: LinkData, params: Any, inside: np.ndarray) -> bool:
     return len(covered) == 1 and whole[0]
 
 
-def _is_alone(links: LinkData, rest_db: np.ndarray, rows: np.ndarray, inside: np.ndarray) -> bool:
-    """Return whether no other window of the same length differs as much (Student's t)."""
+def _is_alone(links: LinkData, value_db: np.ndarray, weight: np.ndarray, rows: np.ndarray,
+              inside: np.ndarray, nats: float) -> bool:
+    """Return whether no other window differs as much.
+
+    None of the same length (Student's t); where it is so long that there are few of these, none
+    of any length, by far.
+    """
     order = rows[np.lexsort((links.time_s[rows], links.flight[rows] * links.time_restarts))]
     own = inside[order]
     others = order[~own]
     windows = int(len(others) // own.sum())
-    if windows < MIN_WINDOWS:
-        windows = min(MIN_WINDOWS, len(others) // MIN_INSIDE)
-    if windows < 3:
-        return False
-    levels_db = np.array([np.median(rest_db[each]) for each in np.array_split(others, windows)])
-    change_db = abs(float(np.median(rest_db[order[own]])) - float(levels_db.mean()))
-    sd_db = max(float(levels_db.std(ddof=1)), 0.1) * np.sqrt(1 + 1 / windows)
-    return bool(2 * t.sf(change_db / sd_db, windows - 1) * (windows + 1) <= MAX_P_VALUE)
+    if windows < FEW_WINDOWS:
+        other = _strongest(links, value_db, weight, others)
+        return other is None or nats > APART * max(other.nats, MIN_NATS)
+    usual_db = mean_by_precision(value_db[others], weight[others])
+
+    def deviation(rows: np.ndarray) -> float:
+        """Over what it would be of independent links: windows see different devices."""
+        return float(weight[rows] @ (value_db[rows] - usual_db)
+                     / np.sqrt(max(weight[rows].sum(), 1e-9)))
+
+    usual = np.array([deviation(each) for each in np.array_split(others, windows)])
+    change = abs(deviation(order[own]) - float(usual.mean()))
+    sd = max(float(usual.std(ddof=1)), MIN_DEVIATION_SD) * np.sqrt(1 + 1 / windows)
+    return bool(2 * t.sf(change / sd, windows - 1) * (windows + 1) <= MAX_P_VALUE)

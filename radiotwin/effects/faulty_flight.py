@@ -19,7 +19,14 @@ from scipy.stats import t
 from typing_extensions import override
 
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.comparison import compared_db, flight_mask, share_alike
+from radiotwin.effects.comparison import (
+    MAD_SD,
+    by_precision,
+    compared_db,
+    flight_mask,
+    mean_by_precision,
+    share_alike,
+)
 from radiotwin.effects.params import (
     Decibels,
     EffectParams,
@@ -46,7 +53,6 @@ STATISTICS = 4  # that are tested
 MAX_P_VALUE = 0.02  # corrected for the number of flights
 PRIOR_SD_DB = 15.0
 RELATION_SD = 0.5  # of the slope that is lost or gained
-MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal errors
 
 
 @dataclass(frozen=True)
@@ -151,7 +157,7 @@ def _flights(view: ResidualView) -> list[_Flight]:
     rows = [np.flatnonzero(seen & (links.receiver == receiver) & (links.flight == flight))
             for receiver, flight in pairs]
     residuals_db = [np.where(seen, each, np.nan) for each in (compared_db(view), view.residual_db)]
-    levels_db = np.column_stack([_levels_db(each, rows, pairs[:, 0], links)
+    levels_db = np.column_stack([_levels_db(*by_precision(view, each), rows, pairs[:, 0], links)
                                  for each in residuals_db])
     found = []
     for (receiver, flight), mine, level_db in zip(pairs.tolist(), rows, levels_db, strict=True):
@@ -164,27 +170,28 @@ def _flights(view: ResidualView) -> list[_Flight]:
     return found
 
 
-def _levels_db(residual_db: np.ndarray, rows: list[np.ndarray], receiver: np.ndarray,
-               links: LinkData) -> np.ndarray:
+def _levels_db(value_db: np.ndarray, weight: np.ndarray, rows: list[np.ndarray],
+               receiver: np.ndarray, links: LinkData) -> np.ndarray:
     """Return levels (f,) of flights over those of the same receiver; NaN if devices disagree."""
-    known = [mine[np.isfinite(residual_db[mine])] for mine in rows]
-    level_db = np.array([np.median(residual_db[mine]) if len(mine) >= MIN_LINKS else np.nan
-                         for mine in known])
+    known = [mine[weight[mine] > 0] for mine in rows]
+    level_db = np.array([mean_by_precision(value_db[mine], weight[mine])
+                         if len(mine) >= MIN_LINKS else np.nan for mine in known])
     for each in np.unique(receiver):  # what a receiver always has is no fault of one of its flights
         same = (receiver == each) & np.isfinite(level_db)
         level_db[same] -= np.median(level_db[same]) if same.any() else 0.0
     for number, (mine, own_db) in enumerate(zip(known, level_db.tolist(), strict=True)):
-        if abs(own_db) >= MIN_OFFSET_DB and not _devices_agree(residual_db[mine], own_db,
-                                                               links.device[mine]):
+        if abs(own_db) >= MIN_OFFSET_DB and not _devices_agree(
+                value_db[mine], weight[mine], own_db, links.device[mine]):
             level_db[number] = np.nan
     return level_db
 
 
-def _devices_agree(residual_db: np.ndarray, level_db: float, device: np.ndarray) -> bool:
+def _devices_agree(value_db: np.ndarray, weight: np.ndarray, level_db: float,
+                   device: np.ndarray) -> bool:
     """Return whether most devices show what the flight as a whole shows."""
     if len(np.unique(device)) > len(device) / MIN_DEVICE_LINKS:  # positions of one that moves
         return True
-    return share_alike(device, residual_db, MIN_DEVICE_LINKS, 0.4 * level_db) >= MIN_DEVICES
+    return share_alike(device, value_db, weight, MIN_DEVICE_LINKS, 0.4 * level_db) >= MIN_DEVICES
 
 
 def _robust_sd(values: np.ndarray) -> float:

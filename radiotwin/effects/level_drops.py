@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from radiotwin.effects.comparison import compared_where_possible_db
+from radiotwin.effects.comparison import MAD_SD, compared_where_possible_db
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.inference.student import log_density
 from radiotwin.links import LinkData
@@ -25,7 +25,6 @@ MIN_RUNS = 4  # stretches of time in which levels are low
 MAX_RUN = 0.5  # share of the low instants in the longest of them
 MAX_OTHERS = 0.3  # share of low readings of other receivers, over this one's
 MIN_APART = 3.0  # error scales between the states
-MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal errors
 
 
 @dataclass(frozen=True, eq=False)
