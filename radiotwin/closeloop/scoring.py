@@ -15,7 +15,8 @@ from radiotwin.effects.fold_model import FoldModel
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.evidence import cross_fit_p_value, sign_flip_p_value
 
-MIN_MOVED = 0.05  # of how much a candidate moves likelihoods in the fold where it does most
+# Of the fold where a candidate moves likelihoods most, and of that where it gains or loses most.
+MIN_MOVED, MIN_SHARE = 0.05, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +160,8 @@ def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score
     p_value, after_db = min(tried * cross_fit_p_value(shares), 1.0), extended.rmse_db(usable)
     # A receiver, or a device, is not in every fold.
     moved = np.bincount(model.index[usable], np.abs(gain[usable]), len(model.folds))
-    touched = moved >= MIN_MOVED * moved.max()
+    touched = (moved >= MIN_MOVED * moved.max()) \
+        & (np.abs(shares) >= MIN_SHARE * np.abs(shares).max())
     few_p = 0.0
     if block is not None:
         few_p = sign_flip_p_value(np.bincount(block[usable], weights=gain[usable]), seed)

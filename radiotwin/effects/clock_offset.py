@@ -42,6 +42,7 @@ class ReceiverClockOffset(GainEffect):
     name = "receiver_clock_offset"
     of_receiver = True
     repeatable = True
+    always_exact = True  # a map's streets are what shows where it was
     confused_with = ("receiver_position_error", "body_shadowing")
 
     class Params(EffectParams):
@@ -103,7 +104,8 @@ class ReceiverClockOffset(GainEffect):
         max_s, step_s = MAX_M / params.speed_m_s, STEP_M / params.speed_m_s
         return Variation(
             np.array([params.offset_s]), np.array([step_s]), np.array([-max_s]), np.array([max_s]),
-            lambda numbers: params.model_copy(update={"offset_s": float(numbers[0])}))
+            lambda numbers: params.model_copy(update={"offset_s": float(numbers[0])}),
+            follows_paths=params.exact)
 
     @override
     def parameters(self, links: LinkData, params: Params,

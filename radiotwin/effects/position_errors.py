@@ -126,6 +126,7 @@ class ReceiverPositionError(GainEffect):
     figure = "links"
     of_receiver = True
     repeatable = True
+    always_exact = True
     confused_with = ("receiver_gain_offset",)
 
     class Params(EffectParams):
@@ -134,6 +135,7 @@ class ReceiverPositionError(GainEffect):
         receiver: ReceiverIndex = Field(description="Index of the receiver.")
         move_m: tuple[Metres, Metres, Metres] = Field(
             description="True minus given position, east, north and up [m].")
+        exact: bool = Field(False, description="Whether paths are followed to the new positions.")
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
@@ -167,15 +169,20 @@ class ReceiverPositionError(GainEffect):
         rows = np.flatnonzero(links.receiver == params.receiver)
         mine = links.select(rows)
         moved = mine.with_receivers(mine.receiver_m + np.array(params.move_m))
-        offset_db[rows] = level_at(moved) - level_at(mine)
+        offset_db[rows] = level_at(moved, params.exact) - level_at(mine, params.exact)
         return Term.of_offset(offset_db)
+
+    @override
+    def exact(self, params: Params) -> Params:
+        return params.model_copy(update={"exact": True})
 
     @override
     def variation(self, params: Params) -> Variation:
         return Variation(
             np.array(params.move_m), np.full(3, 3.0), np.full(3, -MAX_RECEIVER_MOVE_M),
             np.full(3, MAX_RECEIVER_MOVE_M),
-            lambda move_m: params.model_copy(update={"move_m": tuple(move_m.tolist())}))
+            lambda move_m: params.model_copy(update={"move_m": tuple(move_m.tolist())}),
+            follows_paths=params.exact)
 
     @override
     def parameters(self, links: LinkData, params: Params,
