@@ -139,10 +139,10 @@ def _best_addition(model: FoldModel, effect: Effect, result: FitResult,
     if best is None or result.objective - best[1].objective < MIN_GAIN_NATS:
         return best
     refined = _refine(*best, descents=DESCENTS if like is None else 1)
-    if not effect.always_exact:
-        return refined
+    if not effect.always_exact or (like is not None and like != effect.exact(like)):
+        return refined  # of a fold also where quick levels were better on all links
     exact = with_exact_levels(*refined)
-    if like is not None and like == effect.exact(like):
+    if like is not None:
         near = _near(model, effect, result, like)
         return near if near[1].objective < exact[1].objective else exact
     before = result.objective
