@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.missing_obstacle import MissingObstacle
-from radiotwin.effects.position_errors import DevicePositionError
+from radiotwin.effects.position_errors import DevicePositionError, ReceiverPositionError
 from radiotwin.effects.removed_obstacle import RemovedObstacle, only_blocker
 from radiotwin.scene.citymap import CityMap
 
@@ -64,3 +65,22 @@ def test_a_moved_anchor_has_the_level_of_its_true_position(links):
     offset_db = effect.term(links, params, channel).offset_db
     assert offset_db[0] == pytest.approx(20 - 0.1 * (after_m[0] - before_m[0]), abs=0.01)
     assert abs(offset_db[1]) > 1
+
+
+def test_a_moved_receiver_has_the_level_of_its_true_position(links):
+    channel, effect = CountingChannel(), ReceiverPositionError()
+    params = effect.exact(effect.Params(receiver=0, move_m=(0.0, 60.0, 0.0)))
+    assert effect.term(links, params, channel).offset_db[0] == pytest.approx(
+        20 - 0.1 * (np.hypot(120, 60) - 120), abs=0.01)
+    assert effect.variation(params).follows_paths
+
+
+def test_at_another_time_a_receiver_is_elsewhere_along_its_way(make_links):
+    """Ten metres a second to the north: six seconds later it no longer looks through the building."""
+    way_m = [[60.0, 10.0 * slot, 10] for slot in range(12)]
+    links = make_links([[-60.0, 0, 10]], way_m, city=boxes((0, 0)), time_s=np.arange(12.0))
+    channel, effect = CountingChannel(), ReceiverClockOffset()
+    params = effect.exact(effect.Params(receiver=0, offset_s=6.0, speed_m_s=10.0))
+    offset_db = effect.term(links, params, channel).offset_db
+    assert offset_db[0] == pytest.approx(20 - 0.1 * (np.hypot(120, 60) - 120), abs=0.01)
+    assert effect.variation(params).follows_paths

@@ -1,18 +1,21 @@
 """Flights that disagree and episodes: found in worlds that are made here, and not where there is none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from radiotwin.effects.comparison import by_precision, mean_by_precision
 from radiotwin.effects.episode import Episode
 from radiotwin.effects.faulty_flight import FaultyFlight
 
-FLIGHTS, SLOTS, DEVICES, NOISE_DB = 6, 60, 5, 2.0
+FLIGHTS, SLOTS, DEVICES, NOISE_DB, HIDDEN_DB = 6, 60, 5, 2.0, 12.0
 
 
 @pytest.fixture
 def flown(make_links, view):
     """View of two receivers on six flights along neighbouring loops; `change(links, rng)` (n,) is added [dB]."""
-    def make(seed, change=lambda links, rng: 0.0, restart=False):
+    def make(seed, change=lambda links, rng: 0.0, restart=False, hidden_share=0.0):
         rng = np.random.default_rng(seed)
         device_m = np.column_stack([rng.uniform(0, 300, (DEVICES, 2)), np.full(DEVICES, 1.5)])
         slot, receiver, flight = (each.ravel() for each in np.meshgrid(
@@ -24,6 +27,9 @@ def flown(make_links, view):
                            time_s=np.repeat((0.0 if restart else 200.0) * flight + slot, DEVICES))
         mean_db = -40 - 22 * np.log10(links.distance_m)
         links.level_db[:] = mean_db + rng.normal(0, NOISE_DB, len(links)) + change(links, rng)
+        if hidden_share:  # without line of sight: far weaker, and as wrong as a map is
+            links = replace(links, known_los=rng.random(len(links)) >= hidden_share)
+            links.level_db[~links.los] += rng.normal(0, HIDDEN_DB, (~links.los).sum())
         return view(links, mean_db, NOISE_DB)
     return make
 
@@ -117,3 +123,41 @@ def test_an_attenuation_is_held_against_rain():
     assert Episode().implausible(params, np.array([20.0])) is None
     assert "air and rain" in Episode().implausible(params, np.array([60.0]))
     assert "amplify" in Episode().implausible(params, np.array([-2.0]))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_all_links_have_in_common_shows_in_the_few_with_line_of_sight(flown, seed):
+    """A median over all would scatter by 12 dB, as three links in four do."""
+    given = flown(seed, lambda links, rng: np.where((links.time_s >= 420) & (links.time_s < 480), -5.0, 0.0),
+                  hidden_share=0.75)
+    first = Episode().propose(given)[0]
+    assert first.receiver is None and first.form == "loss"
+    assert first.start_s == pytest.approx(420, abs=6) and first.end_s == pytest.approx(459, abs=6)  # the flight's last
+    (params,) = FaultyFlight().propose(flown(seed, FAULTS["offset"], hidden_share=0.75))
+    assert (params.receiver, params.flight) == (1, "f3")
+
+
+def test_without_a_fault_links_without_line_of_sight_make_none(flown):
+    found = [FaultyFlight().propose(given) + Episode().propose(given)
+             for given in (flown(seed, hidden_share=0.75) for seed in range(10))]
+    assert sum(map(bool, found)) == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_episode_over_a_third_of_the_time_has_too_few_others_to_differ_from(flown, seed):
+    first = Episode().propose(flown(seed, lambda links, rng: np.where(
+        (links.time_s >= 430) & (links.time_s < 830), -6.0, 0.0)))[0]
+    assert first.receiver is None
+    assert first.start_s == pytest.approx(430, abs=4) and first.end_s == pytest.approx(829, abs=4)
+
+
+def test_a_value_counts_by_the_scatter_of_its_class_and_outliers_no_more_than_four_times_that(flown):
+    given = flown(0, hidden_share=0.5)
+    given.residual_db[0] = 80.0
+    value_db, weight = by_precision(given, given.residual_db)
+    los = given.links.los
+    assert weight[~los].max() < 0.05 * weight[los].min()  # (12² + 2²) / 2² = 37
+    assert value_db[0] <= 4 * 1.2 * (NOISE_DB if los[0] else np.hypot(NOISE_DB, HIDDEN_DB))
+    assert abs(mean_by_precision(value_db, weight)) < 0.3
+    unknown_db = np.where(los, given.residual_db, np.nan)
+    assert not by_precision(given, unknown_db)[1][~los].any()
