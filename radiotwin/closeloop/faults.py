@@ -56,6 +56,7 @@ def select_faults(result: SelectionResult, effects: list[Effect], links: LinkDat
         hypotheses = result.hypotheses(seed)
         fitted = [fit_candidate(result.model, effect, step, result.criteria, hypotheses)
                   for effect in timed]
+        fitted = [_against_lasting(each, effects, step, result) for each in fitted]
         candidates = [each for each in fitted if isinstance(each, Candidate)]
         refused += [each for each in fitted if isinstance(each, CandidateScore)]
         kept = None
@@ -75,6 +76,27 @@ def select_faults(result: SelectionResult, effects: list[Effect], links: LinkDat
         if kept is None:
             result.scores += refused
             return
+
+
+def _against_lasting(fault: Candidate | CandidateScore, effects: list[Effect], step: int,
+                     result: SelectionResult) -> Candidate | CandidateScore:
+    """Return a fault, or why it is none: an effect that lasts explains as much of all links.
+
+    A receiver that has changed reads less from then on, and so it does in the window that ends
+    where the links do not show it.
+    """
+    if isinstance(fault, CandidateScore):
+        return fault
+    for effect in effects:
+        if effect.name not in fault.effect.confused_with or effect.within_flights \
+                or effect.unavailable(result.model.links):
+            continue
+        lasting = fit_candidate(result.model, effect, step, result.criteria)
+        if isinstance(lasting, Candidate) and lasting.gain >= fault.gain:
+            return CandidateScore(fault.effect.name, step=step, reason=(
+                f"{effect.name} explains as much: {lasting.gain:.0f} nats of the links that it is "
+                f"fitted to, and this {fault.gain:.0f}"))
+    return fault
 
 
 def drop_idle_faults(result: SelectionResult) -> None:
