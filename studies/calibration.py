@@ -51,6 +51,8 @@ def candidates_of(seed: int, settings: dict) -> dict:
     undeclared = set(hidden.answer.get("besides", ()))  # of a campaign over open ground
     if nuisance:
         undeclared |= undeclared_besides(nuisance)
+    if "shower" in right:  # see `studies.foreign`
+        undeclared.add("episode")
     if not settings["map"]:
         undeclared |= {"missing_obstacle", "removed_obstacle"}
     return {
