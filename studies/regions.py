@@ -41,8 +41,8 @@ COSTS = ("wall_s", "cpu_s", "peak_mib")
 def region_cases(seed: int) -> dict[str, dict]:
     """Return the costs by city, and the error in the smaller one."""
     cost = {"part": "cost", "quality": "fast", "devices": 10, "radius_m": RADIUS_M}
-    return {"2,000 buildings": cost | {"buildings": 2_000, "links": 1_000},
-            "50,000 buildings": cost | {"buildings": 50_000, "links": 1_000},
+    return {"2,000 buildings": cost | {"buildings": 2_000, "links": 10_000},
+            "50,000 buildings": cost | {"buildings": 50_000, "links": 10_000},
             "error": {"part": "error", "buildings": 2_000, "quality": "default", "devices": 4,
                       "patches": 2, "receivers": 20, "radii_m": list(RADII_M)}}
 
