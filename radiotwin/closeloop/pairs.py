@@ -1,9 +1,10 @@
-"""Two effects that are probable together, where neither is alone.
+"""Effects that are probable together, where none is alone.
 
-Two masts with sector antennas, or a displaced anchor and a receiver that drifts: each explains a
-part, and beside the other's part in the residual its own is not much. So where the likeliest effect
-is not probable enough, one more of its kind, or the next likeliest, is fitted beside it, and the
-two are judged by what they explain together.
+Three masts with sector antennas, or a displaced anchor and a receiver that drifts: each explains a
+part, and beside the others' parts in the residual its own is not much. So where the likeliest
+effect is not probable enough, one more of its kind, or the next likeliest, is fitted beside it, and
+they are judged by what they explain together. More of a kind follow as long as that makes them
+likelier.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.closeloop.hypotheses import Hypotheses
-from radiotwin.closeloop.posterior import Step, probability_of_both
+from radiotwin.closeloop.posterior import Step, probability_of_all
 from radiotwin.closeloop.scoring import CandidateScore, fit_candidate, score_candidate
 from radiotwin.effects.base import Effect
 
@@ -33,10 +34,10 @@ class Passed:
     model: CrossValidatedModel
 
 
-def probable_pair(passed: Sequence[Passed], before: CrossValidatedModel, step: Step,
-                  block: np.ndarray, tried: int, seed: int, criteria: SelectionCriteria,
-                  on_progress: Callable[[str], None]) -> list[Passed]:
-    """Return two effects that are probable together, in order; none where there are none.
+def probable_together(passed: Sequence[Passed], before: CrossValidatedModel, step: Step,
+                      block: np.ndarray, tried: int, seed: int, criteria: SelectionCriteria,
+                      on_progress: Callable[[str], None]) -> list[Passed]:
+    """Return effects that are probable together, in order; none where there are none.
 
     Args:
         passed: candidates of a step, none of which is probable enough.
@@ -51,28 +52,39 @@ def probable_pair(passed: Sequence[Passed], before: CrossValidatedModel, step: S
     ranked = sorted(passed, key=lambda each: -each.score.probability)
     if not ranked or ranked[0].score.probability < MIN_SHARE * criteria.min_probability:
         return []
-    first, number = ranked[0], step.number + 1
-    if number >= criteria.max_effects:
-        return []
+    first = ranked[0]
+    on_progress(f"step {step.number + 1}: {first.score.name}, beside another effect")
+
+    def beside(found: list[Passed], effects: list[Effect]) -> list[list[Passed]]:
+        """Return what was found with one more effect, for each that held-out links support."""
+        model, number = found[-1].model, step.number + len(found)
+        if number >= criteria.max_effects:
+            return []
+        hypotheses = Hypotheses.of(model.whole, model.fits[0], seed)
+        longer = []
+        for effect in effects:
+            candidate = fit_candidate(model, effect, number, criteria, hypotheses)
+            if isinstance(candidate, CandidateScore):
+                continue
+            score, extended = score_candidate(model, candidate, block, tried, number, seed,
+                                              criteria)
+            if extended is not None:
+                longer.append([*found, Passed(effect, score, extended)])
+        return longer
+
+    def probability(found: list[Passed]) -> float:
+        names = {each.score.name for each in found}
+        others = [each.score.held_out_nats for each in ranked if each.score.name not in names]
+        return probability_of_all([each.score for each in found], max([0.0, *others]),
+                                  step.best_unnamed, before.rmse_db(), step.rest_db / step.noise_db)
+
     seconds = ([first.effect] if first.effect.repeatable else []) + [
         each.effect for each in ranked[1:] if each.effect is not first.effect]
-    on_progress(f"step {number}: {first.score.name}, beside another effect")
-    hypotheses = Hypotheses.of(first.model.whole, first.model.fits[0], seed)
-    found: list[Passed] = []
-    for effect in seconds[:MAX_SECONDS]:
-        candidate = fit_candidate(first.model, effect, number, criteria, hypotheses)
-        if isinstance(candidate, CandidateScore):
-            continue
-        score, model = score_candidate(first.model, candidate, block, tried, number, seed, criteria)
-        if model is None:
-            continue
-        others = [each.score.held_out_nats for each in ranked
-                  if each.score.name not in (first.score.name, score.name)]
-        probability = probability_of_both(first.score, score, max([0.0, *others]),
-                                          step.best_unnamed, before.rmse_db(),
-                                          step.rest_db / step.noise_db)
-        if probability >= max([criteria.min_probability,
-                               *(each.score.probability for each in found)]):
-            found = [replace(first, score=replace(first.score, reason="", probability=probability)),
-                     Passed(effect, replace(score, probability=probability), model)]
-    return found
+    best = max(beside([first], seconds[:MAX_SECONDS]), key=probability, default=[])
+    while best and probability(best) < criteria.min_probability:
+        kind = {each.effect for each in best}
+        more = beside(best, [first.effect]) \
+            if len(kind) == 1 and len(best) < criteria.max_repeats else []
+        best = more[0] if more and probability(more[0]) > probability(best) else []
+    return [replace(each, score=replace(each.score, reason="", probability=probability(best)))
+            for each in best]

@@ -106,23 +106,23 @@ def features(nats: tuple[float, float, float, float], rmse_fall: float,
             float(np.log(max(rest_over_noise, LEAST_RATIO))))
 
 
-def probability_of_both(first: CandidateScore, second: CandidateScore, other: float,
-                        unnamed: float, before_db: float, rest_over_noise: float) -> float:
-    """Return the probability that two effects are there, from what they explain together.
+def probability_of_all(scores: Sequence[CandidateScore], other: float, unnamed: float,
+                       before_db: float, rest_over_noise: float) -> float:
+    """Return the probability that several effects are there, from what they explain together.
 
     Args:
-        first: of a model without any of the two.
-        second: of the model with the first.
+        scores: each of a model with those before it.
         other: most that any other effect gains on held-out links [nats].
         unnamed: most evidence for a curve without a name [nats].
-        before_db: held-out error without any of the two [dB].
+        before_db: held-out error without any of them [dB].
         rest_over_noise: standard deviations of what belongs to places and of noise, without them.
     """
-    evidence, held_out = (first.nats + second.nats, first.held_out_nats + second.held_out_nats)
+    evidence, held_out = (sum(each.nats for each in scores),
+                          sum(each.held_out_nats for each in scores))
     values = features((evidence, evidence - unnamed, held_out, held_out - other),
-                      float(np.nan_to_num(np.log(before_db / second.rmse_db))),
+                      float(np.nan_to_num(np.log(before_db / scores[-1].rmse_db))),
                       rest_over_noise)
-    return min(probability_of(each.name, values) for each in (first, second))
+    return min(probability_of(each.name, values) for each in scores)
 
 
 def probability_of(name: str, values: tuple[float, ...]) -> float:

@@ -15,7 +15,7 @@ from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.closeloop.hypotheses import Hypotheses
 from radiotwin.closeloop.moved_limits import with_moved_limits
-from radiotwin.closeloop.pairs import Passed, probable_pair
+from radiotwin.closeloop.pairs import Passed, probable_together
 from radiotwin.closeloop.posterior import Step, judge
 from radiotwin.closeloop.scoring import (
     Candidate,
@@ -124,10 +124,10 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
                 judged = _judged(result, judged, hypotheses, step)
                 passed = [each for each in judged if not each.score.reason]
             if not passed:
-                pair = probable_pair(judged, result.model, result.steps[-1], block, len(available),
-                                     seed, result.criteria, on_progress)
-                if pair:
-                    _keep_both(result, pair, step)
+                together = probable_together(judged, result.model, result.steps[-1], block,
+                                             len(available), seed, result.criteria, on_progress)
+                if together:
+                    _keep_together(result, together, step)
                     continue
         if not passed:
             break
@@ -209,16 +209,16 @@ def _judged(result: SelectionResult, passed: list[Passed], hypotheses: Hypothese
     return found
 
 
-def _keep_both(result: SelectionResult, pair: list[Passed], step: int) -> None:
-    """Keep two effects that are probable together."""
-    first, second = pair
+def _keep_together(result: SelectionResult, found: list[Passed], step: int) -> None:
+    """Keep effects that are probable together."""
+    first = found[0].score
     for i, entry in enumerate(result.scores):
-        if entry.step == step and entry.name == first.score.name and entry.passed:
-            result.scores[i] = replace(first.score, kept=True)
+        if entry.step == step and entry.name == first.name and entry.passed:
+            result.scores[i] = replace(first, kept=True)
             break
-    result.scores.append(replace(second.score, kept=True))
-    result.rivals += [[], []]
-    result.model = with_moved_limits(_exactly(second.model))
+    result.scores += [replace(each.score, kept=True) for each in found[1:]]
+    result.rivals += [[] for _ in found]
+    result.model = with_moved_limits(_exactly(found[-1].model))
 
 
 def _keep_best(result: SelectionResult, passed: list[Passed], block: np.ndarray,
