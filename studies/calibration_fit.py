@@ -52,7 +52,7 @@ def fitted(rows: list[dict]) -> dict:
     inputs = np.column_stack([np.arcsinh(steps[:, :2] / posterior.NATS),
                               np.log(np.maximum(steps[:, 2:], 0.1))])
     nothing = logistic(inputs, np.array([not each["hidden"] for each in without]),
-                       np.zeros(4), np.full(4, NOTHING_SD), [(None, 0.0)] * 2 + [(None, None)] * 2)
+                       np.zeros(4), np.full(4, NOTHING_SD), [(None, 0.0)] * 3 + [(None, None)])
     return {"effect": {"intercept": round(float(effect[0]), 3),
                        "weights": weights.round(3).tolist(),
                        "names": {name: round(float(share), 3)
