@@ -24,8 +24,8 @@ from radiotwin.closeloop.posterior import judge
 from radiotwin.closeloop.scoring import (
     Candidate,
     CandidateScore,
+    fit_and_score,
     fit_candidate,
-    score_candidate,
 )
 from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.base import Effect
@@ -56,14 +56,15 @@ def select_faults(result: SelectionResult, effects: list[Effect], links: LinkDat
         hypotheses = result.hypotheses(seed)
         fitted = [fit_candidate(result.model, effect, step, result.criteria, hypotheses)
                   for effect in timed]
-        fitted = [_against_lasting(each, effects, step, result) for each in fitted]
+        fitted = _against_lasting(fitted, effects, step, result)
         candidates = [each for each in fitted if isinstance(each, Candidate)]
         refused += [each for each in fitted if isinstance(each, CandidateScore)]
         kept = None
         for candidate in sorted(candidates, key=lambda each: -each.gain):
             on_progress(f"step {step + 1}: {candidate.effect.name}, held out within flights")
             model = model or _within_flights(result, links, base, seed)
-            score, extended = _score(model, candidate.effect, len(timed), step, seed, result)
+            score, extended = fit_and_score(model, candidate.effect, evidence_blocks(model.links),
+                                            len(timed), step, seed, result.criteria)
             if extended is not None:
                 score = replace(score, evidence_nats=candidate.evidence)
                 score = judge([score], model, hypotheses, result.criteria)[0][0]
@@ -78,25 +79,32 @@ def select_faults(result: SelectionResult, effects: list[Effect], links: LinkDat
             return
 
 
-def _against_lasting(fault: Candidate | CandidateScore, effects: list[Effect], step: int,
-                     result: SelectionResult) -> Candidate | CandidateScore:
-    """Return a fault, or why it is none: an effect that lasts explains as much of all links.
+def _against_lasting(faults: list[Candidate | CandidateScore], effects: list[Effect], step: int,
+                     result: SelectionResult) -> list[Candidate | CandidateScore]:
+    """Return faults, or why one is none: an effect that lasts explains as much of all links.
 
     A receiver that has changed reads less from then on, and so it does in the window that ends
     where the links do not show it.
     """
-    if isinstance(fault, CandidateScore):
+    rivals = {name for each in faults if isinstance(each, Candidate)
+              for name in each.effect.confused_with}
+    fitted = [fit_candidate(result.model, effect, step, result.criteria) for effect in effects
+              if effect.name in rivals and not effect.within_flights
+              and not effect.unavailable(result.model.links)]
+    lasting = [each for each in fitted if isinstance(each, Candidate)]
+    return [_unless_outdone(each, lasting, step) if isinstance(each, Candidate) else each
+            for each in faults]
+
+
+def _unless_outdone(fault: Candidate, lasting: list[Candidate],
+                    step: int) -> Candidate | CandidateScore:
+    rival = next((each for each in lasting if each.effect.name in fault.effect.confused_with
+                  and each.gain >= fault.gain), None)
+    if rival is None:
         return fault
-    for effect in effects:
-        if effect.name not in fault.effect.confused_with or effect.within_flights \
-                or effect.unavailable(result.model.links):
-            continue
-        lasting = fit_candidate(result.model, effect, step, result.criteria)
-        if isinstance(lasting, Candidate) and lasting.gain >= fault.gain:
-            return CandidateScore(fault.effect.name, step=step, reason=(
-                f"{effect.name} explains as much: {lasting.gain:.0f} nats of the links that it is "
-                f"fitted to, and this {fault.gain:.0f}"))
-    return fault
+    return CandidateScore(fault.effect.name, step=step, reason=(
+        f"{rival.effect.name} explains as much: {rival.gain:.0f} nats of the links that it is "
+        f"fitted to, and this {fault.gain:.0f}"))
 
 
 def drop_idle_faults(result: SelectionResult) -> None:
@@ -150,15 +158,6 @@ def _within_flights(result: SelectionResult, links: LinkData, base: Base,
 def _folds(links: LinkData, seed: int) -> Folds:
     by_device = len(links.anchors & set(links.device.tolist())) >= MIN_DEVICES
     return make_folds(links, seed, "device" if by_device and not devices_move(links) else "block")
-
-
-def _score(model: CrossValidatedModel, effect: Effect, tried: int, step: int, seed: int,
-           result: SelectionResult) -> tuple[CandidateScore, CrossValidatedModel | None]:
-    candidate = fit_candidate(model, effect, step, result.criteria)
-    if isinstance(candidate, CandidateScore):
-        return candidate, None
-    return score_candidate(model, candidate, evidence_blocks(model.links), tried, step, seed,
-                           result.criteria)
 
 
 def _adopted(model: CrossValidatedModel, candidate: Candidate) -> CrossValidatedModel:

@@ -18,7 +18,7 @@ from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.closeloop.hypotheses import Hypotheses
 from radiotwin.closeloop.posterior import Step, probability_of_all
-from radiotwin.closeloop.scoring import CandidateScore, fit_candidate, score_candidate
+from radiotwin.closeloop.scoring import CandidateScore, fit_and_score
 from radiotwin.effects.base import Effect
 
 MIN_SHARE = 0.5  # of the probability that is needed, for the first of two
@@ -63,11 +63,8 @@ def probable_together(passed: Sequence[Passed], before: CrossValidatedModel, ste
         hypotheses = Hypotheses.of(model.whole, model.fits[0], seed)
         longer = []
         for effect in effects:
-            candidate = fit_candidate(model, effect, number, criteria, hypotheses)
-            if isinstance(candidate, CandidateScore):
-                continue
-            score, extended = score_candidate(model, candidate, block, tried, number, seed,
-                                              criteria)
+            score, extended = fit_and_score(model, effect, block, tried, number, seed, criteria,
+                                            hypotheses)
             if extended is not None:
                 longer.append([*found, Passed(effect, score, extended)])
         return longer
@@ -86,5 +83,6 @@ def probable_together(passed: Sequence[Passed], before: CrossValidatedModel, ste
         more = beside(best, [first.effect]) \
             if len(kind) == 1 and len(best) < criteria.max_repeats else []
         best = more[0] if more and probability(more[0]) > probability(best) else []
-    return [replace(each, score=replace(each.score, reason="", probability=probability(best)))
+    chance = probability(best) if best else 0.0
+    return [replace(each, score=replace(each.score, reason="", probability=chance))
             for each in best]

@@ -138,6 +138,17 @@ def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.
     return score, None if score.reason else extended
 
 
+def fit_and_score(model: CrossValidatedModel, effect: Effect, block: np.ndarray, tried: int,
+                  step: int, seed: int, criteria: SelectionCriteria,
+                  hypotheses: Hypotheses | None = None,
+                  ) -> tuple[CandidateScore, CrossValidatedModel | None]:
+    """Return `score_candidate` of `fit_candidate`; of one that is refused, no model."""
+    candidate = fit_candidate(model, effect, step, criteria, hypotheses)
+    if isinstance(candidate, CandidateScore):
+        return candidate, None
+    return score_candidate(model, candidate, block, tried, step, seed, criteria)
+
+
 def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score: CandidateScore,
                 block: np.ndarray | None, tried: int, seed: int, criteria: SelectionCriteria,
                 nlos_only: bool = False) -> CandidateScore:

@@ -20,6 +20,7 @@ from radiotwin.closeloop.posterior import Step, judge
 from radiotwin.closeloop.scoring import (
     Candidate,
     CandidateScore,
+    fit_and_score,
     fit_candidate,
     score_candidate,
     score_model,
@@ -291,10 +292,8 @@ def _several(rival: Passed, block: np.ndarray, hypotheses: Hypotheses | None, se
     while len(extended.whole.effects) < criteria.max_effects and len(steps) < most:
         if hypotheses is not None:
             hypotheses = Hypotheses.of(extended.whole, extended.fits[0], seed)
-        candidate = fit_candidate(extended, rival.effect, score.step + 1, criteria, hypotheses)
-        if isinstance(candidate, CandidateScore):
-            return None
-        score, more = score_candidate(extended, candidate, block, 1, score.step + 1, seed, criteria)
+        score, more = fit_and_score(extended, rival.effect, block, 1, score.step + 1, seed,
+                                    criteria, hypotheses)
         if more is None:
             return None
         extended = more

@@ -10,6 +10,8 @@ from radiotwin.errors import BadInput
 from radiotwin.links import LinkData
 from radiotwin.scene.citymap import CityMap
 
+MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal errors
+
 
 class LinkCache:
     """Values derived from links, kept for as long as those links are in use."""
@@ -90,3 +92,8 @@ def frequent_labels(index: np.ndarray, minimum: int) -> list[int]:
     """Return the labels of (n,) that occur at least `minimum` times, in order."""
     values, counts = np.unique(index, return_counts=True)
     return [int(value) for value, count in zip(values, counts, strict=True) if count >= minimum]
+
+
+def robust_sd(values: np.ndarray) -> float:
+    """Return the standard deviation of normal values (n,) among which there may be outliers."""
+    return MAD_SD * float(np.median(np.abs(values - np.median(values))))

@@ -7,6 +7,7 @@ after the comparison belongs to the flight, the receiver or the time.
 import numpy as np
 from scipy.spatial import cKDTree
 
+from radiotwin.effects.arrays import robust_sd
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData, correlation_length_m
 from radiotwin.links.correlation import devices_move, step_m
@@ -15,7 +16,6 @@ NEIGHBOURS = 24  # nearest links that are looked at, of which some are of other 
 MIN_OTHERS = 2  # links of other flights, for a comparison
 MIN_STEPS = 2.0  # between positions, that still count as one place
 MAX_REACH_M = 60.0
-MAD_SD = 1.4826  # standard deviation over median absolute deviation, of normal errors
 MAX_Z, MIN_SD_DB = 4.0, 0.3  # of a value, over the scatter of its class; of that scatter
 
 
@@ -79,7 +79,7 @@ def by_precision(view: ResidualView, rest_db: np.ndarray) -> tuple[np.ndarray, n
         rows = np.flatnonzero(members & says & np.isfinite(rest_db))
         if len(rows):
             centred_db = rest_db[rows] - np.median(rest_db[rows])
-            sd_db = max(MAD_SD * float(np.median(np.abs(centred_db))), MIN_SD_DB)
+            sd_db = max(robust_sd(rest_db[rows]), MIN_SD_DB)
             value_db[rows] = np.clip(centred_db, -MAX_Z * sd_db, MAX_Z * sd_db)
             weight[rows] = 1.0 / sd_db**2 / view.design_effect
     return value_db, weight

@@ -18,9 +18,9 @@ from pydantic import Field
 from scipy.stats import t
 from typing_extensions import override
 
+from radiotwin.effects.arrays import robust_sd
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.comparison import (
-    MAD_SD,
     by_precision,
     compared_db,
     flight_mask,
@@ -197,9 +197,7 @@ def _devices_agree(value_db: np.ndarray, weight: np.ndarray, level_db: float,
 def _robust_sd(values: np.ndarray) -> float:
     """Return the standard deviation of normal values (n,); NaN where few are known."""
     known = values[np.isfinite(values)]
-    if len(known) < MIN_LINKS:
-        return np.nan
-    return MAD_SD * float(np.median(np.abs(known - np.median(known))))
+    return robust_sd(known) if len(known) >= MIN_LINKS else np.nan
 
 
 def _from_reading_to_reading_db(residual_db: np.ndarray, links: LinkData) -> np.ndarray:

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from radiotwin.effects.comparison import MAD_SD, compared_where_possible_db
+from radiotwin.effects.arrays import robust_sd
+from radiotwin.effects.comparison import compared_where_possible_db
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.inference.student import log_density
 from radiotwin.links import LinkData
@@ -95,7 +96,7 @@ def _instants(links: LinkData, rows: np.ndarray) -> np.ndarray:
 def _two_states(rest_db: np.ndarray, instant: np.ndarray, drop_db: float) -> _States:
     """Return the likeliest two states of instants, from a first drop on."""
     share, level_db = 0.2, float(np.quantile(rest_db, 0.6))
-    scale_db = max(MAD_SD * float(np.median(np.abs(rest_db - np.median(rest_db)))), 0.5) / 2
+    scale_db = max(robust_sd(rest_db), 0.5) / 2
     low, total = np.zeros(instant.max() + 1), np.zeros(instant.max() + 1)
     for _ in range(STEPS):
         z = (rest_db[None] - level_db + np.array([[0.0], [drop_db]])) / scale_db
@@ -122,7 +123,7 @@ def _single_state(rest_db: np.ndarray) -> np.ndarray:
     best = np.full(len(rest_db), -np.inf)
     for dof in TAILS:
         level_db = float(np.median(rest_db))
-        scale_db = MAD_SD * float(np.median(np.abs(rest_db - level_db))) + 0.3
+        scale_db = robust_sd(rest_db) + 0.3
         for _ in range(STEPS):
             z = (rest_db - level_db) / scale_db
             weight = (dof + 1) / (dof + z * z)

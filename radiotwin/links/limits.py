@@ -272,9 +272,9 @@ def _notes(links: LinkData, rows: list[np.ndarray], own_db: np.ndarray,
                      for end in (known_db.min(), known_db.max()))
         notes.append(f"limits of detection differ between receivers: from {known_db.min():.1f} "
                      f"{unit} ({low}) to {known_db.max():.1f} {unit} ({high}), by their readings")
-    open_ones = [r for r in lost if (each := found[r]) is not None and each.nats > 0]
-    for receivers, what in ((sorted({*lost} - {*open_ones}), "are blank at any level"),
-                            (open_ones, "may be blank at any level, or below a limit")):
+    unsure = [r for r in lost if (each := found[r]) is not None and each.nats > 0]
+    for receivers, what in (([r for r in lost if r not in unsure], "are blank at any level"),
+                            (unsure, "may be blank at any level, or below a limit")):
         if receivers:
             names = ", ".join(links.receiver_names[r] for r in receivers[:MAX_NAMED])
             notes.append(f"links of receiver {names}{_more(receivers)} {what}: they count as lost, "
