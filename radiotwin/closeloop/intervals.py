@@ -21,6 +21,7 @@ from radiotwin.inference.censored_regression import FitResult
 
 QUANTILE = 0.95  # upper end of a 90 % interval
 MAX_SHARE = 0.5  # of what is allowed, which an interval may span: more is less than one bit learnt
+LEVELS_DB = 120.0  # span of changes of a level that can be at all, where no bounds are given
 MIN_FOLDS = 0.5  # share of the folds that must have found the parameter, too
 
 
@@ -106,5 +107,6 @@ def _checked(parameter: Parameter, found: int, folds: int) -> Parameter:
         with np.errstate(divide="ignore"):
             ends, bounds = np.log(ends), np.log(bounds)
     span = min(np.ptp(bounds), allowed.period) if np.isfinite(bounds).all() else allowed.period
+    span = min(span, LEVELS_DB) if parameter.unit == "dB" else span
     determined = bool(np.ptp(ends) <= MAX_SHARE * span) and found >= MIN_FOLDS * folds
     return replace(parameter, low=low, high=high, determined=determined)

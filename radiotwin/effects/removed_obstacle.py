@@ -2,6 +2,9 @@
 
 No law of its own: links that only this building blocks have the channel's level with line of sight.
 Exactly: links near it have the channel's level over the map without it.
+
+Maps give many a roof too high. Links that pass just below its edge gain from that building's
+removal as well, so only those that a lower one would block, too, show that it is gone.
 """
 
 from functools import lru_cache
@@ -24,6 +27,7 @@ from radiotwin.scene.citymap import CityMap
 MIN_NATS = 6.0  # that the removal of a building must gain to be proposed
 MIN_LINKS = 8  # that only this building blocks
 WELD_M = 0.05  # vertices closer together belong to one building
+LOWER_M = 5.0  # more than the height of a mapped building is usually off
 NEAR_M = 25.0  # links whose ground tracks stay farther away keep their level, also exactly
 
 
@@ -58,8 +62,13 @@ class RemovedObstacle(GainEffect):
             return []
         mine = links.select(rows)
         rise_db = view.level_at(mine.with_los(np.ones(len(rows), bool))) - view.level_at(mine)
-        total = np.bincount(blocker[rows], weights=view.gain_nats(rows, rise_db))
-        counts = np.bincount(blocker[rows])
+        a_m, b_m = links.device_m[links.device[rows]], links.receiver_m[rows]
+        deep = ~_lowered(links.city).line_of_sight(a_m, b_m)
+        if not deep.any():
+            return []
+        gain_nats = view.gain_nats(rows[deep], rise_db[deep])
+        total, counts = (np.bincount(blocker[rows[deep]], weights=each)
+                         for each in (gain_nats, None))
         best = int(np.where(counts >= MIN_LINKS, total, -np.inf).argmax())
         if total[best] < MIN_NATS or counts[best] < MIN_LINKS:
             return []
@@ -143,6 +152,21 @@ def buildings(city: CityMap) -> tuple[np.ndarray, np.ndarray]:
     centre_m = np.column_stack([0.5 * (low_m + high_m)[:, :2], high_m[:, 2]])
     label.flags.writeable = centre_m.flags.writeable = False
     return label, centre_m
+
+
+@lru_cache(maxsize=4)
+def _lowered(city: CityMap) -> CityMap:
+    """Return a map of which every building is lower by `LOWER_M`, or as flat as the ground."""
+    label = buildings(city)[0]
+    base_m = np.full(label.max() + 1, np.inf)
+    np.minimum.at(base_m, label, city.vertices[city.faces][:, :, 2].min(axis=1))
+    lowest_m = np.full(len(city.vertices), -np.inf)
+    lowest_m[city.faces] = base_m[label][:, None]
+    if city.terrain is not None:
+        lowest_m[city.faces[city.terrain]] = np.inf
+    height_m = city.vertices[:, 2]
+    lower_m = np.minimum(height_m, np.maximum(height_m - LOWER_M, lowest_m))
+    return city.with_vertices(np.column_stack([city.vertices[:, :2], lower_m]))
 
 
 @lru_cache(maxsize=32)

@@ -137,7 +137,7 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
         declared that they allow. And notes on what is odd, a sentence each.
     """
     declared = -np.inf if declared_db is None else declared_db
-    apart = _says_nothing(links.level_db, declared)
+    apart = _says_nothing(links, declared)
     if apart:
         declared = -np.inf
     count = np.bincount(links.receiver, minlength=len(links.receiver_names))
@@ -163,20 +163,22 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
     return own_db[links.receiver], [*apart, *notes]
 
 
-def _says_nothing(level_db: np.ndarray, declared_db: float) -> list[str]:
+def _says_nothing(links: LinkData, declared_db: float) -> list[str]:
     """Return why a declared limit is not looked at, a sentence; empty where it may be right.
 
     Signals of all levels arrive, so where some are too weak others are just strong enough. A limit
     far below all readings stands for "not known", and blanks below it would be impossible.
     """
-    read_db, blanks = level_db[np.isfinite(level_db)], int(np.isnan(level_db).sum())
-    if not np.isfinite(declared_db) or not len(read_db) or blanks < MIN_BLANKS:
+    readings, lowest_db = int(np.isfinite(links.level_db).sum()), _lowest_db(links.level_db)
+    blanks = len(links) - readings
+    if not np.isfinite(declared_db) or not readings or blanks < MIN_BLANKS:
         return []
-    if read_db.min() - declared_db < FAR_DB:
+    if lowest_db - declared_db < FAR_DB:
         return []
-    return [f"the declared limit of detection, {declared_db:g}, is not used: the weakest of "
-            f"{len(read_db):,} readings is {read_db.min():g}, far above it, though {blanks:,} "
-            "links are blank"]
+    unit = _unit(links)
+    return [f"the declared limit of detection, {declared_db:g} {unit}, is not used: but for odd "
+            f"ones, the weakest of {readings:,} readings is {lowest_db:g} {unit}, far above it, "
+            f"though {blanks:,} links are blank"]
 
 
 def _usual_db(links: LinkData, rows: list[np.ndarray], found: list[LimitEstimate | None],
@@ -252,7 +254,7 @@ def _lowest_db(level_db: np.ndarray) -> float:
 def _notes(links: LinkData, rows: list[np.ndarray], own_db: np.ndarray,
            found: list[LimitEstimate | None], declared_db: float, lost: list[int]) -> list[str]:
     """Return what is odd about the limits of receivers (r,), a sentence each."""
-    unit, notes = "dB" if links.is_gain else "dBm", []
+    unit, notes = _unit(links), []
     other = [r for r in range(len(rows)) if np.isfinite(declared_db) and own_db[r] != declared_db]
     known_db = own_db[np.isfinite(own_db)]
     if other:
@@ -280,6 +282,10 @@ def _notes(links: LinkData, rows: list[np.ndarray], own_db: np.ndarray,
             notes.append(f"links of receiver {names}{_more(receivers)} {what}: they count as lost, "
                          "not as weak")
     return notes
+
+
+def _unit(links: LinkData) -> str:
+    return "dB" if links.is_gain else "dBm"
 
 
 def _used(name: str, limit_db: float, found: LimitEstimate | None, unit: str) -> str:

@@ -73,7 +73,8 @@ class CityMap:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what the map is made of; Embree's scene is made again."""
-        return CityMap, (self.vertices, self.faces, self.materials, self.material, self.vegetation)
+        return CityMap, (self.vertices, self.faces, self.materials, self.material, self.vegetation,
+                         self.terrain)
 
     @classmethod
     def from_xml(cls, xml_path: Path | str, vegetation: Vegetation | None = None,
@@ -124,6 +125,11 @@ class CityMap:
         """Return the map without some faces, (f,) bool."""
         return CityMap(self.vertices, self.faces[~faces], self.materials, self.material[~faces],
                        self.vegetation, None if self.terrain is None else self.terrain[~faces])
+
+    def with_vertices(self, vertices: np.ndarray) -> "CityMap":
+        """Return the map with its vertices elsewhere, (v, 3) [m]."""
+        return CityMap(vertices, self.faces, self.materials, self.material, self.vegetation,
+                       self.terrain)
 
     def state(self) -> tuple[Any, ...]:
         """Return all that decides the answers of a map, and what paths over it are."""

@@ -104,10 +104,12 @@ def test_a_parameter_that_most_folds_do_not_find_is_not_determined():
 
 @pytest.mark.parametrize(("low", "high", "allowed", "determined"), (
     (-100.0, 90.0, Allowed(period=360.0), False), (-40.0, 40.0, Allowed(period=360.0), True),
+    (-30.0, 31.0, "dB", False), (-29.0, 30.0, "dB", True),
     (-230.0, 315.0, Allowed(8.0, 45.0), False), (0.1, 0.2, Allowed(0.05, 5.0, is_log=True), True),
     (0.1, 4.0, Allowed(0.05, 5.0, is_log=True), False), (-900.0, 900.0, Allowed(), True)))
 def test_intervals_of_more_than_half_of_what_is_allowed_say_nothing(low, high, allowed, determined):
-    checked = intervals._checked(Parameter(20.0 if low < 0 else 0.15, low, high, "", allowed=allowed), 6, 6)
+    unit, allowed = ("dB", Allowed()) if allowed == "dB" else ("", allowed)
+    checked = intervals._checked(Parameter(20.0 if low < 0 else 0.15, low, high, unit, allowed=allowed), 6, 6)
     assert checked.determined is determined
     assert checked.low >= allowed.low and checked.high <= allowed.high
 

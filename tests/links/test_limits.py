@@ -80,11 +80,11 @@ def test_a_declared_limit_that_readings_allow_stays_to_the_bit(seed, given):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("lost", [0.0, 0.3])
-def test_a_limit_far_below_all_readings_stands_for_none(seed, lost):
-    links = fly(seed, lost=lost)
+@pytest.mark.parametrize("given", [{}, {"lost": 0.3}, {"odd": 1}])
+def test_a_limit_far_below_all_readings_stands_for_none(seed, given):
+    links = fly(seed, **given)
     limits_db, notes = estimated(links, -250.0)
-    assert notes[0].startswith("the declared limit of detection, -250, is not used: the weakest of")
+    assert notes[0].startswith("the declared limit of detection, -250 dB, is not used: but for odd ones, the weakest")
     np.testing.assert_array_equal(limits_db, estimated(links)[0])
     np.testing.assert_allclose(limits_db, -110.0, atol=0.8)
 

@@ -1,5 +1,6 @@
 """The ground as a terrain: its triangles, and what the 3D map, placement and lattices make of it."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -135,3 +136,10 @@ def test_a_height_is_above_the_datum_or_above_the_ground_not_both():
         parse_config(DECLARED | {"devices": [device | {"z_m": 2, "above_ground_m": 2}]}, "scene.toml")
     with pytest.raises(BadInput, match="lattice.above = 'sea': Input should be 'datum' or 'ground'"):
         parse_config(DECLARED | {"lattice": {"altitudes_m": [3], "above": "sea"}}, "scene.toml")
+
+
+def test_a_map_that_goes_to_another_process_keeps_its_terrain():
+    city = terrain_map(ridge(30.0))
+    other = pickle.loads(pickle.dumps(city))
+    np.testing.assert_array_equal(other.terrain, city.terrain)
+    assert other.ground_height_m(30.0, 40.0) == city.ground_height_m(30.0, 40.0)
