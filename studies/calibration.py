@@ -15,15 +15,18 @@ from pathlib import Path
 from radiotwin import close_loop
 from radiotwin.closeloop import posterior
 from radiotwin.closeloop.scoring import CandidateScore
+from radiotwin.effects.missing_obstacle import MissingObstacle
+from radiotwin.effects.removed_obstacle import RemovedObstacle
 from radiotwin.files import atomic_path
 from studies.calibration_fit import calibration_figures, calibration_table, fitted
-from studies.foreign_roc import undeclared_besides
+from studies.foreign_roc import by_mistake_of_the_map, undeclared_besides
 from studies.runner import RECORDS, Study, read_rows
 from tests.undeclared.cases import FAMILIES, OUTSIDE, Case, case, stored
 from tests.undeclared.foreign.cases import ForeignCase, foreign_case, names
 from tests.undeclared.open_ground import CASES, OpenCase, open_case
 
 KNOWN_SEEDS = (1, 2)  # of the traced cities' cases
+PLACED = frozenset({"missing_obstacle", "removed_obstacle"})  # of these it is known what is right
 PATH = Path(posterior.__file__).with_name("calibration.json")
 
 
@@ -50,18 +53,18 @@ def candidates_of(seed: int, settings: dict) -> dict:
     nuisance = hidden.answer.get("nuisance")  # of a foreign case
     undeclared = set(hidden.answer.get("besides", ()))  # of a campaign over open ground
     if nuisance:
-        undeclared |= undeclared_besides(nuisance)
+        undeclared |= undeclared_besides(nuisance) - PLACED
     if "shower" in right:  # see `studies.foreign`
         undeclared.add("episode")
     if not settings["map"]:
-        undeclared |= {"missing_obstacle", "removed_obstacle"}
+        undeclared |= PLACED
     return {
         "hidden": [[each["name"], each.get("in_catalogue", family not in OUTSIDE)]
                    for each in hidden.answer["effects"]],
         "open": sorted(undeclared - right),
         "named": [each.effect.name for each in loop.after.whole.effects],
-        "candidates": [[*_row(score), score.name in right] for score in loop.selection.scores
-                       if score.features],
+        "candidates": [[*_row(score), score.name in right or _is_wrong_map(score, nuisance)]
+                       for score in loop.selection.scores if score.features],
         "steps": [[max([0.0, *(score.nats for score in loop.selection.scores if score.features
                                and score.step == step.number)]),
                    step.best_unnamed, step.rest_db, step.noise_db]
@@ -72,6 +75,17 @@ def _case(family: str, number: str) -> Case | ForeignCase | OpenCase:
     if family == "open":
         return open_case(int(number))
     return case(family, int(number)) if number else foreign_case(family)
+
+
+def _is_wrong_map(score: CandidateScore, nuisance: dict | None) -> bool:
+    """Return whether a building of a candidate is missing or gone, though nobody hid it."""
+    if isinstance(score.params, MissingObstacle.Params):
+        x_m, y_m = score.params.box.x_m, score.params.box.y_m
+    elif isinstance(score.params, RemovedObstacle.Params):
+        x_m, y_m, _ = score.params.centre_m
+    else:
+        return False
+    return nuisance is not None and by_mistake_of_the_map(score.name, x_m, y_m, nuisance)
 
 
 def _row(score: CandidateScore) -> list:

@@ -19,12 +19,11 @@ from radiotwin.closeloop.cross_validation import cross_validate, training_parts
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.links import prepare_links
 from studies.foreign_figures import foreign_figures
-from studies.foreign_roc import COLUMNS, LIMITS_DIFFER_DB
+from studies.foreign_roc import COLUMNS, LIMITS_DIFFER_DB, by_mistake_of_the_map
 from studies.foreign_table import PHYSICS, UNNAMED, foreign_table
 from studies.runner import Study
 from tests.undeclared.foreign.cases import ForeignCase, families, foreign_case, names, split_of
 
-NEAR_M = 25.0  # of a building that the map lacks or shows by mistake: a box there is no false name
 NONE, OTHER = "none", "not in the catalogue"
 
 
@@ -106,11 +105,9 @@ def _is_true(name: str, hidden: ForeignCase, right: set[str]) -> bool:
 def _by_mistake_of_the_map(effect: dict, hidden: ForeignCase) -> bool:
     """Return whether a name is true of what no campaign declares right, though nobody hid it."""
     nuisance, values = hidden.answer["nuisance"], effect["parameters"]
-    wrong = {"missing_obstacle": "unmapped", "removed_obstacle": "gone"}.get(effect["name"])
-    if wrong and "x_m" in values:
-        place_m = np.array([values["x_m"]["value"], values["y_m"]["value"]])
-        return any(np.linalg.norm(_middle(corners_m) - place_m) < NEAR_M
-                   for corners_m in nuisance[wrong])
+    if "x_m" in values and by_mistake_of_the_map(
+            effect["name"], values["x_m"]["value"], values["y_m"]["value"], nuisance):
+        return True
     if effect["name"] == "noise_floor_censoring":
         return nuisance["declared"] == "wrong" or np.ptp(nuisance["limit_db"]) > LIMITS_DIFFER_DB
     return False
@@ -123,10 +120,6 @@ def _is_a_shower(effect: dict, hidden: ForeignCase) -> bool:
                if name.startswith(("start_s", "end_s"))]
     return (effect["name"] == "episode" and bool(rain) and len(times_s) == 2
             and rain["start_s"] <= np.mean(times_s) <= rain["end_s"])
-
-
-def _middle(corners_m: Any) -> np.ndarray:
-    return 0.5 * (np.min(corners_m, axis=0) + np.max(corners_m, axis=0))
 
 
 def compared(truth: dict, effects: list[dict], hidden: ForeignCase) -> list[dict]:

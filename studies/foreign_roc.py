@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+NEAR_M = 25.0  # of a building that the map lacks or shows by mistake: a box there is no false name
 LIMITS_DIFFER_DB = 2.0  # between receivers: then a limit of its own is no false name
 FALSE_ALARMS = (0.01, 0.05)
 SCORES = ("probability", "heldout_nll_gain")
@@ -21,6 +22,21 @@ def undeclared_besides(nuisance: dict) -> set[str]:
              "noise_floor_censoring": nuisance["declared"] == "wrong"
              or np.ptp(nuisance["limit_db"]) > LIMITS_DIFFER_DB}
     return {name for name, there in names.items() if there}
+
+
+def by_mistake_of_the_map(name: str, x_m: float, y_m: float, nuisance: dict) -> bool:
+    """Return whether a building is rightly said to be missing or gone, though nobody hid it.
+
+    Args:
+        name: of the effect.
+        x_m: its centre [m].
+        y_m: likewise [m].
+        nuisance: of a foreign case.
+    """
+    wrong = {"missing_obstacle": "unmapped", "removed_obstacle": "gone"}.get(name)
+    return wrong is not None and any(
+        np.linalg.norm(0.5 * (np.min(corners_m, axis=0) + np.max(corners_m, axis=0))
+                       - (x_m, y_m)) < NEAR_M for corners_m in nuisance[wrong])
 
 
 def scored(rows: pd.DataFrame, score: str) -> pd.DataFrame:

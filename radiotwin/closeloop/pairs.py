@@ -72,8 +72,8 @@ def probable_together(passed: Sequence[Passed], before: CrossValidatedModel, ste
     def probability(found: list[Passed]) -> float:
         names = {each.score.name for each in found}
         others = [each.score.held_out_nats for each in ranked if each.score.name not in names]
-        return probability_of_all([each.score for each in found], max([0.0, *others]),
-                                  step.best_unnamed, before.rmse_db(), step.rest_db / step.noise_db)
+        return probability_of_all([each.score for each in found], max([0.0, *others]), before,
+                                  step.rest_db / step.noise_db)
 
     seconds = ([first.effect] if first.effect.repeatable else []) + [
         each.effect for each in ranked[1:] if each.effect is not first.effect]

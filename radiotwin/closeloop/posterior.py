@@ -2,10 +2,10 @@
 
 Nats are worth what they turned out to be worth: a logistic regression, fitted on traced cases
 (`tests/undeclared`, of the foreign worlds the cities for calibration; `python -m studies foreign`
-judges it on the others), turns evidence beside a correlated rest, its lead over curves without a
-name, what held-out links gain, and how much of the rest belongs to places (a map that is wrong, or
-none) into a probability (Platt 1999, 'Probabilistic outputs for
-support vector machines'). Its few numbers are in `calibration.json`, made by
+judges it on the others), turns evidence beside a correlated rest, what held-out links gain, how
+much of the rest belongs to places (a map that is wrong, or none), and whether an effect of another
+kind is there already (two are rarer than one) into a probability (Platt 1999, 'Probabilistic
+outputs for support vector machines'). Its few numbers are in `calibration.json`, made by
 `python -m studies.calibration`.
 """
 
@@ -66,7 +66,8 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
     """
     rest_db, noise_db = hypotheses.sizes_db
     step = Step(len(model.whole.effects), hypotheses.unnamed_nats, rest_db, noise_db, {})
-    before_db, best_unnamed = model.rmse_db(), step.best_unnamed
+    before_db = model.rmse_db()
+    there = {each.effect.name for each in model.whole.effects}
     judged = []
     for score in scores:
         if score.gain_by_fold.size:
@@ -77,10 +78,9 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
                       and each.gain_by_fold.size
                       and (by_levels or not np.isfinite(each.evidence_nats))]
             fall = np.log(before_db / score.rmse_db) if score.rmse_db > 0 else 0.0
-            nats = (score.nats, score.nats - by_levels * best_unnamed, held_out,
-                    held_out - max([0.0, *others]))
-            score = replace(score, features=features(nats, float(np.nan_to_num(fall)),
-                                                     rest_db / noise_db))
+            nats = score.nats, held_out, held_out - max([0.0, *others])
+            score = replace(score, features=features(
+                nats, float(np.nan_to_num(fall)), rest_db / noise_db, bool(there - {score.name})))
             probability = probability_of(score.name, score.features)
             low = probability < criteria.min_probability
             why = (f"it is not probable enough ({probability:.2f}; "
@@ -88,40 +88,41 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
             score = replace(score, probability=probability,
                             reason=why if score.passed else score.reason)
         judged.append(score)
-    return judged, replace(step, probabilities=_probabilities(judged, best_unnamed, rest_db,
+    return judged, replace(step, probabilities=_probabilities(judged, step.best_unnamed, rest_db,
                                                               noise_db))
 
 
-def features(nats: tuple[float, float, float, float], rmse_fall: float,
-             rest_over_noise: float) -> tuple[float, ...]:
+def features(nats: tuple[float, float, float], rmse_fall: float, rest_over_noise: float,
+             is_another_kind: bool) -> tuple[float, ...]:
     """Return what a candidate's probability depends on, (6,).
 
     Args:
-        nats: its evidence beside a correlated rest, its lead over the best curve without a name,
-            its gain on held-out links, and its lead over the best other effect there [nats].
+        nats: its evidence beside a correlated rest, its gain on held-out links, and its lead over
+            the best other effect there [nats].
         rmse_fall: of held-out links, logarithm of the error without it over that with it.
         rest_over_noise: standard deviations of what belongs to places and of noise.
+        is_another_kind: whether an effect of another name is there already.
     """
     return (*np.arcsinh(np.array(nats) / NATS).tolist(), 10 * rmse_fall,
-            float(np.log(max(rest_over_noise, LEAST_RATIO))))
+            float(np.log(max(rest_over_noise, LEAST_RATIO))), float(is_another_kind))
 
 
-def probability_of_all(scores: Sequence[CandidateScore], other: float, unnamed: float,
-                       before_db: float, rest_over_noise: float) -> float:
+def probability_of_all(scores: Sequence[CandidateScore], other: float, before: CrossValidatedModel,
+                       rest_over_noise: float) -> float:
     """Return the probability that several effects are there, from what they explain together.
 
     Args:
         scores: each of a model with those before it.
         other: most that any other effect gains on held-out links [nats].
-        unnamed: most evidence for a curve without a name [nats].
-        before_db: held-out error without any of them [dB].
+        before: the model without any of them.
         rest_over_noise: standard deviations of what belongs to places and of noise, without them.
     """
     evidence, held_out = (sum(each.nats for each in scores),
                           sum(each.held_out_nats for each in scores))
-    values = features((evidence, evidence - unnamed, held_out, held_out - other),
-                      float(np.nan_to_num(np.log(before_db / scores[-1].rmse_db))),
-                      rest_over_noise)
+    kinds = {each.name for each in scores} | {each.effect.name for each in before.whole.effects}
+    values = features((evidence, held_out, held_out - other),
+                      float(np.nan_to_num(np.log(before.rmse_db() / scores[-1].rmse_db))),
+                      rest_over_noise, len(kinds) > 1)
     return min(probability_of(each.name, values) for each in scores)
 
 

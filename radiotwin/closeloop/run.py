@@ -125,7 +125,10 @@ class Loop(Summarised):
     def detectable(self) -> list[Detectable]:
         """How large effects would have had to be, to be named."""
         left = self.selection.looked_at
-        return [] if left is None else detectable(left[1], self.criteria)
+        if left is None:
+            return []
+        there = {each.effect.name for each in left[0].whole.effects}
+        return detectable(left[1], self.criteria, there)
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:

@@ -12,6 +12,7 @@ from radiotwin.closeloop.hypotheses import Hypotheses, is_judged_by_levels
 from radiotwin.effects.base import Effect
 from radiotwin.effects.fitting import add_effect
 from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.params import EffectParams
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.evidence import cross_fit_p_value, sign_flip_p_value
 
@@ -39,6 +40,7 @@ class CandidateScore:
         features: (6,) what its probability depends on, see `radiotwin.closeloop.posterior`; empty
             where it was not tried.
         probability: that it is there.
+        params: as fitted to all links; None where it was not tried.
     """
 
     name: str
@@ -53,6 +55,7 @@ class CandidateScore:
     passed: bool = False
     features: tuple[float, ...] = ()
     probability: float = np.nan
+    params: EffectParams | None = None
 
     @property
     def held_out_nats(self) -> float:
@@ -132,7 +135,8 @@ def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.
         models.append(extended_fold)
         fits.append(extended_fit)
     extended = model.extended(models, fits)
-    score = CandidateScore(candidate.effect.name, step=step, evidence_nats=candidate.evidence)
+    score = CandidateScore(candidate.effect.name, step=step, evidence_nats=candidate.evidence,
+                           params=like)
     score = score_model(model, extended, score, block, tried, seed, criteria,
                         nlos_only=candidate.effect.nlos_only)
     return score, None if score.reason else extended

@@ -7,7 +7,7 @@ enough to be named. What was not named and is smaller may be there.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,30 +44,34 @@ class Detectable:
     pattern: str
 
 
-def detectable(hypotheses: Hypotheses, criteria: SelectionCriteria) -> list[Detectable]:
+def detectable(hypotheses: Hypotheses, criteria: SelectionCriteria,
+               there: Set[str] = frozenset()) -> list[Detectable]:
     """Return the least size that would have been named of each family that can be there.
 
     Args:
         hypotheses: about what the last model lacks.
         criteria: with the probability that is needed.
+        there: names of the effects of that model.
     """
     found: dict[tuple[str, str, str], list[float]] = {}
     rest_db, noise_db = hypotheses.sizes_db
     ratio, probability = rest_db / noise_db, criteria.min_probability
     for name, unit, what, pattern in _patterns(hypotheses.links):
         information = hypotheses.information(pattern)
-        nats = needed_nats(name, probability, ratio) + 0.5 * np.log(len(pattern))
+        nats = needed_nats(name, probability, ratio, bool(there - {name}))
+        nats += 0.5 * np.log(len(pattern))
         size = np.sqrt(2 * nats / information) if information > 0 else np.inf
         found.setdefault((name, unit, what), []).append(float(size))
     return [Detectable(name, float(np.median(sizes)), unit, what)
             for (name, unit, what), sizes in found.items()]
 
 
-def needed_nats(name: str, probability: float, rest_over_noise: float) -> float:
+def needed_nats(name: str, probability: float, rest_over_noise: float,
+                is_another_kind: bool = False) -> float:
     """Return the evidence that makes an effect so probable, if nothing competes with it."""
     def lack(nats: float) -> float:
-        return probability_of(name, features((nats, nats, nats, nats), 0.0,
-                                             rest_over_noise)) - probability
+        return probability_of(name, features((nats, nats, nats), 0.0, rest_over_noise,
+                                             is_another_kind)) - probability
 
     if lack(0.0) >= 0:
         return 0.0

@@ -116,18 +116,24 @@ def test_what_makes_links_blank_has_no_rival_among_what_changes_levels(open_grou
     alone, beside = (judge(scores, model, hypotheses, CRITERIA)[0][0] for scores in ([lost], [lost, offset]))
     assert beside.probability == pytest.approx(alone.probability) and beside.features[0] == beside.features[1]
     (weaker,) = (score for score in judge([lost, offset, lost], model, hypotheses, CRITERIA)[0] if score.name == "foliage")
-    assert weaker.features[3] < judge([offset], model, hypotheses, CRITERIA)[0][0].features[3]
+    assert weaker.features[2] < judge([offset], model, hypotheses, CRITERIA)[0][0].features[2]
 
 
 def test_more_evidence_is_never_less_probable():
     nats = np.arange(0.0, 300.0, 10.0)
-    found = [probability_of("foliage", features((each,) * 4, 0.01 * each, 1.0)) for each in nats]
+    found = [probability_of("foliage", features((each,) * 3, 0.01 * each, 1.0, False)) for each in nats]
     assert np.all(np.diff(found) > 0)
 
 
 def test_where_more_of_the_rest_belongs_to_places_the_same_evidence_is_worth_less():
-    found = [probability_of("foliage", features((40.0,) * 4, 0.1, ratio)) for ratio in (0.3, 1.0, 3.0, 9.0)]
+    found = [probability_of("foliage", features((40.0,) * 3, 0.1, ratio, False)) for ratio in (0.3, 1.0, 3.0, 9.0)]
     assert np.all(np.diff(found) < 0)
+
+
+def test_beside_an_effect_of_another_kind_the_same_evidence_is_worth_less():
+    alone, beside = (probability_of("foliage", features((40.0,) * 3, 0.1, 1.0, there)) for there in (False, True))
+    assert beside < 0.8 * alone
+    assert needed_nats("foliage", 0.5, 1.0, True) > needed_nats("foliage", 0.5, 1.0)
 
 
 def test_an_effect_of_the_size_that_would_have_been_seen_has_the_evidence_for_it(open_ground):

@@ -4,9 +4,12 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from studies import calibration_fit
+from radiotwin.closeloop.scoring import CandidateScore
+from radiotwin.effects.missing_obstacle import MissingObstacle
+from radiotwin.effects.removed_obstacle import RemovedObstacle
+from studies import calibration, calibration_fit
 
-WEIGHTS = np.array([0.5, 0.0, 0.6, 0.1, 0.2, -0.8])  # the second feature does not count
+WEIGHTS = np.array([0.5, 0.6, 0.1, 0.2, -0.8, -0.3])
 
 
 def rows(seed, cases=120):
@@ -47,3 +50,13 @@ def test_what_is_open_and_what_held_out_links_do_not_support_is_left_out():
     one["results"]["open"] = ["foliage"]
     one["results"]["candidates"][1][2] = False
     assert sorted(calibration_fit.usable([one])["name"]) == ["interference", "lock_loss"]
+
+
+def test_a_building_is_right_where_the_map_is_wrong_and_nowhere_else():
+    nuisance = {"unmapped": [[[0.0, 0.0], [20.0, 0.0], [20.0, 10.0]]], "gone": [[[100.0, 0.0], [120.0, 10.0]]]}
+    new, gone = MissingObstacle.Params, RemovedObstacle.Params
+    for params, right in ((new(box=(12.0, 9.0, 10.0, 10.0, 20.0, 0.0)), True), (new(box=(110.0, 5.0, 10.0, 10.0, 20.0, 0.0)), False),
+                          (gone(building=0, centre_m=(110.0, 9.0, 20.0)), True), (gone(building=0, centre_m=(10.0, 5.0, 20.0)), False)):
+        name = "missing_obstacle" if isinstance(params, new) else "removed_obstacle"
+        assert calibration._is_wrong_map(CandidateScore(name, params=params), nuisance) is right
+        assert not calibration._is_wrong_map(CandidateScore(name, params=params), None)
