@@ -26,6 +26,7 @@ DESCENTS = 2  # a simplex that has collapsed too early starts anew; one for a fo
 MAX_LINKS, MAX_LINKS_OF_MEMBER = 5000, 1500  # that numbers are refined on
 EXACT_EVALUATIONS, MAX_EXACT_LINKS = 8, 1500  # the same where each follows paths, which is slow
 MIN_EXACT_GAIN_NATS = 10.0  # that exact levels must gain to be refined on, and each descent
+MAX_EXACT_NUMBERS = 3  # of an effect whose exact levels are looked for where quick ones fit better
 MAX_EXACT_DESCENTS = 3  # the objective is rough, as paths open and close: a simplex stops early
 MAX_PROPOSALS = 2  # of one effect that are fitted
 MIN_GAIN_NATS = 5.0  # that a proposal must gain to be refined
@@ -145,6 +146,8 @@ def _best_addition(model: FoldModel, effect: Effect, result: FitResult,
     if like is not None:
         near = _near(model, effect, result, like)
         return near if near[1].objective < exact[1].objective else exact
+    if exact[1] is refined[1] and model.channel.follows_paths:
+        exact = _exactly_beside(*refined)
     before = result.objective
     for _ in range(MAX_EXACT_DESCENTS):
         if exact[1] is refined[1] or before - exact[1].objective < MIN_EXACT_GAIN_NATS:
@@ -153,6 +156,23 @@ def _best_addition(model: FoldModel, effect: Effect, result: FitResult,
         exact = _refine(*exact, evaluations=EXACT_EVALUATIONS, descents=1,
                         max_links=MAX_EXACT_LINKS)
     return exact
+
+
+def _exactly_beside(model: FoldModel, result: FitResult) -> tuple[FoldModel, FitResult]:
+    """Look for better exact levels of the last effect, where those of its quick optimum are not.
+
+    The optimum of both need not be the same. Only of few numbers, such as a position: each value
+    that is tried follows paths.
+    """
+    last = model.effects[-1]
+    variation = last.effect.variation(last.params)
+    if variation is None or len(variation.values) > MAX_EXACT_NUMBERS:
+        return model, result
+    exact = model.apply(last.effect, last.effect.exact(last.params))
+    start = model.with_effects([*model.effects[:-1], exact])
+    beside = _refine(start, start.fit(result), evaluations=EXACT_EVALUATIONS, descents=1,
+                     max_links=MAX_EXACT_LINKS)
+    return beside if beside[1].objective < result.objective else (model, result)
 
 
 def _near(model: FoldModel, effect: Effect, result: FitResult,
