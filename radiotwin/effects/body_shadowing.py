@@ -80,6 +80,11 @@ class BodyShadowing(GainEffect):
         return [self.Params(receivers=found)] if found else []
 
     @override
+    def propose_like(self, view: ResidualView, params: Params) -> list[Params]:
+        """Return also what all links proposed: every link bears on it, in each part alike."""
+        return [*self.propose(view), params]
+
+    @override
     def gain_db(self, links: LinkData, params: Params) -> np.ndarray:
         gain_db = np.zeros(len(links))
         for receiver, body in params.receivers.items():

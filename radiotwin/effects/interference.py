@@ -93,6 +93,11 @@ class Interference(ReceiverEffect):
         return found
 
     @override
+    def propose_like(self, view: ResidualView, params: Params) -> list[Params]:
+        """Return also what all links proposed: every link bears on it, in each part alike."""
+        return [*self.propose(view), params]
+
+    @override
     def inputs(self, links: LinkData, params: Params) -> np.ndarray:
         return np.exp(_arriving_db(links, params.place_m, params.level_db, params.hidden_loss_db)
                       * NEPERS)
