@@ -4,10 +4,14 @@ import numpy as np
 import pytest
 import trimesh
 
+from radiotwin.channel.log_distance import LogDistance
 from radiotwin.effects.clock_offset import ReceiverClockOffset
+from radiotwin.effects.fitting import add_effect
+from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.position_errors import DevicePositionError, ReceiverPositionError
 from radiotwin.effects.removed_obstacle import RemovedObstacle, only_blocker
+from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.scene.citymap import CityMap
 
 FAR_M, NEAR_M = [-300.0, 300, 60], [60.0, 0, 10]
@@ -84,3 +88,38 @@ def test_at_another_time_a_receiver_is_elsewhere_along_its_way(make_links):
     offset_db = effect.term(links, params, channel).offset_db
     assert offset_db[0] == pytest.approx(20 - 0.1 * (np.hypot(120, 60) - 120), abs=0.01)
     assert effect.variation(params).follows_paths
+
+
+class TwoAnswers(LogDistance):
+    """A law whose quick levels are of another place than asked for, some metres beside it, and a little rough."""
+
+    follows_paths = True
+    beside_m, rough_db = np.array([12.0, -6.0, 0.0]), 0.2
+
+    def level_at(self, links, exact=False):
+        if exact:
+            return self.predict(links.geometry)[0]
+        moved_m = links.device_m - DECLARED_M
+        share = np.minimum(np.linalg.norm(moved_m, axis=1), 1.0)[:, None]
+        level_db = self.predict(links.with_devices(links.device_m + share * self.beside_m).geometry)[0]
+        rough_db = self.rough_db * (-1.0) ** np.arange(len(links))
+        return level_db + np.where(share[links.device, 0] > 0, rough_db, 0.0)
+
+
+DECLARED_M, MOVE_M = np.array([[0.0, 0.0, 10.0], [300.0, 200.0, 10.0]]), (14.0, -18.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_position_whose_exact_optimum_lies_beside_the_quick_one_is_found(make_links, seed):
+    """At the quick optimum the exact levels fit worse, so they were not looked at there."""
+    rng = np.random.default_rng(seed)
+    receiver_m = np.column_stack([rng.uniform(-150, 400, 700), rng.uniform(-150, 350, 700), rng.uniform(20, 60, 700)])
+    true_m = DECLARED_M + np.array([[*MOVE_M, 0.0], [0.0, 0.0, 0.0]])
+    distance_m = np.linalg.norm(receiver_m[:, None] - true_m, axis=2).ravel()
+    links = make_links(DECLARED_M, receiver_m, level_db=-40 - 22 * np.log10(distance_m) + rng.normal(0, 0.5, 1400))
+    model = FoldModel.build(links, TwoAnswers(LogDistanceLine(-40.0, -2.2, 0.5)), 5.0)
+    fit = model.fit()
+    found, _ = add_effect(model, DevicePositionError(), fit)
+    params = found.effects[-1].params
+    assert params.exact and params.device == 0
+    assert params.move_m == pytest.approx(MOVE_M, abs=2.0)

@@ -89,3 +89,12 @@ def test_an_emitter_that_a_wall_hides_is_found(make_links, view, walled):
     best = Interference().propose(view(links, mean_db, 1.0))[0]
     assert np.hypot(*(np.array(best.place_m) - emitter_m[:2])) < 30 and best.hidden_loss_db == 20
     assert len(Interference().variation(best).values) == 4
+
+
+def test_a_part_of_the_links_is_searched_where_all_of_them_found_it(make_links, view):
+    """A part whose own links propose nothing, as the emitter is far below the level there, still tries it."""
+    rng = np.random.default_rng(0)
+    links = make_links([[0.0, 0, 1.5]], np.column_stack([rng.uniform(0, 300, (60, 2)), np.full(60, 60.0)]))
+    params = Interference.Params(place_m=(120.0, 80.0), level_db=-190.0, within_m=(0, 0, 300, 300))
+    seen = view(links, np.zeros(60), 2.0)
+    assert Interference().propose(seen) == [] and Interference().propose_like(seen, params) == [params]
