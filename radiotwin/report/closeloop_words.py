@@ -7,6 +7,7 @@ from radiotwin.report.labels import INTERPOLATIONS, join_names, name_label, vari
 
 MAX_NAMED = 4  # variables or effects in a sentence
 MIN_DIFFERENCE_DB = 0.5  # of two receivers, to be worth a word: instruments' tolerance
+SURE = 0.9  # a cause that is less probable is said to be probable only
 LIKELY = 0.05  # a cause that is less probable is not worth a word
 BADGES = {"effect": "found: ", "none": "no cause found", "unexplained": "unexplained",
           "undecided": "undecided"}
@@ -55,6 +56,12 @@ def cause_names(report: dict) -> list[str]:
     causes = [each for each in report["effects"] if each["name"] not in INTERPOLATIONS]
     counts = Counter(name_label(each["name"]) for each in causes)
     return [name if count == 1 else f"{name} ({count} times)" for name, count in counts.items()]
+
+
+def least_probability(report: dict) -> float:
+    """Return the probability of the least probable cause that was found; 1 where none has one."""
+    return min((each["probability"] for each in report["effects"]
+                if each.get("probability") is not None), default=1.0)
 
 
 def rivals(report: dict) -> str:
@@ -142,8 +149,13 @@ def _effect(report: dict) -> str:
     interpolated = any(each["name"] in INTERPOLATIONS for each in report["effects"])
     after = explained[-1] if explained and interpolated else error["after"]["rmse_db"]
     it = "it" if len(causes) == 1 else "them"
-    text = (f"The model lacked {join_names(causes)}. With {it} the RMSE on held-out links falls "
-            f"from {number(error['before']['rmse_db'])} to {number(after)} dB.")
+    least = least_probability(report)
+    lacked, sure = "lacked", ""
+    if least < SURE:
+        lacked = "probably lacked"
+        sure = f" (probability {probability(least)}{' and more' * (len(causes) > 1)})"
+    text = (f"The model {lacked} {join_names(causes)}{sure}. With {it} the RMSE on held-out links "
+            f"falls from {number(error['before']['rmse_db'])} to {number(after)} dB.")
     if report["remaining"]["drivers"]:
         text += f" The remaining residual depends on {join_names(drivers(report))}."
     return text

@@ -124,6 +124,16 @@ def test_numbers_that_are_not_known_are_dashes(tmp_path):
     assert "None" not in page(unknown, tmp_path) and "nan" not in page(unknown, tmp_path)
 
 
+def test_what_is_not_sure_is_said_to_be_probable(tmp_path):
+    text = page(report(effects=[DRIFT | {"probability": 0.561}]), tmp_path)
+    assert "The model probably lacked receiver drift (probability 0.56). With it the RMSE" in text
+    assert "<b>probable: receiver drift</b>" in text
+    both = [DRIFT | {"probability": 0.97}, DRIFT | {"name": "foliage", "rank": 2, "probability": 0.6}]
+    assert "probably lacked receiver drift and foliage (probability 0.60 and more). With them" \
+        in closeloop_summary(report(effects=both))
+    assert "The model lacked receiver drift. With it" in closeloop_summary(report(effects=both[:1]))
+
+
 def test_a_last_resort_is_not_called_an_explanation(tmp_path):
     shadowing = DRIFT | {"name": "correlated_shadowing", "rank": 2}
     filled = report("unexplained", effects=[shadowing])
