@@ -67,7 +67,7 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
     rest_db, noise_db = hypotheses.sizes_db
     step = Step(len(model.whole.effects), hypotheses.unnamed_nats, rest_db, noise_db, {})
     before_db = model.rmse_db()
-    there = {each.effect.name for each in model.whole.effects}
+    there = model.whole.effect_names
     judged = []
     for score in scores:
         if score.gain_by_fold.size:
@@ -119,7 +119,7 @@ def probability_of_all(scores: Sequence[CandidateScore], other: float, before: C
     """
     evidence, held_out = (sum(each.nats for each in scores),
                           sum(each.held_out_nats for each in scores))
-    kinds = {each.name for each in scores} | {each.effect.name for each in before.whole.effects}
+    kinds = {each.name for each in scores} | before.whole.effect_names
     values = features((evidence, held_out, held_out - other),
                       float(np.nan_to_num(np.log(before.rmse_db() / scores[-1].rmse_db))),
                       rest_over_noise, len(kinds) > 1)

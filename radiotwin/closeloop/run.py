@@ -127,8 +127,7 @@ class Loop(Summarised):
         left = self.selection.looked_at
         if left is None:
             return []
-        there = {each.effect.name for each in left[0].whole.effects}
-        return detectable(left[1], self.criteria, there)
+        return detectable(left[1], self.criteria, left[0].whole.effect_names)
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:

@@ -60,7 +60,7 @@ class DetectionLimit(LimitEffect):
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
-        unit = "dB" if links.is_gain else "dBm"
+        unit = links.level_unit
         return {f"limit[{links.receiver_names[receiver]}]": Parameter.normal(
                     limit_db, params.sd_db.get(receiver, np.nan), unit)
                 for receiver, limit_db in params.receivers.items()}

@@ -106,6 +106,11 @@ class FoldModel:
         """The channel's levels of any links, quickly or exactly."""
         return self.channel.level_at
 
+    @property
+    def effect_names(self) -> frozenset[str]:
+        """Names of the effects found so far."""
+        return frozenset(each.effect.name for each in self.effects)
+
     def apply(self, effect: Effect, params: Any) -> AppliedEffect:
         """Return an effect on these links."""
         return AppliedEffect(effect, params, effect.term(self.links, params, self.level_at))

@@ -141,7 +141,7 @@ class Interference(ReceiverEffect):
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         names = "x_m", "y_m", f"level_at_{REFERENCE_M:.0f}_m", "hidden_loss_db"
-        units = "m", "m", "dB" if links.is_gain else "dBm", "dB"
+        units = "m", "m", links.level_unit, "dB"
         of = self.variation(params)
         return {name: Parameter.normal(value, sd, unit, Allowed(float(low), float(high)))
                 for name, value, sd, unit, low, high in zip(

@@ -102,7 +102,7 @@ class NoiseFloor(ReceiverEffect):
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
-        unit = "dB" if links.is_gain else "dBm"
+        unit = links.level_unit
         return {f"floor[{links.receiver_names[receiver]}]": Parameter.normal(floor_db, sd_db, unit)
                 for (receiver, floor_db), sd_db in zip(params.receivers.items(),
                                                        estimate.params_sd)}

@@ -111,7 +111,7 @@ class ReceiverSaturation(ReceiverEffect):
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
-        unit = "dB" if links.is_gain else "dBm"
+        unit = links.level_unit
         return {f"saturation_level[{links.receiver_names[receiver]}]":
                 Parameter.normal(compression.level_db, sd_db, unit)
                 for (receiver, compression), sd_db in zip(params.receivers.items(),

@@ -58,17 +58,14 @@ class RemovedObstacle(GainEffect):
         assert links.city is not None
         blocker = only_blocker(links)
         rows = np.flatnonzero(blocker >= 0)
+        a_m, b_m = links.device_m[links.device[rows]], links.receiver_m[rows]
+        rows = rows[~_lowered(links.city).line_of_sight(a_m, b_m)]
         if not len(rows):
             return []
         mine = links.select(rows)
         rise_db = view.level_at(mine.with_los(np.ones(len(rows), bool))) - view.level_at(mine)
-        a_m, b_m = links.device_m[links.device[rows]], links.receiver_m[rows]
-        deep = ~_lowered(links.city).line_of_sight(a_m, b_m)
-        if not deep.any():
-            return []
-        gain_nats = view.gain_nats(rows[deep], rise_db[deep])
-        total, counts = (np.bincount(blocker[rows[deep]], weights=each)
-                         for each in (gain_nats, None))
+        total = np.bincount(blocker[rows], weights=view.gain_nats(rows, rise_db))
+        counts = np.bincount(blocker[rows])
         best = int(np.where(counts >= MIN_LINKS, total, -np.inf).argmax())
         if total[best] < MIN_NATS or counts[best] < MIN_LINKS:
             return []

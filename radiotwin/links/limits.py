@@ -175,7 +175,7 @@ def _says_nothing(links: LinkData, declared_db: float) -> list[str]:
         return []
     if lowest_db - declared_db < FAR_DB:
         return []
-    unit = _unit(links)
+    unit = links.level_unit
     return [f"the declared limit of detection, {declared_db:g} {unit}, is not used: but for odd "
             f"ones, the weakest of {readings:,} readings is {lowest_db:g} {unit}, far above it, "
             f"though {blanks:,} links are blank"]
@@ -254,7 +254,7 @@ def _lowest_db(level_db: np.ndarray) -> float:
 def _notes(links: LinkData, rows: list[np.ndarray], own_db: np.ndarray,
            found: list[LimitEstimate | None], declared_db: float, lost: list[int]) -> list[str]:
     """Return what is odd about the limits of receivers (r,), a sentence each."""
-    unit, notes = _unit(links), []
+    unit, notes = links.level_unit, []
     other = [r for r in range(len(rows)) if np.isfinite(declared_db) and own_db[r] != declared_db]
     known_db = own_db[np.isfinite(own_db)]
     if other:
@@ -282,10 +282,6 @@ def _notes(links: LinkData, rows: list[np.ndarray], own_db: np.ndarray,
             notes.append(f"links of receiver {names}{_more(receivers)} {what}: they count as lost, "
                          "not as weak")
     return notes
-
-
-def _unit(links: LinkData) -> str:
-    return "dB" if links.is_gain else "dBm"
 
 
 def _used(name: str, limit_db: float, found: LimitEstimate | None, unit: str) -> str:

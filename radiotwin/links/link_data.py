@@ -137,6 +137,11 @@ class LinkData:
         return limits_db.reindex(range(len(self.receiver_names)), fill_value=-np.inf).to_numpy()
 
     @property
+    def level_unit(self) -> str:
+        """Unit of the levels, and of limits."""
+        return "dB" if self.is_gain else "dBm"
+
+    @property
     def usual_limit_db(self) -> float | None:
         """The limit of detection of most receivers [dB]: the median; None where none is known."""
         known_db = np.sort(self.receiver_limits_db[np.isfinite(self.receiver_limits_db)])
