@@ -181,7 +181,8 @@ def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score
     if block is not None:
         few_p = sign_flip_p_value(np.bincount(block[usable], weights=gain[usable]), seed)
     los_p = 0.0
-    if los.any() and not los.all() and not nlos_only:
+    acts_there = np.abs(gain[usable & los]).sum() >= MIN_MOVED * np.abs(gain[usable]).sum()
+    if acts_there and los.any() and not los.all() and not nlos_only:
         los_p = cross_fit_p_value(by_fold(usable & los))
     reason = ""
     if total < criteria.min_gain_nats:

@@ -27,6 +27,7 @@ from radiotwin.links import LinkData, site_of
 MIN_LINKS = 60  # of an end that is moved about
 MAX_ENDS = 60  # that are moved about, or it takes too long
 MIN_NATS = 6.0  # that a move must gain to be proposed
+MIN_MOVE_M = 5.0  # less is within what surveys, receivers and the walls of maps are off by
 MAX_PROPOSE_LINKS = 600  # of an end, on which moves are tried
 # Moves that are tried: of devices on circles, of receivers along axes.
 RADII_M = (8.0, 15.0, 25.0, 40.0, 60.0, 85.0)
@@ -99,6 +100,10 @@ class DevicePositionError(GainEffect):
     @override
     def exact(self, params: Params) -> Params:
         return params.model_copy(update={"exact": True})
+
+    @override
+    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+        return _too_near(params.move_m)
 
     @override
     def variation(self, params: Params) -> Variation:
@@ -177,6 +182,10 @@ class ReceiverPositionError(GainEffect):
         return params.model_copy(update={"exact": True})
 
     @override
+    def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
+        return _too_near(params.move_m)
+
+    @override
     def variation(self, params: Params) -> Variation:
         return Variation(
             np.array(params.move_m), np.full(3, 3.0), np.full(3, -MAX_RECEIVER_MOVE_M),
@@ -191,6 +200,14 @@ class ReceiverPositionError(GainEffect):
         return {f"true_minus_given_{axis}_m[{name}]": Parameter.normal(
                     move_m, sd, "m", Allowed(-MAX_RECEIVER_MOVE_M, MAX_RECEIVER_MOVE_M))
                 for axis, move_m, sd in zip("xyz", params.move_m, estimate.params_sd, strict=True)}
+
+
+def _too_near(move_m: tuple[float, ...]) -> str | None:
+    size_m = float(np.linalg.norm(move_m))
+    if size_m < MIN_MOVE_M:
+        return (f"it would be {size_m:.1f} m from its given position only: walls of the map that "
+                "are elsewhere look alike")
+    return None
 
 
 def _movable_anchors(links: LinkData) -> list[int]:
