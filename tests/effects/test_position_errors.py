@@ -76,3 +76,14 @@ def test_sectors_on_one_mast_move_together_and_count_as_one(make_links, view):
     assert params.device == 1 and np.hypot(params.move_m[0] - 36, params.move_m[1] + 22) < 15
     given = replace(view(links, law_db(links), 0.5, law_db), found=(("device_position_error", params),))
     assert all(other.device == 0 for other in DevicePositionError().propose(given))
+
+
+def test_an_end_that_is_off_by_metres_is_no_effect():
+    """What a survey, or the map's walls beside it, are off by."""
+    for move_m, size_m in (((3.0, 3.0), "4.2 m"), ((3.0, 4.2), None)):
+        why = DevicePositionError().implausible(DevicePositionError.Params(device=0, move_m=move_m), np.zeros(0))
+        assert why is None if size_m is None else size_m in why
+    near = ReceiverPositionError.Params(receiver=0, move_m=(0.0, 0.0, 4.9))
+    assert "4.9 m" in ReceiverPositionError().implausible(near, np.zeros(0))
+    far = near.model_copy(update={"move_m": (3.0, 0.0, 4.9)})
+    assert ReceiverPositionError().implausible(far, np.zeros(0)) is None
