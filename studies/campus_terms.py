@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.channel.followed_paths import interaction_gains
+from radiotwin.channel.residual_field import ResidualField
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.effects.sector_antenna import SectorPattern, sector_pattern_db
 from radiotwin.links import LinkData, prepare_links
@@ -20,6 +21,7 @@ from studies.tables import markdown, number
 DIFFUSE_DB, DIFFUSE_EXPONENT = -125.0, 3.0  # power beside the paths, at 100 m
 POSITION_SD_M, DRAWS = 6.0, 16  # of a phone's receiver, for the chance of line of sight
 WAYS = ("block", "quadrant")
+FEW, FEW_SEEDS = (500, 2000), 3  # scattered readings that are learnt from
 
 
 def by_class(values: np.ndarray, los: np.ndarray) -> np.ndarray:
@@ -91,10 +93,17 @@ INDOORS: dict[str, tuple[str, ...]] = {"+ antenna, LoS class": MODELS["+ antenna
     for extra in ("indoors", "chance of being indoors")}
 
 
+FEW_MODELS: dict[str, tuple[str, ...]] = {
+    "distance, LoS class": MODELS["+ LoS class"],
+    "distance, LoS class, antenna": MODELS["+ antenna, LoS class"]}
+
+
 def fit_terms(seed: int, settings: dict) -> dict:
     """Return held-out errors of each model, by split."""
     with campus() as (measured, scene):
         links = prepare_links(measured, scene)
+        if settings.get("only") == "few":
+            return {"links": len(links), "few": _learnt_from_few(links)}
         models = INDOORS if settings.get("only") == "indoors" else MODELS
         terms = quick_terms_of(links) if models is INDOORS else terms_of(links, seed)
     level_db, found = links.level_db, {}
@@ -106,6 +115,30 @@ def fit_terms(seed: int, settings: dict) -> dict:
     if models is INDOORS:
         result |= _indoors(level_db, terms)
     return result
+
+
+def _learnt_from_few(links: LinkData) -> list[dict]:
+    """Return errors on all readings but a few: terms alone, and with their residual by kriging."""
+    terms, found = quick_terms_of(links), []
+    level_db = links.level_db
+    for count in FEW:
+        for seed in range(FEW_SEEDS):
+            order = np.random.default_rng(seed).permutation(len(links))
+            learnt, others = np.sort(order[:count]), np.sort(order[count:])
+            row: dict = {"readings": count, "seed": seed}
+            for name, chosen in FEW_MODELS.items():
+                columns = np.column_stack([terms["sector"], *(terms[each] for each in chosen)])
+                weights = np.linalg.lstsq(columns[learnt], level_db[learnt], rcond=None)[0]
+                rest_db = level_db - columns @ weights
+                sd_db = float(rest_db[learnt].std())
+                field = ResidualField().fit(links.device[learnt], links.receiver_m[learnt],
+                                            rest_db[learnt] / sd_db, seed)
+                mean, _ = field.predict(links.device[others], links.receiver_m[others])
+                kriged_db = rest_db[others] - sd_db * mean
+                row[name] = [float(np.sqrt(np.mean(np.square(each))))
+                             for each in (rest_db[others], kriged_db)]
+            found.append(row)
+    return found
 
 
 def _indoors(level_db: np.ndarray, terms: dict[str, np.ndarray]) -> dict:
@@ -135,6 +168,8 @@ def _rmse_db(columns: np.ndarray, level_db: np.ndarray, fold: np.ndarray) -> flo
 
 def terms_table(rows: pd.DataFrame) -> str:
     """Return errors by model and split."""
+    few = rows[rows["name"] == "few"]
+    rows = rows[rows["name"] != "few"]
     titles = {"all": "What each part brings", "indoors": "Indoors by the map, or probably"}
     parts = [markdown(["model", *(SPLITS[way] for way in WAYS)],
                       [[model, *(number(row["rmse_db"][way][model], 2 + (name == "indoors"))
@@ -147,9 +182,21 @@ def terms_table(rows: pd.DataFrame) -> str:
                        "Beside walls and behind them",
                        ": level beside what is predicted outdoors")
               for groups in rows.get("groups", pd.Series()).dropna()]
+    parts += [_few_table(pd.DataFrame(each)) for each in few["few"]]
     return "\n\n".join(parts)
 
 
+def _few_table(rows: pd.DataFrame) -> str:
+    lines = [[f"{count:,}", *(number(value, 2) for name in FEW_MODELS
+                              for value in np.mean(group[name].tolist(), axis=0))]
+             for count, group in rows.groupby("readings")]
+    return markdown(["readings", *(f"{name}{rest}" for name in FEW_MODELS
+                                   for rest in ("", ", and kriging"))], lines,
+                    "Learnt from few readings",
+                    f", scattered, told the azimuths: RMSE of all others [dB], {FEW_SEEDS} seeds")
+
+
 STUDIES = {"terms": Study("What does each part of the physics bring on a real campus?", fit_terms,
-                          lambda seed: {"all": {}, "indoors": {"only": "indoors"}}, terms_table,
+                          lambda seed: {"all": {}, "indoors": {"only": "indoors"},
+                                        "few": {"only": "few"}}, terms_table,
                           seeds=1)}
