@@ -16,7 +16,8 @@ from radiotwin.effects.params import EffectParams
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.evidence import cross_fit_p_value, sign_flip_p_value
 
-# Of the fold where a candidate moves likelihoods most, and of that where it gains or loses most.
+# Of the fold (of all links) where a candidate moves likelihoods most, and of that where it gains or
+# loses most.
 MIN_MOVED, MIN_SHARE = 0.05, 0.1
 
 
