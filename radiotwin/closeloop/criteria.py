@@ -33,7 +33,7 @@ class SelectionCriteria:
         max_sign_flip_p_value: of the sign-flip test over pieces of evidence, so that a gain does
             not hang on a few positions.
         max_los_p_value: of the cross-fit test on links with line of sight, where the channel is
-            surest, for effects that change those.
+            surest, for effects that act there.
         indistinguishable_nats: log(100): how much likelier the data must be with one effect than
             with another to tell them apart.
         max_effects: in all.

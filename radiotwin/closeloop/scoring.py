@@ -16,8 +16,7 @@ from radiotwin.effects.params import EffectParams
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.evidence import cross_fit_p_value, sign_flip_p_value
 
-# Of the fold (of all links) where a candidate moves likelihoods most, and of that where it gains or
-# loses most.
+# Of the fold where a candidate moves likelihoods most, and of that where it gains or loses most.
 MIN_MOVED, MIN_SHARE = 0.05, 0.1
 
 
@@ -182,8 +181,7 @@ def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score
     if block is not None:
         few_p = sign_flip_p_value(np.bincount(block[usable], weights=gain[usable]), seed)
     los_p = 0.0
-    acts_there = np.abs(gain[usable & los]).sum() >= MIN_MOVED * np.abs(gain[usable]).sum()
-    if acts_there and los.any() and not los.all() and not nlos_only:
+    if los.any() and not los.all() and not nlos_only:
         los_p = cross_fit_p_value(by_fold(usable & los))
     reason = ""
     if total < criteria.min_gain_nats:

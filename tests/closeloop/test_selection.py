@@ -1,7 +1,5 @@
 """Candidates are scored on held-out links, and refused where those do not support them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -51,22 +49,6 @@ def test_folds_that_a_candidate_does_not_act_on_do_not_vote(open_ground, gains, 
     extended.held_out_nll = model.held_out_nll - per_link
     score = score_model(six, extended, CandidateScore("lock_loss"), None, 1, 0, SelectionCriteria())
     assert ("folds" in score.reason) == (not passes)
-
-
-@pytest.mark.parametrize(("los_nats", "passes"), [(0.02, True), (-0.02, True), (-20.0, False)])
-def test_links_with_line_of_sight_vote_where_the_candidate_changes_them(open_ground, los_nats, passes):
-    """A weak emitter disturbs links without line of sight only: the others say nothing of it, for or against."""
-    links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
-    folds = make_folds(links, 0)
-    model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
-    sight = np.arange(len(links)) % 3 == 0
-    whole = replace(model.whole, links=replace(model.links, known_los=sight))
-    model = CrossValidatedModel(whole, model.folds, model.fits, model.index, model.twin)
-    nats = np.where(sight, los_nats, 60.0) / np.bincount(sight)[sight.astype(int)]
-    extended = CrossValidatedModel(whole, model.folds, model.fits, model.index, model.twin)
-    extended.held_out_nll = model.held_out_nll - nats * model.whole.view(model.fits[0]).design_effect
-    score = score_model(model, extended, CandidateScore("interference"), None, 1, 0, SelectionCriteria())
-    assert ("with line of sight" in score.reason) == (not passes)
 
 
 def test_what_an_improbable_candidate_has_outdone_is_asked_as_well(open_ground, monkeypatch):
