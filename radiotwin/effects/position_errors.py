@@ -205,8 +205,8 @@ class ReceiverPositionError(GainEffect):
 def _too_near(move_m: tuple[float, ...]) -> str | None:
     size_m = float(np.linalg.norm(move_m))
     if size_m < MIN_MOVE_M:
-        return (f"it would be {size_m:.1f} m from its given position only; surveys and the walls of "
-                f"maps are off by as much, and less than {MIN_MOVE_M:g} m is no effect")
+        return (f"it would be {size_m:.1f} m from its given position only; surveys and the walls "
+                f"of maps are off by as much, and less than {MIN_MOVE_M:g} m is no effect")
     return None
 
 
