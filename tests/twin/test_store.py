@@ -47,7 +47,7 @@ def test_a_twin_with_effects_predicts_the_same_after_loading(open_ground, tmp_pa
     world = open_ground.fly(20)
     world.gain_db[world.receiver == 1] += 6.0
     world.gain_db[world.device == 2] -= 7.0
-    measurements = open_ground.measured(world).select(world.slot % 3 == 0)
+    measurements = open_ground.measured(world).select(world.slot % 2 == 0)
     loop = close_loop(measurements, base="log-distance")
     twin = corrected_twin(loop, None)
     assert {each.effect.name for each in twin.effects} == {"device_gain_offset", "receiver_gain_offset"}
