@@ -10,6 +10,7 @@ import pandas as pd
 from radiotwin.channel.followed_paths import interaction_gains
 from radiotwin.channel.residual_field import ResidualField
 from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.residuals import rmse_db
 from radiotwin.effects.sector_antenna import SectorPattern, sector_pattern_db
 from radiotwin.links import LinkData, prepare_links
 from radiotwin.links.indoors import SURE, chance_inside
@@ -21,7 +22,7 @@ from studies.tables import markdown, number
 DIFFUSE_DB, DIFFUSE_EXPONENT = -125.0, 3.0  # power beside the paths, at 100 m
 POSITION_SD_M, DRAWS = 6.0, 16  # of a phone's receiver, for the chance of line of sight
 WAYS = ("block", "quadrant")
-FEW, FEW_SEEDS = (500, 2000), 3  # scattered readings that are learnt from
+FEW = (500, 2000)  # scattered readings that are learnt from
 
 
 def by_class(values: np.ndarray, los: np.ndarray) -> np.ndarray:
@@ -92,63 +93,55 @@ INDOORS: dict[str, tuple[str, ...]] = {"+ antenna, LoS class": MODELS["+ antenna
     f"+ antenna, LoS class, {extra}": ("distance", "antenna", "LoS class", extra)
     for extra in ("indoors", "chance of being indoors")}
 
-
 FEW_MODELS: dict[str, tuple[str, ...]] = {
     "distance, LoS class": MODELS["+ LoS class"],
     "distance, LoS class, antenna": MODELS["+ antenna, LoS class"]}
 
 
+def terms_cases(seed: int) -> dict[str, dict]:
+    """Return what is asked of all readings, with seed 0, and of few."""
+    every: dict[str, dict] = {} if seed else {"all": {}, "indoors": {"only": "indoors"}}
+    return every | {f"few-{count}": {"readings": count} for count in FEW}
+
+
 def fit_terms(seed: int, settings: dict) -> dict:
-    """Return held-out errors of each model, by split."""
+    """Return held-out errors of each model, by split; or those of what few readings teach."""
     with campus() as (measured, scene):
         links = prepare_links(measured, scene)
-        if settings.get("only") == "few":
-            return {"links": len(links), "few": _learnt_from_few(links)}
+        if "readings" in settings:
+            return {"links": len(links), "few": _learnt_from_few(links, settings["readings"], seed)}
         models = INDOORS if settings.get("only") == "indoors" else MODELS
         terms = quick_terms_of(links) if models is INDOORS else terms_of(links, seed)
-    level_db, found = links.level_db, {}
+    found = {}
     for way in WAYS:
         fold = make_folds(links, seed, way).index
-        found[way] = {name: _rmse_db(np.column_stack([terms["sector"], *(
-            terms[each] for each in columns)]), level_db, fold) for name, columns in models.items()}
+        found[way] = {name: _held_out_rmse_db(terms, chosen, links.level_db, fold)
+                      for name, chosen in models.items()}
     result = {"links": len(links), "los": float(links.los.mean()), "rmse_db": found}
     if models is INDOORS:
-        result |= _indoors(level_db, terms)
+        result |= _indoors(links.level_db, terms)
     return result
 
 
-def _learnt_from_few(links: LinkData) -> list[dict]:
-    """Return errors on all readings but a few: terms alone, and with their residual by kriging."""
-    terms, found = quick_terms_of(links), []
-    level_db = links.level_db
-    for count in FEW:
-        for seed in range(FEW_SEEDS):
-            order = np.random.default_rng(seed).permutation(len(links))
-            learnt, others = np.sort(order[:count]), np.sort(order[count:])
-            row: dict = {"readings": count, "seed": seed}
-            for name, chosen in FEW_MODELS.items():
-                columns = np.column_stack([terms["sector"], *(terms[each] for each in chosen)])
-                weights = np.linalg.lstsq(columns[learnt], level_db[learnt], rcond=None)[0]
-                rest_db = level_db - columns @ weights
-                sd_db = float(rest_db[learnt].std())
-                field = ResidualField().fit(links.device[learnt], links.receiver_m[learnt],
-                                            rest_db[learnt] / sd_db, seed)
-                mean, _ = field.predict(links.device[others], links.receiver_m[others])
-                kriged_db = rest_db[others] - sd_db * mean
-                row[name] = [float(np.sqrt(np.mean(np.square(each))))
-                             for each in (rest_db[others], kriged_db)]
-            found.append(row)
+def _learnt_from_few(links: LinkData, count: int, seed: int) -> dict[str, list[float]]:
+    """Return errors on all readings but a few: of terms, and with their residual by kriging."""
+    terms, found = quick_terms_of(links), {}
+    order = np.random.default_rng(seed).permutation(len(links))
+    learnt, others = np.sort(order[:count]), np.sort(order[count:])
+    for name, chosen in FEW_MODELS.items():
+        rest_db = _rest_db(terms, chosen, links.level_db, learnt)
+        sd_db = float(rest_db[learnt].std())
+        field = ResidualField().fit(links.device[learnt], links.receiver_m[learnt],
+                                    rest_db[learnt] / sd_db, seed)
+        mean, _ = field.predict(links.device[others], links.receiver_m[others])
+        found[name] = [rmse_db(rest_db[others]), rmse_db(rest_db[others] - sd_db * mean)]
     return found
 
 
 def _indoors(level_db: np.ndarray, terms: dict[str, np.ndarray]) -> dict:
     """Return numbers of links with their receiver indoors, and by how much these are weaker."""
     chance, told = terms["chance of being indoors"][:, 0], terms["indoors"][:, 0] > 0
-    columns = np.column_stack([terms["sector"], *(
-        terms[each] for each in MODELS["+ antenna, LoS class"])])
-    outdoors = chance == 0
-    weights = np.linalg.lstsq(columns[outdoors], level_db[outdoors], rcond=None)[0]
-    rest_db = level_db - columns @ weights
+    rest_db = _rest_db(terms, MODELS["+ antenna, LoS class"], level_db, chance == 0)
     groups = {"indoors by the map, surely": told & (chance >= SURE),
               "indoors by the map, perhaps": told & (chance < SURE),
               "outdoors by the map, perhaps indoors": ~told & (chance >= 1 - SURE)}
@@ -157,19 +150,27 @@ def _indoors(level_db: np.ndarray, terms: dict[str, np.ndarray]) -> dict:
                        for name, rows in groups.items()}}
 
 
-def _rmse_db(columns: np.ndarray, level_db: np.ndarray, fold: np.ndarray) -> float:
+def _held_out_rmse_db(terms: dict[str, np.ndarray], chosen: tuple[str, ...], level_db: np.ndarray,
+                      fold: np.ndarray) -> float:
     error_db = np.full(len(level_db), np.nan)
-    for number_ in np.unique(fold):
-        out = fold == number_
-        weights = np.linalg.lstsq(columns[~out], level_db[~out], rcond=None)[0]
-        error_db[out] = level_db[out] - columns[out] @ weights
-    return float(np.sqrt(np.mean(error_db**2)))
+    for each in np.unique(fold):
+        out = fold == each
+        error_db[out] = _rest_db(terms, chosen, level_db, ~out)[out]
+    return rmse_db(error_db)
+
+
+def _rest_db(terms: dict[str, np.ndarray], chosen: tuple[str, ...], level_db: np.ndarray,
+             learnt: np.ndarray) -> np.ndarray:
+    """Return levels (n,) less what the terms predict, fitted to the rows that are learnt from."""
+    columns = np.column_stack([terms["sector"], *(terms[each] for each in chosen)])
+    weights = np.linalg.lstsq(columns[learnt], level_db[learnt], rcond=None)[0]
+    return level_db - columns @ weights
 
 
 def terms_table(rows: pd.DataFrame) -> str:
     """Return errors by model and split."""
-    few = rows[rows["name"] == "few"]
-    rows = rows[rows["name"] != "few"]
+    few = rows["name"].str.startswith("few-")
+    learnt, rows = rows[few], rows[~few]
     titles = {"all": "What each part brings", "indoors": "Indoors by the map, or probably"}
     parts = [markdown(["model", *(SPLITS[way] for way in WAYS)],
                       [[model, *(number(row["rmse_db"][way][model], 2 + (name == "indoors"))
@@ -182,21 +183,22 @@ def terms_table(rows: pd.DataFrame) -> str:
                        "Beside walls and behind them",
                        ": level beside what is predicted outdoors")
               for groups in rows.get("groups", pd.Series()).dropna()]
-    parts += [_few_table(pd.DataFrame(each)) for each in few["few"]]
+    if len(learnt):
+        parts.append(_few_table(learnt))
     return "\n\n".join(parts)
 
 
 def _few_table(rows: pd.DataFrame) -> str:
+    counts = rows.groupby(rows["name"].str.removeprefix("few-").astype(int))
     lines = [[f"{count:,}", *(number(value, 2) for name in FEW_MODELS
-                              for value in np.mean(group[name].tolist(), axis=0))]
-             for count, group in rows.groupby("readings")]
+                              for value in np.mean([each[name] for each in group["few"]], axis=0))]
+             for count, group in counts]
+    seeds = rows["seed"].nunique()
     return markdown(["readings", *(f"{name}{rest}" for name in FEW_MODELS
                                    for rest in ("", ", and kriging"))], lines,
                     "Learnt from few readings",
-                    f", scattered, told the azimuths: RMSE of all others [dB], {FEW_SEEDS} seeds")
+                    f", scattered, told the azimuths: RMSE of all others [dB], {seeds} seeds")
 
 
 STUDIES = {"terms": Study("What does each part of the physics bring on a real campus?", fit_terms,
-                          lambda seed: {"all": {}, "indoors": {"only": "indoors"},
-                                        "few": {"only": "few"}}, terms_table,
-                          seeds=1)}
+                          terms_cases, terms_table)}

@@ -79,7 +79,7 @@ def test_sectors_on_one_mast_move_together_and_count_as_one(make_links, view):
 
 
 def test_an_end_that_is_off_by_metres_is_no_effect():
-    """What a survey, or the map's walls beside it, are off by."""
+    """Surveys, and the walls of maps, are off by as much."""
     for move_m, size_m in (((3.0, 3.0), "4.2 m"), ((3.0, 4.2), None)):
         why = DevicePositionError().implausible(DevicePositionError.Params(device=0, move_m=move_m), np.zeros(0))
         assert why is None if size_m is None else size_m in why
