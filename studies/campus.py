@@ -26,6 +26,7 @@ from radiotwin.measurements import read_measurements
 from radiotwin.scene.build import BuildOptions
 from studies.closeloop import counted, summary
 from studies.closeloop_real import (
+    AZIMUTHS_DEG,
     DATA,
     azimuth_errors_deg,
     explained,
@@ -46,6 +47,8 @@ LACKING = {"no-heights": "a map without heights: 14 m everywhere",
            "one-phone": "the readings of one phone", "thinned": "one reading in each 10 m cell",
            "thinned-quadrant": "the same, a quadrant of the area held out",
            "thinned-device": "the same, a sector held out"}
+TOLD = {f"told-{split}": words for split, words in SPLITS.items()} | {
+    "turned-device": "a sector, with all azimuths turned by 180°"}
 PHONE, CELL_M = "Pixel", 10.0
 HEIGHT_TAG = re.compile(r'<tag k="(building:)?(min_)?(height|levels?|min_level)" [^>]*>')
 SHIFT_M = 50.0
@@ -96,6 +99,9 @@ def campus_cases(seed: int) -> dict[str, dict]:
         other = split in SPLITS
         cases[name] = {"split": split if other else "block", "base": "twin",
                        "control": control if other else name}
+    for name in TOLD:
+        control, _, split = name.partition("-")
+        cases[name] = {"split": split, "base": "twin", "control": control}
     return cases
 
 
@@ -129,6 +135,9 @@ def _controlled(measured: Measurements, control: str | None, seed: int) -> Measu
     Only the x of both ends is mirrored, so that distances stay.
     """
     table = measured.table
+    if control in ("told", "turned"):
+        azimuth_deg = measured.devices["device"].map(AZIMUTHS_DEG) + 180.0 * (control == "turned")
+        return replace(measured, devices=measured.devices.assign(azimuth_deg=azimuth_deg % 360))
     if control == "permuted":
         return permuted(measured, seed)
     if control == "permuted-all":
@@ -172,7 +181,7 @@ def campus_table(rows: pd.DataFrame) -> str:
         [[SPLITS[split], f"`{base}`", *(number(row[key], 2) for key in (
             "before_db", "named_db", "named_bias_db", "after_db", "combined_db")),
           _best(row["baselines_db"]), f"{100 * row['coverage']:.0f} %", counted(row["named"])]
-         for name in named if name not in CONTROLS | LACKING
+         for name in named if name not in CONTROLS | LACKING | TOLD
          for split, _, base in [name.partition("-")] for row in [by_name.loc[name]]],
         "A campus with its map", ": RMSE of held-out readings")]
     found = [(name, by_name.loc[name]) for name in named if name.startswith("block-")]
@@ -183,6 +192,16 @@ def campus_table(rows: pd.DataFrame) -> str:
           *(number(row["azimuth_error_deg"].get(each, np.nan), 0) for each in sectors),
           number(row["turned_by_180_db"], 2)] for name, row in found],
         "Azimuths found", ": how far off [°]"))
+    told = [(name, by_name.loc[name]) for name in named if name in TOLD]
+    if told:
+        parts.append(markdown(
+            ["held out", "base with them [dB]", "named effects", "mean error", "with the rest",
+             "combined", "best of the others", "in 90 %", "named", "all azimuths turned by [°]"],
+            [[TOLD[name], *(number(row[key], 2) for key in (
+                "before_db", "named_db", "named_bias_db", "after_db", "combined_db")),
+              _best(row["baselines_db"]), f"{100 * row['coverage']:.0f} %", counted(row["named"]),
+              number(_turn_deg(row["effects"]), 1)] for name, row in told],
+            "Azimuths declared", ", base `twin`: RMSE of held-out readings"))
     for title, words in (("Controls", CONTROLS), ("Less to learn from", LACKING)):
         if not set(words) & set(named):
             continue
@@ -196,6 +215,12 @@ def campus_table(rows: pd.DataFrame) -> str:
              for name in named if name in words for row in [by_name.loc[name]]],
             title, ", base `twin`; 60 m blocks held out, or what the row says"))
     return "\n\n".join(parts)
+
+
+def _turn_deg(effects: list[dict]) -> float:
+    """Return the angle by which all declared azimuths are off, as found; NaN: they are not used."""
+    return next((effect["parameters"]["turn_deg"]["value"] for effect in effects
+                 if "turn_deg" in effect["parameters"]), np.nan)
 
 
 def _best(baselines_db: dict[str, float]) -> str:

@@ -16,6 +16,7 @@ from radiotwin.closeloop.cross_validation import (
     cross_validate,
     training_parts,
 )
+from radiotwin.closeloop.declared import take_declared
 from radiotwin.closeloop.effect_size import effect_size_db
 from radiotwin.closeloop.faults import drop_idle_faults, select_faults
 from radiotwin.closeloop.folds import Folds, make_folds
@@ -48,7 +49,7 @@ class Loop(Summarised):
         base: name of the base.
         links: that were used: all, or a sample of very many.
         folds: how they were held out.
-        before: the base alone.
+        before: the base alone, with what is declared.
         selection: base and effects.
         dependences_before, dependences_after: of the held-out residual.
         seed: of what is still to be drawn.
@@ -94,7 +95,8 @@ class Loop(Summarised):
         Without a named effect: `unexplained` where a cause without a name is the likeliest, or more
         than `max_rest_db` belongs to places; `none` where nothing is the likeliest by far.
         """
-        if any(each.effect.is_cause for each in self.after.whole.effects):
+        if any(each.effect.is_cause and not each.effect.is_declared
+               for each in self.after.whole.effects):
             return "effect"
         if not self.selection.steps:
             return "undecided"
@@ -189,11 +191,11 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         on_progress(f"fitting the base {name}")
         models[name] = cross_validate(links, bases[name], folds, parts)
     best = min(models, key=lambda name: models[name].rmse_db())
-    before = models[best]
+    selection = SelectionResult(models[best], criteria, executor=executor)
+    effects = take_declared(selection, [effect() for effect in catalogue()], seed, on_progress)
+    before = selection.model
     on_progress("looking at the residual")
     dependences_before = _dependences(before, seed)
-    selection = SelectionResult(before, criteria, executor=executor)
-    effects = [effect() for effect in catalogue()]
     select_faults(selection, effects, links, bases[best], seed, on_progress)
     forward_selection(selection, [effect for effect in effects if not effect.within_flights], seed,
                       on_progress)

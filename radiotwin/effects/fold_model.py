@@ -108,8 +108,8 @@ class FoldModel:
 
     @property
     def effect_names(self) -> frozenset[str]:
-        """Names of the effects found so far."""
-        return frozenset(each.effect.name for each in self.effects)
+        """Names of the effects found so far, without those that were declared."""
+        return frozenset(each.effect.name for each in self.effects if not each.effect.is_declared)
 
     def apply(self, effect: Effect, params: Any) -> AppliedEffect:
         """Return an effect on these links."""

@@ -136,7 +136,7 @@ class SectorAntenna(GainEffect):
             rows = np.flatnonzero(links.device == device)
             if len(rows):
                 rays = self._rays.get(links, (device, params.straight),
-                                      partial(_Rays.of, links, rows, params.straight))
+                                      partial(Rays.of, links, rows, params.straight))
                 offset_db[rows] = rays.offset_db(pattern)
         return Term(offset_db, one_hot(links.device, list(params.devices)),
                     np.full(len(params.devices), LEVEL_SD_DB))
@@ -169,7 +169,7 @@ def _eligible_devices(links: LinkData) -> list[int]:
             if device in links.anchors]
 
 
-class _Rays(NamedTuple):
+class Rays(NamedTuple):
     """Directions in which links leave their device.
 
     Attributes:
@@ -184,7 +184,7 @@ class _Rays(NamedTuple):
     free: np.ndarray
 
     @classmethod
-    def of(cls, links: LinkData, rows: np.ndarray, straight: bool) -> "_Rays":
+    def of(cls, links: LinkData, rows: np.ndarray, straight: bool) -> "Rays":
         """Return those of some links, which are followed over the map unless they are straight."""
         links = links.select(rows)
         if straight or links.city is None:
@@ -223,7 +223,7 @@ def _best_patterns(view: ResidualView, devices: list[int],
 def _best_pattern(view: ResidualView, rows: np.ndarray,
                   straight: bool) -> tuple[SectorPattern, float]:
     """Return the pattern of a grid that fits links best, and its gain over a level alone [nats]."""
-    rays, residual_db = _Rays.of(view.links, rows, straight), view.residual_db[rows]
+    rays, residual_db = Rays.of(view.links, rows, straight), view.residual_db[rows]
     weight = view.weight[rows] * np.isfinite(view.links.level_db[rows])
 
     def nats(offset_db: np.ndarray) -> float:

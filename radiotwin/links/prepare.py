@@ -159,7 +159,8 @@ def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | N
         list(flight_names), _frequency_hz(measurements, scene),
         scene.city if scene is not None else None,
         is_gain, anchors, notes, _column(table, "pitch_deg"), _column(table, "roll_deg"),
-        _column(table, "quality"))
+        _column(table, "quality"),
+        boresight_deg=_column(measurements.devices, "azimuth_deg")[kept_devices])
     declared_db = None
     if scene is not None:
         declared_db = scene.config.gain_limit_db if is_gain else scene.config.radio.sensitivity_dbm

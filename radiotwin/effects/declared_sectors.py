@@ -1,0 +1,185 @@
+"""Sector antennas of which only the direction is known: a planner's table has it, not the pattern.
+
+All declared devices have one pattern (3GPP TR 38.901 V17, Table 7.3-1, as in `sector_antenna`),
+each turned to its own azimuth, and one maximum gain, from which each device's may differ a little.
+All azimuths may be off by one small angle (a compass, another north); by a large one the table is
+wrong. So it holds for a sector that nobody has measured, too, which a pattern learnt for each
+device by itself does not.
+"""
+
+from itertools import product
+from typing import Any
+
+import numpy as np
+from typing_extensions import override
+
+from radiotwin.effects.arrays import subsample
+from radiotwin.effects.base import Term
+from radiotwin.effects.params import (
+    Allowed,
+    Estimate,
+    Parameter,
+    Variation,
+    quantities,
+    quantity,
+)
+from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.effects.sector_antenna import (
+    BEAMWIDTHS_DEG,
+    FRONT_TO_BACK_DB,
+    LEVEL_SD_DB,
+    MAX_PROPOSE_LINKS,
+    MIN_LINKS,
+    MIN_NATS,
+    VERTICALS_DEG,
+    Rays,
+    SectorAntenna,
+    SectorPattern,
+)
+from radiotwin.links import LinkData
+
+MIN_DEVICES = 2  # of declared azimuth; of one, the pattern is that of `SectorAntenna`
+MAX_TURN_DEG = 20.0  # by which compasses, maps and declination are off; more is a wrong table
+TURNS_DEG = (0.0, -45.0, 45.0, -90.0, 90.0, -135.0, 135.0, 180.0)  # that are tried first
+DEVICE_SD_DB = 3.0  # between the maximum gains of devices: powers and cables differ
+
+
+class DeclaredSectors(SectorAntenna):
+    """One pattern for all devices whose azimuth the table of devices has."""
+
+    variant = "sector antennas of declared azimuth"
+    is_declared = True
+    repeatable = False
+
+    class Params(SectorAntenna.Params):
+        """Antennas of devices, all of one pattern, at their declared azimuths and a common turn."""
+
+        turn_deg: float = quantity(
+            0.0, unit="deg", low=-180.0, high=180.0, step=5.0, prior_sd=5.0,
+            description="By which all declared azimuths are off, clockwise.")
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if len(_declared(links)) < MIN_DEVICES:
+            return f"azimuth_deg of {MIN_DEVICES} devices of known position is not declared"
+        return None
+
+    @override
+    def propose(self, view: ResidualView) -> list[SectorAntenna.Params]:
+        known = {device for devices in view.found_params(self.name, "devices")
+                 for device in devices}
+        declared = sorted(set(_declared(view.links)) - known)
+        ways = [False, True] if view.links.city is not None else [False]
+        heard = np.isin(view.links.device, declared).sum() >= MIN_LINKS
+        if len(declared) < MIN_DEVICES or not heard:
+            return []
+        found = [(_best_shape(view, declared, straight), straight) for straight in ways]
+        return [self.Params(devices=_turned(view.links, declared, shape, turn_deg),
+                            straight=straight, turn_deg=turn_deg)
+                for (nats, shape, turn_deg), straight in sorted(found, key=lambda each: -each[0][0])
+                if nats > MIN_NATS]
+
+    @override
+    def implausible(self, params: Any, coefficients: np.ndarray) -> str | None:
+        if abs(params.turn_deg) <= MAX_TURN_DEG:
+            return None
+        return (f"they fit azimuths that are all turned by {params.turn_deg:+.0f}°; azimuth_deg "
+                "counts clockwise from north")
+
+    @override
+    def term(self, links: LinkData, params: SectorAntenna.Params, level_at: LevelAt) -> Term:
+        own = super().term(links, params, level_at)
+        # Of a device without a reading only the common level is known.
+        columns = np.column_stack([own.columns.sum(axis=1), own.columns])
+        return Term(own.offset_db, columns,
+                    np.r_[LEVEL_SD_DB, np.full(len(params.devices), DEVICE_SD_DB)])
+
+    @override
+    def variation(self, params: Any) -> Variation:
+        fields = _numbers()
+        shape = next(iter(params.devices.values()))
+        values = np.array([params.turn_deg, *(getattr(shape, name) for name in fields if
+                                              name != "turn_deg")])
+        steps, low, high = (np.array([each[key] for each in fields.values()], dtype=float)
+                            for key in ("step", "low", "high"))
+
+        def changed(numbers: np.ndarray) -> DeclaredSectors.Params:
+            turn_deg, *shape = numbers.tolist()
+            update = dict(zip([*fields][1:], shape, strict=True))
+            devices = {device: pattern.model_copy(update=update | {
+                "azimuth_deg": pattern.azimuth_deg + turn_deg - params.turn_deg})
+                for device, pattern in params.devices.items()}
+            return params.model_copy(update={"devices": devices, "turn_deg": turn_deg})
+
+        return Variation(values, steps, low, high, changed)
+
+    @override
+    def parameters(self, links: LinkData, params: SectorAntenna.Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        values = self.variation(params).values
+        reported = {name: Parameter.normal(value, sd, field["unit"],
+                                           Allowed(field["low"], field["high"]))
+                    for (name, field), value, sd in zip(_numbers().items(), values,
+                                                        estimate.params_sd, strict=True)}
+        if links.city is None or params.straight:
+            reported.pop("scattered_db")
+        reported["gain_db"] = Parameter.normal(estimate.coefficients[0],
+                                               estimate.coefficients_sd[0], "dB")
+        return reported
+
+
+def _numbers() -> dict[str, dict]:
+    """Return what is searched for, the turn first: name -> step, bounds and unit."""
+    shape = {name: field for name, field in quantities(SectorPattern).items()
+             if name != "azimuth_deg"}
+    return {"turn_deg": quantities(DeclaredSectors.Params)["turn_deg"]} | shape
+
+
+def _declared(links: LinkData) -> list[int]:
+    """Return the devices of declared azimuth and position, also those without a reading."""
+    return [device for device in np.flatnonzero(np.isfinite(links.boresight_deg)).tolist()
+            if device in links.anchors]
+
+
+def _turned(links: LinkData, devices: list[int], shape: SectorPattern,
+            turn_deg: float) -> dict[int, SectorPattern]:
+    """Return device -> a pattern, turned to the azimuth that is declared for it, and further."""
+    return {device: shape.model_copy(
+        update={"azimuth_deg": float(links.boresight_deg[device]) + turn_deg})
+        for device in devices}
+
+
+def _best_shape(view: ResidualView, devices: list[int],
+                straight: bool) -> tuple[float, SectorPattern, float]:
+    """Return what the best pattern of a grid gains over a level [nats], the pattern, its turn."""
+    parts = []
+    for device in devices:
+        every = np.flatnonzero(view.links.device == device)
+        rows = subsample(every, MAX_PROPOSE_LINKS)
+        if len(rows):
+            parts.append((device, rows, np.full(len(rows), len(every) / len(rows)),
+                          Rays.of(view.links, rows, straight)))
+    rows, times = (np.concatenate([part[column] for part in parts]) for column in (1, 2))
+    residual_db = view.residual_db[rows]
+    weight = view.weight[rows] * np.isfinite(view.links.level_db[rows])
+
+    def nats(offset_db: np.ndarray) -> float:
+        level_db = weight @ (residual_db - offset_db) / max(weight.sum(), 1e-12)
+        return float(times @ view.gain_nats(rows, offset_db + level_db))
+
+    def tried(width: float, back_db: float, tilt: float, height: float,
+              turn_deg: float) -> tuple[float, SectorPattern, float]:
+        shape = SectorPattern(beamwidth_deg=width, front_to_back_db=back_db, tilt_deg=tilt,
+                              vertical_beamwidth_deg=height)
+        turned = _turned(view.links, devices, shape, turn_deg)
+        return nats(np.concatenate([rays.offset_db(turned[device])
+                                    for device, _, _, rays in parts])), shape, turn_deg
+
+    # A turn first, with the pattern flat: of azimuths in another convention no shape is right.
+    turn_deg = max((tried(*numbers, 0.0, 360.0, turn) for turn in TURNS_DEG
+                    for numbers in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
+                   key=lambda each: each[0])[2]
+    best, shape, _ = max((tried(*numbers, *vertical, turn_deg) for vertical in VERTICALS_DEG
+                          for numbers in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
+                         key=lambda each: each[0])
+    return best - nats(np.zeros(len(rows))), shape, turn_deg

@@ -1,0 +1,127 @@
+"""Sectors whose azimuths a table declares, one of them held out: what nobody measured is predicted.
+
+Levels are made here: a law, a cardioid raised to a power (no pattern of 3GPP), a level of each sector's own.
+"""
+
+import re
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import radiotwin as rt
+from radiotwin.closeloop.bases import make_bases
+from radiotwin.closeloop.cross_validation import cross_validate, training_parts
+from radiotwin.closeloop.declared import take_declared
+from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.selection import SelectionResult
+from radiotwin.effects.declared_sectors import DeclaredSectors
+from radiotwin.effects.registry import BUILT_IN
+from radiotwin.effects.sector_antenna import SectorPattern
+from radiotwin.links import prepare_links
+from radiotwin.measurements import Measurements
+
+MASTS_M = np.array([[150.0, 200.0, 25.0], [420.0, 330.0, 25.0]])
+AZIMUTHS_DEG = (20.0, 140.0, 260.0)
+NAMES = [f"{mast}{sector}" for mast in "AB" for sector in range(3)]
+
+
+def network(seed, noise_db=3.0, points=400):
+    """Drive through the streets below two masts of three sectors."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for flight in range(5):
+        turn = rng.normal(0, 0.1, points // 5).cumsum() + rng.uniform(0, 2 * np.pi)
+        place_m = rng.uniform(50, 500, 2) + 12 * np.cumsum(np.column_stack([np.cos(turn), np.sin(turn)]), axis=0)
+        place_m = 275 + 260 * np.sin((place_m - 275) / 260)
+        for number, name in enumerate(NAMES):
+            to_m = place_m - MASTS_M[number // 3, :2]
+            off = np.radians(np.degrees(np.arctan2(to_m[:, 0], to_m[:, 1])) - AZIMUTHS_DEG[number % 3])
+            antenna_db = 10 * np.log10(0.006 + 0.994 * np.cos(off / 2) ** 8)
+            distance_m = np.hypot(np.linalg.norm(to_m, axis=1), 23.5)
+            level_db = -30 - 30 * np.log10(distance_m) + antenna_db + (number % 3 - 1)
+            parts.append(pd.DataFrame({
+                "time_s": 1000.0 * flight + np.arange(len(place_m)), "flight": f"f{flight}", "receiver": "car",
+                "receiver_x_m": place_m[:, 0], "receiver_y_m": place_m[:, 1], "receiver_z_m": 1.5, "device": name,
+                "gain_db": level_db + rng.normal(0, noise_db, len(place_m))}))
+    where_m = MASTS_M[np.arange(len(NAMES)) // 3]
+    devices = pd.DataFrame({"device": NAMES, "x_m": where_m[:, 0], "y_m": where_m[:, 1], "z_m": where_m[:, 2],
+                            "role": "anchor", "frequency_hz": 3.6e9, "azimuth_deg": np.tile(AZIMUTHS_DEG, 2)})
+    return Measurements(pd.concat(parts, ignore_index=True), devices)
+
+
+def taken(measurements):
+    """Return the base log-distance, a device held out, with what is declared, the score and the notes."""
+    links = prepare_links(measurements, None)
+    folds = make_folds(links, 0, "device")
+    base = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
+    result = SelectionResult(base)
+    others = take_declared(result, [effect() for effect in BUILT_IN], 0, lambda _: None)
+    assert len(others) == len(BUILT_IN) - 1
+    return SimpleNamespace(before_db=base.rmse_db(), after_db=result.model.rmse_db(), scores=result.scores,
+                           variants=[each.effect.variant for each in result.model.whole.effects],
+                           note=(result.model.links.notes or [""])[-1])
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_sector_that_was_not_measured_is_predicted_by_its_declared_azimuth(seed):
+    found = taken(network(seed))
+    assert found.variants == [DeclaredSectors.variant]
+    assert found.before_db > 6.5
+    assert found.after_db < 4.2  # the noise is 3 dB, levels of sectors 0.8 dB
+    assert f"{found.after_db:.2f} dB, and {found.before_db:.2f} dB without them" in found.note
+
+
+@pytest.mark.parametrize("turn_deg", [60.0, 180.0])
+def test_azimuths_that_the_readings_contradict_are_left_out_and_told(turn_deg):
+    """Between the neighbours, or backwards: the table is wrong, and is not believed."""
+    measurements = network(2)
+    devices = measurements.devices.assign(azimuth_deg=(measurements.devices["azimuth_deg"] + turn_deg) % 360)
+    found = taken(replace(measurements, devices=devices))
+    assert found.variants == []
+    assert found.after_db == found.before_db
+    turned = re.search(r"left out: they fit azimuths that are all turned by ([+-]\d+)°", found.note)
+    assert abs((float(turned[1]) + turn_deg + 180) % 360 - 180) < 10
+
+
+def test_where_no_azimuth_is_declared_nothing_is_said_of_it():
+    measurements = network(2)
+    found = taken(replace(measurements, devices=measurements.devices.drop(columns="azimuth_deg")))
+    assert (found.variants, found.scores, found.note) == ([], [], "")
+
+
+def test_the_loop_begins_with_what_is_declared_and_calls_it_no_cause():
+    loop = rt.close_loop(network(0, points=150), base="log-distance", hold_out="device")
+    report = rt.make_report(loop)
+    assert [each["variant"] for each in report["effects"]] == [DeclaredSectors.variant]
+    assert report["verdict"] != "effect"
+    [effect] = report["effects"]
+    assert effect["probability"] is None
+    assert effect["parameters"]["beamwidth_deg"]["unit"] == "deg"
+    assert not any("azimuth" in name for name in effect["parameters"])  # declared, not found
+    assert report["error"]["before"]["rmse_db"] < 4.5  # part of the base
+
+
+def test_one_declared_azimuth_is_too_few():
+    measurements = network(3)
+    devices = measurements.devices.assign(azimuth_deg=[20.0] + [np.nan] * 5)
+    reason = DeclaredSectors().unavailable(prepare_links(replace(measurements, devices=devices), None))
+    assert reason == "azimuth_deg of 2 devices of known position is not declared"
+    assert DeclaredSectors().unavailable(prepare_links(measurements, None)) is None
+
+
+def test_all_sectors_share_a_pattern_and_a_level_and_keep_their_azimuths():
+    links = prepare_links(network(4), None)
+    shape = SectorPattern(beamwidth_deg=80.0)
+    params = DeclaredSectors.Params(devices={device: shape.model_copy(update={"azimuth_deg": azimuth})
+                                           for device, azimuth in enumerate(links.boresight_deg)})
+    variation = DeclaredSectors().variation(params)
+    wider = variation.params(variation.values + np.array([3.0, 5.0, 0, 0, 0, 0]))
+    assert [each.azimuth_deg for each in wider.devices.values()] == [23, 143, 263] * 2
+    assert {each.beamwidth_deg for each in wider.devices.values()} == {85.0}
+    term = DeclaredSectors().term(links, params, None)
+    np.testing.assert_allclose(term.columns[:, 0], 1.0)  # of a sector without a reading, too
+    np.testing.assert_allclose(term.columns[:, 1:].sum(axis=1), 1.0)
+    assert term.prior_sd_db[0] > 3 * term.prior_sd_db[1:].max()
