@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
-from radiotwin.closeloop.scoring import fit_and_score
+import numpy as np
+
+from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.closeloop.scoring import CandidateScore, fit_and_score
 from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.base import Effect
 from radiotwin.links import evidence_blocks
@@ -27,19 +31,40 @@ def take_declared(result: SelectionResult, effects: list[Effect], seed: int,
         the other effects.
     """
     block = evidence_blocks(result.model.links)
-    for effect in effects:
-        if not effect.is_declared or effect.unavailable(result.model.links):
-            continue
-        on_progress(effect.variant)
-        before, step = result.model, len(result.model.whole.effects)
-        score, extended = fit_and_score(before, effect, block, 1, step, seed, result.criteria)
-        if extended is None:
-            result.scores.append(score)
-            result.model.links.notes.append(
-                f"{effect.variant} do not agree with the readings and are left out: {score.reason}")
-            continue
-        result.keep(score, extended)
-        result.model.links.notes.append(
-            f"{effect.variant} are part of the base: the RMSE on held-out links is "
-            f"{score.rmse_db:.2f} dB, and {before.rmse_db():.2f} dB without them")
+    declared = [effect for effect in effects if effect.is_declared]
+    for name in dict.fromkeys(effect.name for effect in declared):
+        forms = [effect for effect in declared if effect.name == name
+                 and not effect.unavailable(result.model.links)]
+        _take_best(result, forms, block, seed, on_progress)
     return [effect for effect in effects if not effect.is_declared]
+
+
+def _take_best(result: SelectionResult, forms: list[Effect], block: np.ndarray, seed: int,
+               on_progress: Callable[[str], None]) -> None:
+    """Add the form of one declared effect that held-out links gain most by, if they gain."""
+    before, step = result.model, len(result.model.whole.effects)
+    best: tuple[Effect, CandidateScore, CrossValidatedModel] | None = None
+    refused: list[CandidateScore] = []
+    for effect in forms:
+        on_progress(effect.variant)
+        score, extended = fit_and_score(before, effect, block, len(forms), step, seed,
+                                        result.criteria)
+        if extended is None:
+            refused.append(score)
+        elif best is None or score.held_out_nats > best[1].held_out_nats:
+            refused += [best[1]] if best else []
+            best = effect, score, extended
+        else:
+            refused.append(score)
+    notes = before.links.notes
+    if best is not None:
+        effect, score, extended = best
+        refused = [replace(each, reason=each.reason or f"{effect.variant} gain more")
+                   for each in refused]
+        result.keep(score, extended)
+        notes.append(f"{effect.variant} are part of the base: the RMSE on held-out links is "
+                     f"{score.rmse_db:.2f} dB, and {before.rmse_db():.2f} dB without them")
+    elif refused:
+        notes.append(f"{forms[0].variant} do not agree with the readings and are left out: "
+                     f"{refused[0].reason}")
+    result.scores += refused

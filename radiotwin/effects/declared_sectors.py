@@ -8,7 +8,7 @@ device by itself does not.
 """
 
 from itertools import product
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from typing_extensions import override
@@ -45,9 +45,16 @@ DEVICE_SD_DB = 3.0  # between the maximum gains of devices: powers and cables di
 
 
 class DeclaredSectors(SectorAntenna):
-    """One pattern for all devices whose azimuth the table of devices has."""
+    """One pattern for all devices of declared azimuth; links leave along the straight line.
+
+    Attributes:
+        straight: whether they do, or in the directions of the paths over the map. On the links that
+            both are fitted to, paths over a map that is half guessed may well win; held-out links
+            say which is right.
+    """
 
     variant = "sector antennas of declared azimuth"
+    straight: ClassVar[bool] = True
     is_declared = True
     repeatable = False
 
@@ -69,15 +76,12 @@ class DeclaredSectors(SectorAntenna):
         known = {device for devices in view.found_params(self.name, "devices")
                  for device in devices}
         declared = sorted(set(_declared(view.links)) - known)
-        ways = [False, True] if view.links.city is not None else [False]
         heard = np.isin(view.links.device, declared).sum() >= MIN_LINKS
         if len(declared) < MIN_DEVICES or not heard:
             return []
-        found = [(_best_shape(view, declared, straight), straight) for straight in ways]
+        nats, shape, turn_deg = _best_shape(view, declared, self.straight)
         return [self.Params(devices=_turned(view.links, declared, shape, turn_deg),
-                            straight=straight, turn_deg=turn_deg)
-                for (nats, shape, turn_deg), straight in sorted(found, key=lambda each: -each[0][0])
-                if nats > MIN_NATS]
+                            straight=self.straight, turn_deg=turn_deg)] if nats > MIN_NATS else []
 
     @override
     def implausible(self, params: Any, coefficients: np.ndarray) -> str | None:
@@ -126,6 +130,17 @@ class DeclaredSectors(SectorAntenna):
         reported["gain_db"] = Parameter.normal(estimate.coefficients[0],
                                                estimate.coefficients_sd[0], "dB")
         return reported
+
+
+class DeclaredSectorsOnPaths(DeclaredSectors):
+    """The same, each path with the gain of the direction in which it leaves the device."""
+
+    variant = "sector antennas of declared azimuth, along paths"
+    straight = False
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        return "there is no 3D map" if links.city is None else super().unavailable(links)
 
 
 def _numbers() -> dict[str, dict]:

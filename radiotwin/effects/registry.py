@@ -8,7 +8,7 @@ from radiotwin.effects.base import Effect
 from radiotwin.effects.body_shadowing import BodyShadowing
 from radiotwin.effects.building_entry import BuildingEntry
 from radiotwin.effects.clock_offset import ReceiverClockOffset
-from radiotwin.effects.declared_sectors import DeclaredSectors
+from radiotwin.effects.declared_sectors import DeclaredSectors, DeclaredSectorsOnPaths
 from radiotwin.effects.detection_limit import DetectionLimit
 from radiotwin.effects.episode import Episode
 from radiotwin.effects.excess_attenuation import ExcessAttenuation
@@ -34,10 +34,11 @@ from radiotwin.plugins import load_plugins
 ENTRY_POINTS = "radiotwin.effects"
 BUILT_IN: tuple[type[Effect], ...] = (
     DeviceGainOffset, ReceiverGainOffset, DeviceDrift, ReceiverDrift, ReceiverSaturation,
-    NoiseFloor, DetectionLimit, SectorAntenna, DeclaredSectors, TiltedDipole, BodyShadowing,
-    ExcessAttenuation, DevicePositionError, ReceiverPositionError, ReceiverClockOffset,
-    MissingObstacle, RemovedObstacle, BuildingEntry, Foliage, MappedVegetation, WallReflection,
-    Diffraction, GroundReflection, Interference, LockLoss, FaultyFlight, Episode)
+    NoiseFloor, DetectionLimit, SectorAntenna, DeclaredSectors, DeclaredSectorsOnPaths,
+    TiltedDipole, BodyShadowing, ExcessAttenuation, DevicePositionError, ReceiverPositionError,
+    ReceiverClockOffset, MissingObstacle, RemovedObstacle, BuildingEntry, Foliage,
+    MappedVegetation, WallReflection, Diffraction, GroundReflection, Interference, LockLoss,
+    FaultyFlight, Episode)
 
 _registered: list[type[Effect]] = []
 

@@ -17,6 +17,7 @@ from radiotwin.closeloop.cross_validation import cross_validate, training_parts
 from radiotwin.closeloop.declared import take_declared
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.closeloop.selection import SelectionResult
+from radiotwin.effects.base import GainEffect
 from radiotwin.effects.declared_sectors import DeclaredSectors
 from radiotwin.effects.registry import BUILT_IN
 from radiotwin.effects.sector_antenna import SectorPattern
@@ -59,7 +60,7 @@ def taken(measurements):
     base = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
     result = SelectionResult(base)
     others = take_declared(result, [effect() for effect in BUILT_IN], 0, lambda _: None)
-    assert len(others) == len(BUILT_IN) - 1
+    assert len(others) == len(BUILT_IN) - 2
     return SimpleNamespace(before_db=base.rmse_db(), after_db=result.model.rmse_db(), scores=result.scores,
                            variants=[each.effect.variant for each in result.model.whole.effects],
                            note=(result.model.links.notes or [""])[-1])
@@ -125,3 +126,35 @@ def test_all_sectors_share_a_pattern_and_a_level_and_keep_their_azimuths():
     np.testing.assert_allclose(term.columns[:, 0], 1.0)  # of a sector without a reading, too
     np.testing.assert_allclose(term.columns[:, 1:].sum(axis=1), 1.0)
     assert term.prior_sd_db[0] > 3 * term.prior_sd_db[1:].max()
+
+
+def antenna_db(links):
+    off = np.radians(links.azimuth_deg - links.boresight_deg[links.device])
+    return 10 * np.log10(0.006 + 0.994 * np.cos(off / 2) ** 8)
+
+
+class Half(GainEffect):
+    name, variant, is_declared = "thing", "half of it", True
+
+    def gain_db(self, links, params):
+        return 0.5 * antenna_db(links)
+
+
+class All(Half):
+    variant = "all of it"
+
+    def gain_db(self, links, params):
+        return antenna_db(links)
+
+
+@pytest.mark.parametrize("forms", [(Half, All), (All, Half)])
+def test_of_two_forms_held_out_links_choose(forms):
+    links = prepare_links(network(5), None)
+    folds = make_folds(links, 0, "device")
+    result = SelectionResult(cross_validate(links, make_bases(None, 0)["log-distance"], folds,
+                                            training_parts(links, folds)))
+    assert take_declared(result, [form() for form in forms], 0, lambda _: None) == []
+    [effect] = result.model.whole.effects
+    assert effect.effect.variant == "all of it"
+    assert [each.reason for each in result.scores if not each.kept] == ["all of it gain more"]
+    assert [each.kept for each in result.scores].count(True) == 1
