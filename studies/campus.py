@@ -219,8 +219,8 @@ def campus_table(rows: pd.DataFrame) -> str:
 
 def _turn_deg(effects: list[dict]) -> float:
     """Return the angle by which all declared azimuths are off, as found; NaN: they are not used."""
-    return next((effect["parameters"]["turn_deg"]["value"] for effect in effects
-                 if "turn_deg" in effect["parameters"]), np.nan)
+    return next((effect["parameters"]["azimuth_offset_deg"]["value"] for effect in effects
+                 if "azimuth_offset_deg" in effect["parameters"]), np.nan)
 
 
 def _best(baselines_db: dict[str, float]) -> str:

@@ -32,7 +32,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
     selection = loop.selection
     kept = [score for score in selection.scores if score.kept]
     effects = [{"name": score.name, "variant": each.effect.variant, "rank": rank,
-                "uses": list(each.effect.uses),
+                "uses": list(each.effect.uses), "is_declared": each.effect.is_declared,
                 "params": each.params.model_dump(mode="json"),
                 "parameters": {name: parameter.record() for name, parameter in parameters.items()},
                 "size_db": size.record(),

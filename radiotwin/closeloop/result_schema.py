@@ -66,6 +66,7 @@ class EffectRecord(Record):
     name: str
     variant: str = ""
     uses: list[str] = Field(default_factory=list)
+    is_declared: bool = False
     rank: Whole
     params: dict[str, Any] = Field(default_factory=dict)
     parameters: dict[str, ParameterRecord]

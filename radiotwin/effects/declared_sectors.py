@@ -61,7 +61,7 @@ class DeclaredSectors(SectorAntenna):
     class Params(SectorAntenna.Params):
         """Antennas of devices, all of one pattern, at their declared azimuths and a common turn."""
 
-        turn_deg: float = quantity(
+        azimuth_offset_deg: float = quantity(
             0.0, unit="deg", low=-180.0, high=180.0, step=5.0, prior_sd=5.0,
             description="By which all declared azimuths are off, clockwise.")
 
@@ -79,16 +79,18 @@ class DeclaredSectors(SectorAntenna):
         heard = np.isin(view.links.device, declared).sum() >= MIN_LINKS
         if len(declared) < MIN_DEVICES or not heard:
             return []
-        nats, shape, turn_deg = _best_shape(view, declared, self.straight)
-        return [self.Params(devices=_turned(view.links, declared, shape, turn_deg),
-                            straight=self.straight, turn_deg=turn_deg)] if nats > MIN_NATS else []
+        nats, shape, offset_deg = _best_shape(view, declared, self.straight)
+        if nats <= MIN_NATS:
+            return []
+        return [self.Params(devices=_turned(view.links, declared, shape, offset_deg),
+                            straight=self.straight, azimuth_offset_deg=offset_deg)]
 
     @override
     def implausible(self, params: Any, coefficients: np.ndarray) -> str | None:
-        if abs(params.turn_deg) <= MAX_TURN_DEG:
+        if abs(params.azimuth_offset_deg) <= MAX_TURN_DEG:
             return None
-        return (f"they fit azimuths that are all turned by {params.turn_deg:+.0f}°; azimuth_deg "
-                "counts clockwise from north")
+        return (f"they fit azimuths that are all turned by {params.azimuth_offset_deg:+.0f}°; "
+                "azimuth_deg counts clockwise from north")
 
     @override
     def term(self, links: LinkData, params: SectorAntenna.Params, level_at: LevelAt) -> Term:
@@ -102,18 +104,18 @@ class DeclaredSectors(SectorAntenna):
     def variation(self, params: Any) -> Variation:
         fields = _numbers()
         shape = next(iter(params.devices.values()))
-        values = np.array([params.turn_deg, *(getattr(shape, name) for name in fields if
-                                              name != "turn_deg")])
+        values = np.array([params.azimuth_offset_deg, *(getattr(shape, name) for name in fields if
+                                              name != "azimuth_offset_deg")])
         steps, low, high = (np.array([each[key] for each in fields.values()], dtype=float)
                             for key in ("step", "low", "high"))
 
         def changed(numbers: np.ndarray) -> DeclaredSectors.Params:
-            turn_deg, *shape = numbers.tolist()
+            offset_deg, *shape = numbers.tolist()
             update = dict(zip([*fields][1:], shape, strict=True))
             devices = {device: pattern.model_copy(update=update | {
-                "azimuth_deg": pattern.azimuth_deg + turn_deg - params.turn_deg})
+                "azimuth_deg": pattern.azimuth_deg + offset_deg - params.azimuth_offset_deg})
                 for device, pattern in params.devices.items()}
-            return params.model_copy(update={"devices": devices, "turn_deg": turn_deg})
+            return params.model_copy(update={"devices": devices, "azimuth_offset_deg": offset_deg})
 
         return Variation(values, steps, low, high, changed)
 
@@ -127,8 +129,9 @@ class DeclaredSectors(SectorAntenna):
                                                         estimate.params_sd, strict=True)}
         if links.city is None or params.straight:
             reported.pop("scattered_db")
-        reported["gain_db"] = Parameter.normal(estimate.coefficients[0],
-                                               estimate.coefficients_sd[0], "dB")
+        for number, device in enumerate(params.devices, start=1):  # the common one is the channel's
+            reported[f"gain_db[{links.device_names[device]}]"] = Parameter.normal(
+                estimate.coefficients[number], estimate.coefficients_sd[number], "dB")
         return reported
 
 
@@ -147,7 +150,7 @@ def _numbers() -> dict[str, dict]:
     """Return what is searched for, the turn first: name -> step, bounds and unit."""
     shape = {name: field for name, field in quantities(SectorPattern).items()
              if name != "azimuth_deg"}
-    return {"turn_deg": quantities(DeclaredSectors.Params)["turn_deg"]} | shape
+    return {"azimuth_offset_deg": quantities(DeclaredSectors.Params)["azimuth_offset_deg"]} | shape
 
 
 def _declared(links: LinkData) -> list[int]:
@@ -157,10 +160,10 @@ def _declared(links: LinkData) -> list[int]:
 
 
 def _turned(links: LinkData, devices: list[int], shape: SectorPattern,
-            turn_deg: float) -> dict[int, SectorPattern]:
+            offset_deg: float) -> dict[int, SectorPattern]:
     """Return device -> a pattern, turned to the azimuth that is declared for it, and further."""
     return {device: shape.model_copy(
-        update={"azimuth_deg": float(links.boresight_deg[device]) + turn_deg})
+        update={"azimuth_deg": float(links.boresight_deg[device]) + offset_deg})
         for device in devices}
 
 
@@ -183,18 +186,18 @@ def _best_shape(view: ResidualView, devices: list[int],
         return float(times @ view.gain_nats(rows, offset_db + level_db))
 
     def tried(width: float, back_db: float, tilt: float, height: float,
-              turn_deg: float) -> tuple[float, SectorPattern, float]:
+              offset_deg: float) -> tuple[float, SectorPattern, float]:
         shape = SectorPattern(beamwidth_deg=width, front_to_back_db=back_db, tilt_deg=tilt,
                               vertical_beamwidth_deg=height)
-        turned = _turned(view.links, devices, shape, turn_deg)
+        turned = _turned(view.links, devices, shape, offset_deg)
         return nats(np.concatenate([rays.offset_db(turned[device])
-                                    for device, _, _, rays in parts])), shape, turn_deg
+                                    for device, _, _, rays in parts])), shape, offset_deg
 
     # A turn first, with the pattern flat: of azimuths in another convention no shape is right.
-    turn_deg = max((tried(*numbers, 0.0, 360.0, turn) for turn in TURNS_DEG
+    offset_deg = max((tried(*numbers, 0.0, 360.0, turn) for turn in TURNS_DEG
                     for numbers in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
                    key=lambda each: each[0])[2]
-    best, shape, _ = max((tried(*numbers, *vertical, turn_deg) for vertical in VERTICALS_DEG
+    best, shape, _ = max((tried(*numbers, *vertical, offset_deg) for vertical in VERTICALS_DEG
                           for numbers in product(BEAMWIDTHS_DEG, FRONT_TO_BACK_DB)),
                          key=lambda each: each[0])
-    return best - nats(np.zeros(len(rows))), shape, turn_deg
+    return best - nats(np.zeros(len(rows))), shape, offset_deg

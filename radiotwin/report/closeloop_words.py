@@ -53,7 +53,8 @@ def closeloop_summary(report: dict) -> str:
 
 def cause_names(report: dict) -> list[str]:
     """Return the names of the effects that explain something, with counts and probabilities."""
-    causes = [each for each in report["effects"] if each["name"] not in INTERPOLATIONS]
+    causes = [each for each in report["effects"]
+              if each["name"] not in INTERPOLATIONS and not each.get("is_declared")]
     counts = Counter(name_label(each["name"]) for each in causes)
     return [name if count == 1 else f"{name} ({count} times)" for name, count in counts.items()]
 

@@ -99,9 +99,10 @@ def test_the_loop_begins_with_what_is_declared_and_calls_it_no_cause():
     assert [each["variant"] for each in report["effects"]] == [DeclaredSectors.variant]
     assert report["verdict"] != "effect"
     [effect] = report["effects"]
-    assert effect["probability"] is None
+    assert effect["probability"] is None and effect["is_declared"]
+    assert effect["parameters"]["azimuth_offset_deg"]["low"] < 3 and effect["parameters"]["azimuth_offset_deg"]["high"] > -3
     assert effect["parameters"]["beamwidth_deg"]["unit"] == "deg"
-    assert not any("azimuth" in name for name in effect["parameters"])  # declared, not found
+    assert not any("azimuth_deg" in name for name in effect["parameters"])  # declared, not found
     assert report["error"]["before"]["rmse_db"] < 4.5  # part of the base
 
 
