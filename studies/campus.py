@@ -136,8 +136,7 @@ def _controlled(measured: Measurements, control: str | None, seed: int) -> Measu
     """
     table = measured.table
     if control in ("told", "turned"):
-        azimuth_deg = measured.devices["device"].map(AZIMUTHS_DEG) + 180.0 * (control == "turned")
-        return replace(measured, devices=measured.devices.assign(azimuth_deg=azimuth_deg % 360))
+        return with_azimuths(measured, 180.0 * (control == "turned"))
     if control == "permuted":
         return permuted(measured, seed)
     if control == "permuted-all":
@@ -155,6 +154,12 @@ def _controlled(measured: Measurements, control: str | None, seed: int) -> Measu
     if control == "mirrored":
         return measured.moved(lambda position_m: position_m * [-1.0, 1.0, 1.0], measured.origin)
     return measured
+
+
+def with_azimuths(measured: Measurements, turned_deg: float = 0.0) -> Measurements:
+    """Return measurements whose devices declare the published azimuths, turned by so much."""
+    azimuth_deg = (measured.devices["device"].map(AZIMUTHS_DEG) + turned_deg) % 360
+    return replace(measured, devices=measured.devices.assign(azimuth_deg=azimuth_deg))
 
 
 def _bias_db(loop: Loop) -> float:

@@ -17,7 +17,7 @@ from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.closeloop.baselines import BOOSTING, EXTRA_TREES, Part, law_db, trees_db
 from radiotwin.closeloop.corrected_twin import corrected_twin
 from radiotwin.links import LinkData, prepare_links
-from studies.campus import campus
+from studies.campus import campus, with_azimuths
 from studies.closeloop import counted, summary
 from studies.closeloop_real import AZIMUTHS_DEG, azimuth_errors_deg
 from studies.runner import Study
@@ -69,15 +69,21 @@ def _rows_of(links: LinkData, measured: Measurements, chosen: np.ndarray) -> np.
 
 
 def away_cases(seed: int) -> dict[str, dict]:
-    """Return quadrants of the area and sectors of which nothing is learnt."""
+    """Return quadrants of the area and sectors of which nothing is learnt.
+
+    Sectors with their azimuths declared, too: what a planner knows of one that is not built.
+    """
     return {f"quadrant-{each}": {"left_out": each} for each in QUADRANTS} | {
-        f"sector-{each}": {"left_out": each} for each in AZIMUTHS_DEG}
+        f"sector-{each}": {"left_out": each} for each in AZIMUTHS_DEG} | {
+        f"told-sector-{each}": {"left_out": each, "told": True} for each in AZIMUTHS_DEG}
 
 
 def learn_elsewhere(seed: int, settings: dict) -> dict:
     """Learn from all but a quadrant or a sector, and predict that."""
     left_out = settings["left_out"]
     with campus() as (measured, scene):
+        if settings.get("told"):
+            measured = with_azimuths(measured)
         if left_out in QUADRANTS:
             end_m = measured.receiver_m[:, :2]
             east, north = (end_m > np.median(end_m, axis=0)).T
@@ -92,18 +98,23 @@ def away_table(rows: pd.DataFrame) -> str:
     models = list(rows.iloc[0]["rmse_db"])
     by_name = rows.set_index("name")
     names = [name for name in away_cases(0) if name in by_name.index]
-    lines = [[name.replace("-", " ", 1), f"{by_name.loc[name]['others']:,}",
+    lines = [[_left_out(name), f"{by_name.loc[name]['others']:,}",
               *(number(by_name.loc[name]["rmse_db"][model], 2) for model in models),
               counted(by_name.loc[name]["named"])] for name in names]
-    for kind in ("quadrant", "sector"):
+    for kind in ("quadrant", "sector", "told-sector"):
         own = by_name.loc[[name for name in names if name.startswith(kind)]]
         if len(own) == sum(name.startswith(kind) for name in away_cases(0)):
             squares = [np.average([each[model] ** 2 for each in own["rmse_db"]],
                                   weights=own["others"]) for model in models]
-            lines.append([f"**all {kind}s**", f"{own['others'].sum():,}",
+            lines.append([f"**all {_left_out(kind)}s**", f"{own['others'].sum():,}",
                           *(number(np.sqrt(each), 2) for each in squares), ""])
     return markdown(["left out", "readings", *(f"`{name}`" for name in models), "named"], lines,
                     "Where nothing was measured", ": RMSE [dB]")
+
+
+def _left_out(name: str) -> str:
+    told, name = name.startswith("told-"), name.removeprefix("told-")
+    return "declared " * told + name.replace("-", " ", 1)
 
 
 def readings_cases(seed: int) -> dict[str, dict]:
