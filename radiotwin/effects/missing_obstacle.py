@@ -188,5 +188,6 @@ def _with_box(city: CityMap, box: Box) -> CityMap:
     material = np.concatenate([city.material, np.full(len(mesh.faces), len(city.materials))])
     return CityMap(np.vstack([city.vertices, mesh.vertices]),
                    np.vstack([city.faces, mesh.faces + len(city.vertices)]),
-                   (*city.materials, CONCRETE), material, terrain=None if city.terrain is None
+                   (*city.materials, CONCRETE), material, city.vegetation,
+                   None if city.terrain is None
                    else np.concatenate([city.terrain, np.zeros(len(mesh.faces), dtype=bool)]))

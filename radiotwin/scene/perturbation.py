@@ -78,4 +78,4 @@ def perturbed_map(city: CityMap, wall_sd_m: float, height_sd_m: float, seed: int
         corners_m[:, 2] *= max(1 + heights_m[number] / top_m, MIN_HEIGHT_SHARE)
         corners_m[:, 2] += base_m
         vertices_m[rows] = corners_m
-    return CityMap(vertices_m, city.faces, city.materials, city.material, terrain=city.terrain)
+    return city.with_vertices(vertices_m)
