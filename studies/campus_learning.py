@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
+from scipy.stats import t as student
 
 from radiotwin import Measurements, Scene, close_loop, make_report
 from radiotwin.channel.log_distance import LogDistance
@@ -17,7 +18,7 @@ from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.closeloop.baselines import BOOSTING, EXTRA_TREES, Part, law_db, trees_db
 from radiotwin.closeloop.corrected_twin import corrected_twin
 from radiotwin.links import LinkData, prepare_links
-from studies.campus import campus, with_azimuths
+from studies.campus import COVERAGE, campus, with_azimuths
 from studies.closeloop import counted, summary
 from studies.closeloop_real import AZIMUTHS_DEG, azimuth_errors_deg
 from studies.runner import Study
@@ -33,7 +34,8 @@ def learn_from(measured: Measurements, scene: Scene, learnt: np.ndarray, seed: i
     """Learn from a mask (n,) of readings, and predict all others.
 
     Returns:
-        what was named, and `rmse_db` of the others by model.
+        what was named, `rmse_db` of the others by model, and the `coverage` of the twin's 90 %
+        intervals of their readings.
     """
     links = prepare_links(measured, scene)
     rows = _rows_of(links, measured, np.flatnonzero(learnt))
@@ -43,7 +45,10 @@ def learn_from(measured: Measurements, scene: Scene, learnt: np.ndarray, seed: i
     assert twin.fitted is not None
     named = replace(twin, fitted=replace(twin.fitted, shadowing=None, blend=None))
     others = links.select(test)
-    predicted = {TWIN: twin.predict(others).mean_db, NAMED: named.predict(others).mean_db}
+    by_twin, dof = twin.predict(others), twin.fitted.dof
+    half_db = by_twin.sd_db * np.sqrt((dof - 2) / dof) * student.ppf(0.5 + COVERAGE / 2, dof)
+    within = np.abs(others.level_db - by_twin.mean_db) <= half_db
+    predicted = {TWIN: by_twin.mean_db, NAMED: named.predict(others).mean_db}
     unlimited = replace(links, limit_db=np.full(len(links), -np.inf))
     for kind in (LogDistance, SegmentedLogDistance, RegressionKriging):
         predicted[kind.name] = law_db(kind, unlimited, rows, test)
@@ -51,7 +56,9 @@ def learn_from(measured: Measurements, scene: Scene, learnt: np.ndarray, seed: i
         predicted[name] = trees_db(name, Part(unlimited), rows, test, seed)
     report = make_report(loop)
     return summary(report) | {
-        "learnt": len(rows), "others": len(test), "azimuth_error_deg": azimuth_errors_deg(report),
+        "learnt": len(rows), "others": len(test),
+        "coverage": float(within[np.isfinite(others.level_db)].mean()),
+        "azimuth_error_deg": azimuth_errors_deg(report),
         "rmse_db": {name: float(np.sqrt(np.nanmean((others.level_db - mean_db) ** 2)))
                     for name, mean_db in predicted.items()}}
 
@@ -100,6 +107,7 @@ def away_table(rows: pd.DataFrame) -> str:
     names = [name for name in away_cases(0) if name in by_name.index]
     lines = [[_left_out(name), f"{by_name.loc[name]['others']:,}",
               *(number(by_name.loc[name]["rmse_db"][model], 2) for model in models),
+              _percent(by_name.loc[name].get("coverage", np.nan)),
               counted(by_name.loc[name]["named"])] for name in names]
     for kind in ("quadrant", "sector", "told-sector"):
         own = by_name.loc[[name for name in names if name.startswith(kind)]]
@@ -107,14 +115,19 @@ def away_table(rows: pd.DataFrame) -> str:
             squares = [np.average([each[model] ** 2 for each in own["rmse_db"]],
                                   weights=own["others"]) for model in models]
             lines.append([f"**all {_left_out(kind)}s**", f"{own['others'].sum():,}",
-                          *(number(np.sqrt(each), 2) for each in squares), ""])
-    return markdown(["left out", "readings", *(f"`{name}`" for name in models), "named"], lines,
+                          *(number(np.sqrt(each), 2) for each in squares), "", ""])
+    head = ["left out", "readings", *(f"`{name}`" for name in models), "in 90 %", "named"]
+    return markdown(head, lines,
                     "Where nothing was measured", ": RMSE [dB]")
 
 
 def _left_out(name: str) -> str:
     told, name = name.startswith("told-"), name.removeprefix("told-")
     return "declared " * told + name.replace("-", " ", 1)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if np.isfinite(share) else "–"
 
 
 def readings_cases(seed: int) -> dict[str, dict]:
