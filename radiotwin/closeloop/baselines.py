@@ -54,7 +54,8 @@ class Part:
     @property
     def common(self) -> np.ndarray:
         """(n, q) of them, without those that say which receiver it is."""
-        return self.features[:, :feature_count(len(self.links.device_names))]
+        declared = bool(np.isfinite(self.links.boresight_deg).any())
+        return self.features[:, :feature_count(len(self.links.device_names), declared)]
 
     def select(self, rows: np.ndarray) -> Part:
         """Return the links of an index array."""

@@ -41,11 +41,13 @@ def make_blend(model: CrossValidatedModel, prediction: CombinedPrediction,
     places = np.column_stack([np.round(whole.links.receiver_m / SAME_M) * SAME_M,
                               whole.links.device])[whole.train]
     places = np.unique(places, axis=0)
+    declared = np.flatnonzero(np.isfinite(whole.links.boresight_deg))
     near, far = _sd_ratio(model, prediction)
     return Blend({name: (float(pair[0]), float(pair[1])) for name, pair in
                   ((name, pair / total) for name, pair in weights.items())},
                  HALF_M, (near, far), places[:, :3], places[:, 3].astype(int),
-                 {name: forest for name, forest in forests.items() if name in weights}, laws)
+                 {name: forest for name, forest in forests.items() if name in weights}, laws,
+                 np.column_stack([declared, whole.links.boresight_deg[declared]]))
 
 
 def needs_rest(prediction: CombinedPrediction) -> bool:

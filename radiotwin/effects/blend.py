@@ -6,7 +6,7 @@ measurements and one far from them, found on held-out links by `radiotwin.closel
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
@@ -24,12 +24,13 @@ from radiotwin.channel.stored import (
 )
 from radiotwin.inference.stacking import combine
 from radiotwin.links import LinkData
-from radiotwin.links.features import link_features
+from radiotwin.links.features import feature_count, link_features
 
 NAMED, REST = "named", "named_and_rest"
 FORESTS = ("named_and_trees", "named_and_boosting")  # members, learnt of what named effects leave
 LAWS = {each.name: each for each in (SegmentedLogDistance, RegressionKriging)}
 MAX_SD_RATIO = 100.0
+MAX_ANGLE_DEG = 1e6  # of measurements and their devices
 
 
 def far_share(away_m: np.ndarray, half_m: float) -> np.ndarray:
@@ -54,6 +55,7 @@ class Blend:
         measured_device: (p,) the device that was measured there.
         forests: of the standardised residual of named effects, by name (`FORESTS`).
         laws: fitted to the levels, by name.
+        boresights_deg: (j, 2) device, and its declared azimuth [deg]; forests know of these.
     """
 
     weights: dict[str, tuple[float, float]]
@@ -63,6 +65,7 @@ class Blend:
     measured_device: np.ndarray
     forests: dict[str, Forest]
     laws: dict[str, ChannelModel]
+    boresights_deg: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
     def far_share(self, links: LinkData) -> np.ndarray:
         """Return how far the receivers of links are from where their device was measured (n,)."""
@@ -87,7 +90,7 @@ class Blend:
         geometry, share = links.geometry, self.far_share(links)
         members = {NAMED: mean_db, REST: mean_db + rest * scale_db}
         if self.forests:
-            features = link_features(links, receivers=False)
+            features = link_features(self._declared(links), receivers=False)
             for name, forest in self.forests.items():
                 members[name] = mean_db + forest.predict(features) * scale_db
         for name, law in self.laws.items():
@@ -98,10 +101,18 @@ class Blend:
         near, far = np.square(self.sd_ratio)
         return blended_db, scale_db * np.sqrt((1 - share) * near + share * far)
 
+    def _declared(self, links: LinkData) -> LinkData:
+        """Return links with the azimuths that were declared where this was fitted, no others."""
+        boresight_deg = np.full(len(links.device_names), np.nan)
+        boresight_deg[self.boresights_deg[:, 0].astype(int)] = self.boresights_deg[:, 1]
+        return replace(links, boresight_deg=boresight_deg)
+
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return arrays by name, and settings that JSON can hold, for `from_state`."""
         arrays = {"measured_m": self.measured_m.astype(np.float32),
                   "measured_device": self.measured_device.astype(np.int32)}
+        if len(self.boresights_deg):
+            arrays["boresights_deg"] = self.boresights_deg
         settings: dict[str, Any] = {
             "weights": {name: list(each) for name, each in self.weights.items()},
             "half_m": self.half_m, "sd_ratio": list(self.sd_ratio), "models": {}}
@@ -113,13 +124,13 @@ class Blend:
 
     @classmethod
     def from_state(cls, arrays: dict[str, np.ndarray], settings: dict[str, Any],
-                   width: int) -> Self:
+                   devices: int) -> Self:
         """Return what `state` described.
 
         Args:
             arrays: of `state`.
             settings: of `state`.
-            width: number of columns of `link_features` with the twin's devices.
+            devices: of the twin.
 
         Raises:
             BadInput: too large.
@@ -129,7 +140,14 @@ class Blend:
         require_names("settings", settings, ["weights", "half_m", "sd_ratio", "models"])
         forests: dict[str, Forest] = {}
         laws: dict[str, ChannelModel] = {}
-        own = {"measured_m", "measured_device"}
+        own = {"measured_m", "measured_device"} | (arrays.keys() & {"boresights_deg"})
+        boresights_deg = np.zeros((0, 2))
+        if "boresights_deg" in own:
+            boresights_deg = require_array(arrays, "boresights_deg", (None, 2), -MAX_ANGLE_DEG,
+                                           max(MAX_ANGLE_DEG, devices - 1))
+            if not np.isin(boresights_deg[:, 0], np.arange(devices)).all():
+                raise ValueError("an azimuth belongs to no device")
+        width = feature_count(devices, len(boresights_deg) > 0)
         for name, given in settings["models"].items():
             parts = {each.removeprefix(f"{name}/"): array for each, array in arrays.items()
                      if each.startswith(f"{name}/")}
@@ -153,4 +171,4 @@ class Blend:
         return cls(weights, require_number(settings, "half_m", 1e-3, MAX_POSITION_M),
                    (require_number(ratios, "near", 0.01, MAX_SD_RATIO),
                     require_number(ratios, "far", 0.01, MAX_SD_RATIO)), points, device,
-                   forests, laws)
+                   forests, laws, boresights_deg)

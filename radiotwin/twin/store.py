@@ -22,7 +22,6 @@ from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, require_writable
 from radiotwin.inputs import parse_json, read_bytes, read_text, require_within
 from radiotwin.links import LinkData
-from radiotwin.links.features import feature_count
 from radiotwin.localize import TwinDevice
 from radiotwin.twin.record import (
     CHANNEL_FILE,
@@ -184,7 +183,7 @@ def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevic
     if beside and record.blend is None:
         raise ValueError("arrays beside the channel belong to nothing")
     if record.blend is not None:
-        blend = Blend.from_state(beside, record.blend, feature_count(len(devices)))
+        blend = Blend.from_state(beside, record.blend, len(devices))
     _check_terms(effects, [each.device for each in devices], record.receivers)
     return EffectModel(channel, tuple(effects), np.array(record.level_coefficients),
                        np.array(record.scale_db), record.dof, np.nan_to_num(device_m),

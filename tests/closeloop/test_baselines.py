@@ -1,5 +1,7 @@
 """Other models on the folds of the loop."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -20,7 +22,22 @@ def test_trees_are_told_places_and_labels_but_neither_time_nor_quality(links):
     np.testing.assert_allclose(features[:, :3], links.receiver_m, rtol=1e-6)
     np.testing.assert_array_equal(features[:, 14:19].argmax(axis=1), links.device)
     np.testing.assert_array_equal(Part(links).common, link_features(links, receivers=False))
-    assert feature_count(5) == 19 and feature_count(1) == feature_count(5000) == 14
+    assert feature_count(5, False) == 19 and feature_count(1, False) == feature_count(5000, False) == 14
+
+
+def test_trees_are_told_the_angle_off_a_declared_azimuth(links):
+    """Two of five devices declare one; whether a link is to the left or the right of it says nothing."""
+    declared = replace(links, boresight_deg=np.array([90.0, np.nan, -180.0, np.nan, np.nan]))
+    features = link_features(declared)
+    assert features.shape == (len(links), 14 + 2 + 5 + 2) and feature_count(5, True) == 14 + 2 + 5
+    first, third, other = (np.flatnonzero(links.device == device) for device in (0, 2, 1))
+    east, north = (links.offset_m / np.hypot(*links.offset_m.T[:2])[:, None]).T[:2]
+    np.testing.assert_allclose(features[first, 14], east[first], atol=1e-6)
+    np.testing.assert_allclose(features[third, 14], -north[third], atol=1e-6)
+    np.testing.assert_allclose(features[first, 15], abs(north[first]), atol=1e-6)
+    assert (features[other, 14:16] == 0).all()
+    np.testing.assert_array_equal(np.delete(features, [14, 15], axis=1), link_features(links))
+    np.testing.assert_array_equal(Part(declared).common, link_features(declared, receivers=False))
 
 
 @pytest.mark.parametrize("kind", [EXTRA_TREES, BOOSTING])

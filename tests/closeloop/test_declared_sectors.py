@@ -12,6 +12,7 @@ import pandas as pd
 import pytest
 
 import radiotwin as rt
+from radiotwin.closeloop.baselines import EXTRA_TREES, grow_trees
 from radiotwin.closeloop.bases import make_bases
 from radiotwin.closeloop.corrected_twin import corrected_twin
 from radiotwin.closeloop.cross_validation import cross_validate, training_parts
@@ -19,10 +20,12 @@ from radiotwin.closeloop.declared import take_declared
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.base import GainEffect
+from radiotwin.effects.blend import Blend
 from radiotwin.effects.declared_sectors import DeclaredSectors
 from radiotwin.effects.registry import BUILT_IN
 from radiotwin.effects.sector_antenna import SectorPattern
 from radiotwin.links import prepare_links
+from radiotwin.links.features import link_features
 from radiotwin.measurements import Measurements
 
 MASTS_M = np.array([[150.0, 200.0, 25.0], [420.0, 330.0, 25.0]])
@@ -176,3 +179,19 @@ def test_of_two_forms_held_out_links_choose(forms):
     assert effect.effect.variant == "all of it"
     assert [each.reason for each in result.scores if not each.kept] == ["all of it gain more"]
     assert [each.kept for each in result.scores].count(True) == 1
+
+
+def test_trees_of_a_stored_blend_know_the_azimuths_and_nobody_need_tell_them_again():
+    links = prepare_links(network(7), None)
+    forest = grow_trees(EXTRA_TREES, link_features(links, receivers=False), links.level_db, 0, 20)
+    azimuths = np.column_stack([np.arange(6), links.boresight_deg])
+    blend = Blend({"named_and_trees": (1.0, 1.0)}, 30.0, (1.0, 1.0), links.receiver_m[:50], links.device[:50],
+                  {"named_and_trees": forest}, {}, azimuths)
+    arrays, settings = blend.state()
+    again = Blend.from_state(arrays, settings, 6)
+    later = replace(links, boresight_deg=np.full(6, np.nan))  # a map's links declare nothing
+    zero, one = np.zeros(len(links)), np.ones(len(links))
+    expected_db = forest.predict(link_features(links, receivers=False))
+    np.testing.assert_allclose(again.apply(later, zero, one, zero)[0], expected_db, atol=1e-5)
+    with pytest.raises(ValueError, match="belongs to no device"):
+        Blend.from_state(arrays | {"boresights_deg": azimuths + [6, 0]}, settings, 6)
