@@ -92,6 +92,7 @@ class Effect(ABC):
         nlos_only: acts on links without line of sight only, so those with it need not support it.
         confused_with: names of effects that may look alike.
         repeatable: whether there may be several, each found in a step of its own.
+        of_device: whether it is a device's own level or antenna, which another need not have.
         of_receiver: whether it belongs to a receiver, so that it is no part of a map.
         is_cause: whether it is a physical cause, not merely a description of what is left.
         within_flights: whether it acts at certain times only, so that other flights do not show it:
@@ -110,6 +111,7 @@ class Effect(ABC):
     nlos_only: ClassVar[bool] = False
     confused_with: ClassVar[tuple[str, ...]] = ()
     repeatable: ClassVar[bool] = False
+    of_device: ClassVar[bool] = False
     of_receiver: ClassVar[bool] = False
     is_cause: ClassVar[bool] = True
     within_flights: ClassVar[bool] = False

@@ -22,6 +22,42 @@ MAX_Z = 4.0  # an outlier counts as this many scales
 
 
 @dataclass(frozen=True, eq=False)
+class Unheard:
+    """What the others' antennas and offsets say of devices without a reading of their own.
+
+    Attributes:
+        devices: by their rows at the fit, without those whose antennas are declared.
+        mean_db: of what the other devices' own effects add to their links [dB].
+        sd_db: standard deviation of that, and of what devices have in common beside it [dB].
+    """
+
+    devices: tuple[int, ...]
+    mean_db: float
+    sd_db: float
+
+    @classmethod
+    def of(cls, model: FoldModel, result: FitResult) -> Unheard | None:
+        """Return that of a model's devices without a training link; None if each has one."""
+        own_db, declared = np.zeros(len(model.links)), set[int]()
+        for each, slice_ in zip(model.effects, model.coefficient_slices, strict=True):
+            if each.effect.is_declared:
+                declared |= set(getattr(each.params, "devices", ()))
+            elif each.effect.of_device:
+                own_db += each.term.offset_db + each.term.columns @ result.coefficients[slice_]
+        device = model.links.device[model.train]
+        heard = np.unique(device)
+        devices = sorted(set(range(len(model.links.device_m))) - set(heard.tolist()) - declared)
+        if not devices or not len(heard):
+            return None
+        # Each device counts the same, however many readings it has.
+        weight = 1.0 / np.bincount(device)[device] / len(heard)
+        mean_db = float(weight @ own_db[model.train])
+        spread_db = np.sqrt(weight @ (own_db[model.train] - mean_db) ** 2)
+        return cls(tuple(devices), mean_db, float(np.hypot(spread_db,
+                                                           device_sd_db(model, result))))
+
+
+@dataclass(frozen=True, eq=False)
 class EffectModel:
     """A fitted channel with effects, ready for links that were not among the training links.
 
@@ -42,6 +78,7 @@ class EffectModel:
         typical_misfit: of the links of located devices where it was learnt; NaN = not known.
             Both are of `radiotwin.localize.calibration`.
         blend: what predicts together with it, by weights; None = named effects and shadowing alone.
+        unheard: what is known of devices without a reading; None = there are none.
     """
 
     channel: ChannelModel
@@ -58,6 +95,7 @@ class EffectModel:
     radius_factor: float = 1.0
     typical_misfit: float = np.nan
     blend: Blend | None = None
+    unheard: Unheard | None = None
 
     @classmethod
     def of(cls, model: FoldModel, result: FitResult, causes_only: bool = False) -> EffectModel:
@@ -73,7 +111,7 @@ class EffectModel:
         return cls(model.channel, effects,
                    result.coefficients[:model.level_columns.shape[1]], result.scale_db, model.dof,
                    model.links.device_m, tuple(model.links.receiver_names), model.links.first_s,
-                   device_sd_db(model, result))
+                   device_sd_db(model, result), unheard=Unheard.of(model, result))
 
     def on_links(self, links: LinkData) -> tuple[FoldModel, FitResult]:
         """Return the model of any links (n,), and the fit that goes with it.
@@ -102,6 +140,11 @@ class EffectModel:
         regression = model.regression()
         reading = regression.predict(result)
         mean_db, scale_db = reading.mean_db, reading.scale_db
+        unheard_sd_db: np.ndarray | float = 0.0
+        if self.unheard is not None:
+            of_them = np.isin(links.device, self.unheard.devices)
+            mean_db = mean_db + self.unheard.mean_db * of_them
+            unheard_sd_db = self.unheard.sd_db * of_them
         shift, left = np.zeros(len(links)), np.ones(len(links))
         if self.shadowing is not None and self.shadowing.receivers_move:
             shift, left = self.shadowing.at(links)
@@ -111,7 +154,7 @@ class EffectModel:
             mean_db = mean_db + shift * self.scale_db[model.group]
             scale_db = scale_db * left
         return Prediction(
-            mean_db, scale_db * np.sqrt(self.dof / (self.dof - 2)),
+            mean_db, np.hypot(scale_db * np.sqrt(self.dof / (self.dof - 2)), unheard_sd_db),
             detection_probability(mean_db, scale_db, model.limit_db, self.dof,
                                   regression.losses))
 

@@ -103,6 +103,7 @@ class DeviceGainOffset(_GainOffset):
     """Devices that radiate more or less than the others do."""
 
     name = "device_gain_offset"
+    of_device = True
     end = "device"
     confused_with = ("antenna_pattern", "device_position_error")
 

@@ -91,6 +91,7 @@ class SectorAntenna(GainEffect):
     variant = "sector antenna of a device"
     figure = "pattern"
     repeatable = True
+    of_device = True
     confused_with = ("device_gain_offset", "device_position_error", "missing_obstacle", "foliage")
 
     class Params(EffectParams):

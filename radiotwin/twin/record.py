@@ -47,6 +47,14 @@ class EffectRecord(_Strict):
     coefficients: list[_Decibels]
 
 
+class UnheardRecord(_Strict):
+    """What is known of devices without a reading."""
+
+    devices: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
+    mean_db: _Decibels
+    sd_db: Annotated[float, Field(ge=0, le=MAX_SD_DB)]
+
+
 class FittedRecord(_Strict):
     """Levels, effects and errors fitted upon the channel."""
 
@@ -62,6 +70,7 @@ class FittedRecord(_Strict):
     radius_factor: Annotated[float, Field(ge=1, le=1e6)] = 1.0
     typical_misfit: Annotated[float, Field(ge=0, le=1e6)] | None = None
     blend: dict[str, Any] | None = None
+    unheard: UnheardRecord | None = None
 
     @field_validator("receivers")
     @classmethod

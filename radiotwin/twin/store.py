@@ -15,7 +15,7 @@ from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.channel.store import decode_both, encode_channel
 from radiotwin.effects.blend import Blend
 from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
-from radiotwin.effects.effect_model import EffectModel
+from radiotwin.effects.effect_model import EffectModel, Unheard
 from radiotwin.effects.fold_model import FittedEffect
 from radiotwin.effects.registry import effect_named
 from radiotwin.errors import BadInput
@@ -30,6 +30,7 @@ from radiotwin.twin.record import (
     DeviceRecord,
     FittedRecord,
     TwinRecord,
+    UnheardRecord,
 )
 
 TWIN_FILE = "twin.json"
@@ -161,7 +162,9 @@ def _fitted_record(fitted: EffectModel) -> dict[str, Any]:
             "shadowing": fitted.shadowing.state() if fitted.shadowing else None,
             "radius_factor": fitted.radius_factor,
             "typical_misfit": None if np.isnan(fitted.typical_misfit) else fitted.typical_misfit,
-            "blend": fitted.blend.state()[1] if fitted.blend else None}
+            "blend": fitted.blend.state()[1] if fitted.blend else None,
+            "unheard": None if fitted.unheard is None else vars(fitted.unheard) | {
+                "devices": list(fitted.unheard.devices)}}
 
 
 def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevice],
@@ -191,7 +194,16 @@ def _fitted(record: FittedRecord, channel: ChannelModel, devices: list[TwinDevic
                        np.nan if record.first_s is None else record.first_s,
                        record.device_sd_db, record.likelihood_power, shadowing,
                        record.radius_factor,
-                       np.nan if record.typical_misfit is None else record.typical_misfit, blend)
+                       np.nan if record.typical_misfit is None else record.typical_misfit, blend,
+                       _unheard(record.unheard, len(devices)))
+
+
+def _unheard(record: UnheardRecord | None, devices: int) -> Unheard | None:
+    if record is None:
+        return None
+    if max(record.devices) >= devices:
+        raise ValueError(f"there is no device of index {max(record.devices)}")
+    return Unheard(tuple(record.devices), record.mean_db, record.sd_db)
 
 
 def _check_terms(effects: list[FittedEffect], devices: list[str], receivers: list[str]) -> None:
