@@ -68,6 +68,8 @@ def waterfall_figure(report: dict) -> Figure:
     before, after = (report["error"][when]["rmse_db"] or 0.0 for when in ("before", "after"))
     kept = [(candidate["name"], candidate["heldout_rmse_db"]) for candidate in report["candidates"]
             if candidate["kept"] and candidate["heldout_rmse_db"] is not None]
+    declared = sum(effect["is_declared"] for effect in report["effects"])
+    kept = kept[declared:]  # what is declared comes first, and is part of the base
     levels = [before, *(rmse_db for _, rmse_db in kept)]
     steps = [(name_label(name), name in INTERPOLATIONS) for name, _ in kept]
     if kept and abs(levels[-1] - after) > MIN_STEP_DB:
@@ -81,7 +83,8 @@ def waterfall_figure(report: dict) -> Figure:
         change = f"{low - high:+.2f}".replace("-", "−")
         _draw_bar(ax, position, high, low, colour, change, alpha=0.55)
         _connect(ax, position, high)
-    names = [f"before: {name_label(report['base'])} alone", *(name for name, _ in steps)]
+    base = "with what is declared" if declared else "alone"
+    names = [f"before: {name_label(report['base'])} {base}", *(name for name, _ in steps)]
     if kept:
         _connect(ax, len(names), after)
         _draw_bar(ax, len(names), 0.0, after, AFTER, f"{after:.2f} dB")

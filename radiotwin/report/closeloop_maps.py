@@ -20,7 +20,7 @@ RESIDUAL_LABEL = "measured − predicted [dB]"
 
 def residual_map_figure(data: LoopData, background: MapBackground) -> Figure:
     """Draw the mean held-out residual over the positions of the moving end, before and after."""
-    panels = [(f"before: {name_label(data.base)} alone", data.before_db)]
+    panels = [(f"before: {name_label(data.base)}", data.before_db)]
     if data.changed:
         names = [name_label(name) for name in data.kept]
         added = join_names(names) if len(names) < 3 else f"{len(names)} effects"

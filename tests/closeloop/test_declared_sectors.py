@@ -27,6 +27,7 @@ from radiotwin.effects.sector_antenna import SectorPattern
 from radiotwin.links import prepare_links
 from radiotwin.links.features import link_features
 from radiotwin.measurements import Measurements
+from radiotwin.report.closeloop_figures import waterfall_figure
 
 MASTS_M = np.array([[150.0, 200.0, 25.0], [420.0, 330.0, 25.0]])
 AZIMUTHS_DEG = (20.0, 140.0, 260.0)
@@ -108,6 +109,8 @@ def test_the_loop_begins_with_what_is_declared_and_calls_it_no_cause():
     assert effect["parameters"]["beamwidth_deg"]["unit"] == "deg"
     assert not any("azimuth_deg" in name for name in effect["parameters"])  # declared, not found
     assert report["error"]["before"]["rmse_db"] < 4.5  # part of the base
+    labels = [label.get_text().replace("\n", " ") for label in waterfall_figure(report).axes[0].get_xticklabels()]
+    assert labels == ["before: log-distance with what is declared"]
 
 
 def test_a_sector_that_is_only_planned_is_predicted_by_the_stored_twin(tmp_path):
