@@ -182,7 +182,7 @@ def _from_version_1(report: dict[str, Any]) -> dict[str, Any]:
     new = {new_names.get(name, name): value for name, value in report.items()}
     new["effects"] = [{("params" if name == "setting" else name): value
                        for name, value in effect.items()}
-                      | {"size_db": None, "uses": [], "probability": None}
+                      | {"size_db": None, "uses": [], "is_declared": False, "probability": None}
                       for effect in report["effects"]]
     new["error"] = _with_new_bias(report["error"]) | {"combined": None}
     new["baselines"] = _with_new_bias(report["baselines"])

@@ -68,7 +68,7 @@ def waterfall_figure(report: dict) -> Figure:
     before, after = (report["error"][when]["rmse_db"] or 0.0 for when in ("before", "after"))
     kept = [(candidate["name"], candidate["heldout_rmse_db"]) for candidate in report["candidates"]
             if candidate["kept"] and candidate["heldout_rmse_db"] is not None]
-    declared = sum(effect["is_declared"] for effect in report["effects"])
+    declared = sum(effect.get("is_declared", False) for effect in report["effects"])
     kept = kept[declared:]  # what is declared comes first, and is part of the base
     levels = [before, *(rmse_db for _, rmse_db in kept)]
     steps = [(name_label(name), name in INTERPOLATIONS) for name, _ in kept]
