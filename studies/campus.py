@@ -170,10 +170,14 @@ def _bias_db(loop: Loop) -> float:
 def coverage(loop: Loop) -> float:
     """Return the share of held-out readings within their central 90 % interval."""
     mean_db, scale_db = loop.after.held_out_reading
-    half = student.ppf(0.5 + COVERAGE / 2, loop.after.whole.dof)
-    error_db = np.abs(loop.links.level_db - mean_db)
+    return share_within(loop.links.level_db - mean_db, scale_db, loop.after.whole.dof)
+
+
+def share_within(error_db: np.ndarray, scale_db: np.ndarray, dof: float) -> float:
+    """Return the share of errors within their central 90 % interval; Student's t."""
     known = np.isfinite(error_db)
-    return float((error_db[known] <= half * scale_db[known]).mean())
+    half_db = student.ppf(0.5 + COVERAGE / 2, dof) * scale_db
+    return float((np.abs(error_db[known]) <= half_db[known]).mean())
 
 
 def campus_table(rows: pd.DataFrame) -> str:

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from scipy.stats import t as student
 
 from radiotwin import Measurements, Scene, close_loop, make_report
 from radiotwin.channel.log_distance import LogDistance
@@ -18,7 +17,7 @@ from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.closeloop.baselines import BOOSTING, EXTRA_TREES, Part, law_db, trees_db
 from radiotwin.closeloop.corrected_twin import corrected_twin
 from radiotwin.links import LinkData, prepare_links
-from studies.campus import COVERAGE, campus, with_azimuths
+from studies.campus import campus, share_within, with_azimuths
 from studies.closeloop import counted, summary
 from studies.closeloop_real import AZIMUTHS_DEG, azimuth_errors_deg
 from studies.runner import Study
@@ -46,8 +45,7 @@ def learn_from(measured: Measurements, scene: Scene, learnt: np.ndarray, seed: i
     named = replace(twin, fitted=replace(twin.fitted, shadowing=None, blend=None))
     others = links.select(test)
     by_twin, dof = twin.predict(others), twin.fitted.dof
-    half_db = by_twin.sd_db * np.sqrt((dof - 2) / dof) * student.ppf(0.5 + COVERAGE / 2, dof)
-    within = np.abs(others.level_db - by_twin.mean_db) <= half_db
+    scale_db = by_twin.sd_db * np.sqrt((dof - 2) / dof)
     predicted = {TWIN: by_twin.mean_db, NAMED: named.predict(others).mean_db}
     unlimited = replace(links, limit_db=np.full(len(links), -np.inf))
     for kind in (LogDistance, SegmentedLogDistance, RegressionKriging):
@@ -57,7 +55,7 @@ def learn_from(measured: Measurements, scene: Scene, learnt: np.ndarray, seed: i
     report = make_report(loop)
     return summary(report) | {
         "learnt": len(rows), "others": len(test),
-        "coverage": float(within[np.isfinite(others.level_db)].mean()),
+        "coverage": share_within(others.level_db - by_twin.mean_db, scale_db, dof),
         "azimuth_error_deg": azimuth_errors_deg(report),
         "rmse_db": {name: float(np.sqrt(np.nanmean((others.level_db - mean_db) ** 2)))
                     for name, mean_db in predicted.items()}}
@@ -117,8 +115,7 @@ def away_table(rows: pd.DataFrame) -> str:
             lines.append([f"**all {_left_out(kind)}s**", f"{own['others'].sum():,}",
                           *(number(np.sqrt(each), 2) for each in squares), "", ""])
     head = ["left out", "readings", *(f"`{name}`" for name in models), "in 90 %", "named"]
-    return markdown(head, lines,
-                    "Where nothing was measured", ": RMSE [dB]")
+    return markdown(head, lines, "Where nothing was measured", ": RMSE [dB]")
 
 
 def _left_out(name: str) -> str:

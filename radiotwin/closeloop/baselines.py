@@ -54,8 +54,8 @@ class Part:
     @property
     def common(self) -> np.ndarray:
         """(n, q) of them, without those that say which receiver it is."""
-        declared = bool(np.isfinite(self.links.boresight_deg).any())
-        return self.features[:, :feature_count(len(self.links.device_names), declared)]
+        devices = len(self.links.device_names)
+        return self.features[:, :feature_count(devices, self.links.has_boresights)]
 
     def select(self, rows: np.ndarray) -> Part:
         """Return the links of an index array."""

@@ -1,4 +1,4 @@
-"""What the tables declare, before anything is looked for that they do not."""
+"""Effects that the input tables declare: added to the base before the search for causes."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from radiotwin.closeloop.cross_validation import CrossValidatedModel
-from radiotwin.closeloop.scoring import CandidateScore, fit_and_score
+from radiotwin.closeloop.scoring import fit_and_score
 from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.base import Effect
 from radiotwin.links import evidence_blocks
@@ -19,7 +18,7 @@ def take_declared(result: SelectionResult, effects: list[Effect], seed: int,
     """Add what is declared to the base, where held-out links gain by it.
 
     That it is there needs no evidence, only that the declaration is right: links that take no part
-    in the fit of its numbers have to agree. What they contradict is left out, and told.
+    in the fit of its numbers have to agree. A contradicted declaration is left out, with a note.
 
     Args:
         result: of a base alone; is extended.
@@ -43,28 +42,23 @@ def _take_best(result: SelectionResult, forms: list[Effect], block: np.ndarray, 
                on_progress: Callable[[str], None]) -> None:
     """Add the form of one declared effect that held-out links gain most by, if they gain."""
     before, step = result.model, len(result.model.whole.effects)
-    best: tuple[Effect, CandidateScore, CrossValidatedModel] | None = None
-    refused: list[CandidateScore] = []
+    tried, passed = [], []
     for effect in forms:
         on_progress(effect.variant)
         score, extended = fit_and_score(before, effect, block, len(forms), step, seed,
                                         result.criteria)
-        if extended is None:
-            refused.append(score)
-        elif best is None or score.held_out_nats > best[1].held_out_nats:
-            refused += [best[1]] if best else []
-            best = effect, score, extended
-        else:
-            refused.append(score)
+        tried.append(score)
+        if extended is not None:
+            passed.append((effect, score, extended))
     notes = before.links.notes
-    if best is not None:
-        effect, score, extended = best
-        refused = [replace(each, reason=each.reason or f"{effect.variant} gain more")
-                   for each in refused]
-        result.keep(score, extended)
+    if passed:
+        effect, best, extended = max(passed, key=lambda each: each[1].held_out_nats)
+        result.keep(best, extended)
+        result.scores += [replace(each, reason=each.reason or f"{effect.variant} gain more")
+                          for each in tried if each is not best]
         notes.append(f"{effect.variant} are part of the base: the RMSE on held-out links is "
-                     f"{score.rmse_db:.2f} dB, and {before.rmse_db():.2f} dB without them")
-    elif refused:
+                     f"{best.rmse_db:.2f} dB, and {before.rmse_db():.2f} dB without them")
+    elif tried:
+        result.scores += tried
         notes.append(f"{forms[0].variant} do not agree with the readings and are left out: "
-                     f"{refused[0].reason}")
-    result.scores += refused
+                     f"{tried[0].reason}")

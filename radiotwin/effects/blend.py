@@ -25,12 +25,12 @@ from radiotwin.channel.stored import (
 from radiotwin.inference.stacking import combine
 from radiotwin.links import LinkData
 from radiotwin.links.features import feature_count, link_features
+from radiotwin.measurement_columns import MAX_ANGLE_DEG
 
 NAMED, REST = "named", "named_and_rest"
 FORESTS = ("named_and_trees", "named_and_boosting")  # members, learnt of what named effects leave
 LAWS = {each.name: each for each in (SegmentedLogDistance, RegressionKriging)}
 MAX_SD_RATIO = 100.0
-MAX_ANGLE_DEG = 1e6  # of measurements and their devices
 
 
 def far_share(away_m: np.ndarray, half_m: float) -> np.ndarray:

@@ -13,10 +13,10 @@ from typing import Any, ClassVar
 import numpy as np
 from typing_extensions import override
 
+from radiotwin.effects.antenna_params import allowed_of
 from radiotwin.effects.arrays import subsample
 from radiotwin.effects.base import Term
 from radiotwin.effects.params import (
-    Allowed,
     Estimate,
     Parameter,
     Variation,
@@ -73,11 +73,8 @@ class DeclaredSectors(SectorAntenna):
 
     @override
     def propose(self, view: ResidualView) -> list[SectorAntenna.Params]:
-        known = {device for devices in view.found_params(self.name, "devices")
-                 for device in devices}
-        declared = sorted(set(_declared(view.links)) - known)
-        heard = np.isin(view.links.device, declared).sum() >= MIN_LINKS
-        if len(declared) < MIN_DEVICES or not heard:
+        declared = _declared(view.links)
+        if np.isin(view.links.device, declared).sum() < MIN_LINKS:
             return []
         nats, shape, offset_deg = _best_shape(view, declared, self.straight)
         if nats <= MIN_NATS:
@@ -123,8 +120,7 @@ class DeclaredSectors(SectorAntenna):
     def parameters(self, links: LinkData, params: SectorAntenna.Params,
                    estimate: Estimate) -> dict[str, Parameter]:
         values = self.variation(params).values
-        reported = {name: Parameter.normal(value, sd, field["unit"],
-                                           Allowed(field["low"], field["high"]))
+        reported = {name: Parameter.normal(value, sd, field["unit"], allowed_of(name, field))
                     for (name, field), value, sd in zip(_numbers().items(), values,
                                                         estimate.params_sd, strict=True)}
         if links.city is None or params.straight:

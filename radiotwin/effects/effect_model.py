@@ -23,7 +23,7 @@ MAX_Z = 4.0  # an outlier counts as this many scales
 
 @dataclass(frozen=True, eq=False)
 class Unheard:
-    """What the others' antennas and offsets say of devices without a reading of their own.
+    """Mean and spread of the others' antennas and offsets, for devices without a reading.
 
     Attributes:
         devices: by their rows at the fit, without those whose antennas are declared.
@@ -36,8 +36,14 @@ class Unheard:
     sd_db: float
 
     @classmethod
-    def of(cls, model: FoldModel, result: FitResult) -> Unheard | None:
-        """Return that of a model's devices without a training link; None if each has one."""
+    def of(cls, model: FoldModel, result: FitResult, device_sd_db: float) -> Unheard | None:
+        """Return that of a model's devices without a training link; None if each has one.
+
+        Args:
+            model: fitted.
+            result: its fit.
+            device_sd_db: as of `EffectModel` [dB].
+        """
         own_db, declared = np.zeros(len(model.links)), set[int]()
         for each, slice_ in zip(model.effects, model.coefficient_slices, strict=True):
             if each.effect.is_declared:
@@ -53,8 +59,7 @@ class Unheard:
         weight = 1.0 / np.bincount(device)[device] / len(heard)
         mean_db = float(weight @ own_db[model.train])
         spread_db = np.sqrt(weight @ (own_db[model.train] - mean_db) ** 2)
-        return cls(tuple(devices), mean_db, float(np.hypot(spread_db,
-                                                           device_sd_db(model, result))))
+        return cls(tuple(devices), mean_db, float(np.hypot(spread_db, device_sd_db)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +113,11 @@ class EffectModel:
         """
         effects = tuple(each for each in model.fitted_effects(result)
                         if each.effect.is_cause or not causes_only)
+        sd_db = device_sd_db(model, result)
         return cls(model.channel, effects,
                    result.coefficients[:model.level_columns.shape[1]], result.scale_db, model.dof,
                    model.links.device_m, tuple(model.links.receiver_names), model.links.first_s,
-                   device_sd_db(model, result), unheard=Unheard.of(model, result))
+                   sd_db, unheard=Unheard.of(model, result, sd_db))
 
     def on_links(self, links: LinkData) -> tuple[FoldModel, FitResult]:
         """Return the model of any links (n,), and the fit that goes with it.

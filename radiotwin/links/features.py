@@ -42,7 +42,7 @@ def link_features(links: LinkData, receivers: bool = True) -> np.ndarray:
                np.log10(links.distance_m), links.elevation_deg, np.sin(azimuth), np.cos(azimuth),
                links.los, links.metres_inside,
                np.nan_to_num(links.diffraction_parameter, nan=NO_EDGE)]
-    if np.isfinite(links.boresight_deg).any():
+    if links.has_boresights:
         off = azimuth - np.radians(links.boresight_deg[links.device])
         columns += [np.nan_to_num(np.cos(off)), np.nan_to_num(np.abs(np.sin(off)))]
     labels = [(links.device, len(links.device_names))]

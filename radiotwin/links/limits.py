@@ -57,7 +57,7 @@ class LimitEstimate:
 
     @property
     def is_sure(self) -> bool:
-        """Whether a limit explains the blanks, and not only lost links."""
+        """Return whether a limit explains the blanks, and not only lost links."""
         return self.nats > MIN_NATS
 
 

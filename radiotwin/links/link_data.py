@@ -162,6 +162,11 @@ class LinkData:
         """(n,) `time_s` where flights can be compared by it [s]; NaN where clocks restart."""
         return np.full(len(self), np.nan) if self.time_restarts else self.time_s
 
+    @property
+    def has_boresights(self) -> bool:
+        """Whether the azimuth of any device's antenna is declared."""
+        return bool(np.isfinite(self.boresight_deg).any())
+
     @cached_property
     def offset_m(self) -> np.ndarray:
         """(n, 3) from the device to the receiver [m]."""

@@ -48,7 +48,7 @@ class EffectRecord(_Strict):
 
 
 class UnheardRecord(_Strict):
-    """What is known of devices without a reading."""
+    """Mean and uncertainty of devices without a reading."""
 
     devices: Annotated[list[Annotated[int, Field(ge=0)]], Field(min_length=1)]
     mean_db: _Decibels
