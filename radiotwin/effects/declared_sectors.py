@@ -1,22 +1,25 @@
 """Sector antennas of which only the direction is known: a planner's table has it, not the pattern.
 
 All declared devices have one pattern (3GPP TR 38.901 V17, Table 7.3-1, as in `sector_antenna`),
-each turned to its own azimuth, and one maximum gain, from which each device's may differ a little.
-All azimuths may be off by one small angle (a compass, another north); by a large one the table is
-wrong. So it holds for a sector that nobody has measured, too, which a pattern learnt for each
-device by itself does not.
+each turned to its own azimuth, and levels that have much in common (`sector_levels`). All azimuths
+may be off by one small angle (a compass, another north); by a large one the table is wrong. So it
+holds for a sector that nobody has measured, too, which a pattern learnt for each device by itself
+does not.
 """
 
 from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
+from pydantic import Field
 from typing_extensions import override
 
 from radiotwin.effects.antenna_params import allowed_of
 from radiotwin.effects.arrays import subsample
 from radiotwin.effects.base import Term
 from radiotwin.effects.params import (
+    Decibels,
+    DeviceIndex,
     Estimate,
     Parameter,
     Variation,
@@ -36,12 +39,19 @@ from radiotwin.effects.sector_antenna import (
     SectorAntenna,
     SectorPattern,
 )
+from radiotwin.effects.sector_levels import (
+    DEVICE_SD_DB,
+    GROUP_SD_DB,
+    level_groups,
+    membership,
+    unheard_sd_db,
+)
 from radiotwin.links import LinkData
+from radiotwin.links.sites import SAME_SITE_M
 
 MIN_DEVICES = 2  # of declared azimuth; of one, the pattern is that of `SectorAntenna`
 MAX_TURN_DEG = 20.0  # by which compasses, maps and declination are off; more is a wrong table
 TURNS_DEG = (0.0, -45.0, 45.0, -90.0, 90.0, -135.0, 135.0, 180.0)  # that are tried first
-DEVICE_SD_DB = 3.0  # between the maximum gains of devices: powers and cables differ
 
 
 class DeclaredSectors(SectorAntenna):
@@ -64,6 +74,10 @@ class DeclaredSectors(SectorAntenna):
         azimuth_offset_deg: float = quantity(
             0.0, unit="deg", low=-180.0, high=180.0, step=5.0, prior_sd=5.0,
             description="By which all declared azimuths are off, clockwise.")
+        groups: list[list[DeviceIndex]] = Field(
+            [], description="Devices whose levels have more in common: of a mast, of a direction.")
+        unheard_sd_db: dict[DeviceIndex, Decibels] = Field(
+            {}, description="How uncertain the level of each device without a reading is.")
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
@@ -79,8 +93,12 @@ class DeclaredSectors(SectorAntenna):
         nats, shape, offset_deg = _best_shape(view, declared, self.straight)
         if nats <= MIN_NATS:
             return []
+        groups = [[declared[row] for row in group] for group in level_groups(
+            view.links.device_m[declared], view.links.boresight_deg[declared], SAME_SITE_M)]
+        unheard = unheard_sd_db(declared, groups, set(view.links.device.tolist()), LEVEL_SD_DB)
         return [self.Params(devices=_turned(view.links, declared, shape, offset_deg),
-                            straight=self.straight, azimuth_offset_deg=offset_deg)]
+                            straight=self.straight, azimuth_offset_deg=offset_deg, groups=groups,
+                            unheard_sd_db=unheard)]
 
     @override
     def implausible(self, params: Any, coefficients: np.ndarray) -> str | None:
@@ -90,12 +108,16 @@ class DeclaredSectors(SectorAntenna):
                 "azimuth_deg counts clockwise from north")
 
     @override
-    def term(self, links: LinkData, params: SectorAntenna.Params, level_at: LevelAt) -> Term:
+    def term(self, links: LinkData, params: Any, level_at: LevelAt) -> Term:
         own = super().term(links, params, level_at)
-        # Of a device without a reading only the common level is known.
-        columns = np.column_stack([own.columns.sum(axis=1), own.columns])
-        return Term(own.offset_db, columns,
-                    np.r_[LEVEL_SD_DB, np.full(len(params.devices), DEVICE_SD_DB)])
+        shared = _shared(params)
+        unheard_sd_db = np.zeros(len(links))
+        for device, sd_db in params.unheard_sd_db.items():
+            unheard_sd_db[links.device == device] = sd_db
+        return Term(own.offset_db, own.columns @ np.column_stack([shared, np.eye(len(shared))]),
+                    np.r_[LEVEL_SD_DB, np.full(len(params.groups), GROUP_SD_DB),
+                          np.full(len(params.devices), DEVICE_SD_DB)],
+                    random_effect_sd_db=unheard_sd_db)
 
     @override
     def variation(self, params: Any) -> Variation:
@@ -117,7 +139,7 @@ class DeclaredSectors(SectorAntenna):
         return Variation(values, steps, low, high, changed)
 
     @override
-    def parameters(self, links: LinkData, params: SectorAntenna.Params,
+    def parameters(self, links: LinkData, params: Any,
                    estimate: Estimate) -> dict[str, Parameter]:
         values = self.variation(params).values
         reported = {name: Parameter.normal(value, sd, field["unit"], allowed_of(name, field))
@@ -125,9 +147,14 @@ class DeclaredSectors(SectorAntenna):
                                                         estimate.params_sd, strict=True)}
         if links.city is None or params.straight:
             reported.pop("scattered_db")
-        for number, device in enumerate(params.devices, start=1):  # the common one is the channel's
+        # The common one is the channel's.
+        shares = np.column_stack([_shared(params)[:, 1:], np.eye(len(params.devices))])
+        level_db = shares @ estimate.coefficients[1:]
+        variance = np.einsum("ij,jk,ik->i", shares, estimate.covariance[1:, 1:], shares)
+        for device, value_db, sd_db in zip(params.devices, level_db, np.sqrt(variance),
+                                           strict=True):
             reported[f"gain_db[{links.device_names[device]}]"] = Parameter.normal(
-                estimate.coefficients[number], estimate.coefficients_sd[number], "dB")
+                float(value_db), float(sd_db), "dB")
         return reported
 
 
@@ -140,6 +167,12 @@ class DeclaredSectorsOnPaths(DeclaredSectors):
     @override
     def unavailable(self, links: LinkData) -> str | None:
         return "there is no 3D map" if links.city is None else super().unavailable(links)
+
+
+def _shared(params: Any) -> np.ndarray:
+    """Return which level each device shares with others, all or a group, (k, 1 + groups)."""
+    devices = list(params.devices)
+    return np.column_stack([np.ones(len(devices)), membership(devices, params.groups)])
 
 
 def _numbers() -> dict[str, dict]:
