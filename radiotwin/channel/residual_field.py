@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -130,18 +131,31 @@ class ResidualField:
             (n,) mean and (n,) standard deviation: 0 and 1 far from points and in unknown series.
         """
         mean, sd = np.zeros(len(series)), np.ones(len(series))
+        for number, rows, cross in self._crossing(series, position_m, kind):
+            factor, weights = self._solved[number]
+            mean[rows] = weights @ cross
+            whitened = solve_triangular(factor, cross, lower=True, overwrite_b=True)
+            sd[rows] = np.sqrt(np.maximum(1.0 - np.square(whitened).sum(axis=0), 0.0))
+        return mean, sd
+
+    def mean(self, series: np.ndarray, position_m: np.ndarray,
+             kind: np.ndarray | None = None) -> np.ndarray:
+        """Return the mean that `predict` returns, of the same arguments, in less time."""
+        mean = np.zeros(len(series))
+        for number, rows, cross in self._crossing(series, position_m, kind):
+            mean[rows] = self._solved[number][1] @ cross
+        return mean
+
+    def _crossing(self, series: np.ndarray, position_m: np.ndarray, kind: np.ndarray | None,
+                  ) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+        """Give a series, some rows of it, and how its points correlate with them; in batches."""
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
         for number, field in self.fields.items():
-            factor, weights = self._solved[number]
             mine = np.flatnonzero(series == number)
             for start in range(0, len(mine), BATCH):
                 rows = mine[start : start + BATCH]
-                cross = self._correlation(cdist(field.position_m, position_m[rows]), field.kind,
-                                          kind[rows])
-                mean[rows] = weights @ cross
-                whitened = solve_triangular(factor, cross, lower=True, overwrite_b=True)
-                sd[rows] = np.sqrt(np.maximum(1.0 - np.square(whitened).sum(axis=0), 0.0))
-        return mean, sd
+                yield number, rows, self._correlation(cdist(field.position_m, position_m[rows]),
+                                                      field.kind, kind[rows])
 
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Return arrays by name, and settings that JSON can hold, for `from_state`."""

@@ -47,7 +47,6 @@ from radiotwin.effects.sector_levels import (
     unheard_sd_db,
 )
 from radiotwin.links import LinkData
-from radiotwin.links.sites import SAME_SITE_M
 
 MIN_DEVICES = 2  # of declared azimuth; of one, the pattern is that of `SectorAntenna`
 MAX_TURN_DEG = 20.0  # by which compasses, maps and declination are off; more is a wrong table
@@ -93,8 +92,7 @@ class DeclaredSectors(SectorAntenna):
         nats, shape, offset_deg = _best_shape(view, declared, self.straight)
         if nats <= MIN_NATS:
             return []
-        groups = [[declared[row] for row in group] for group in level_groups(
-            view.links.device_m[declared], view.links.boresight_deg[declared], SAME_SITE_M)]
+        groups = level_groups(view.links, declared)
         unheard = unheard_sd_db(declared, groups, set(view.links.device.tolist()), LEVEL_SD_DB)
         return [self.Params(devices=_turned(view.links, declared, shape, offset_deg),
                             straight=self.straight, azimuth_offset_deg=offset_deg, groups=groups,

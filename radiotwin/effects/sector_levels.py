@@ -8,27 +8,21 @@ has measured, and how surely.
 
 import numpy as np
 
-SAME_DIRECTION_DEG = 5.0  # azimuths within it are of one antenna, or of two side by side
+from radiotwin.links import LinkData
+from radiotwin.links.sites import antenna_of, site_of
+
 GROUP_SD_DB = 3.0  # between masts, and between directions of a mast
 DEVICE_SD_DB = 3.0  # between carriers of an antenna: powers and cables differ
 
 
-def level_groups(device_m: np.ndarray, azimuth_deg: np.ndarray, same_m: float) -> list[list[int]]:
-    """Return the devices of each mast and of each direction of a mast, by their rows.
+def level_groups(links: LinkData, devices: list[int]) -> list[list[int]]:
+    """Return those of some devices that are on one mast, and that look one way from it.
 
-    Args:
-        device_m: (k, 3) positions [m].
-        azimuth_deg: (k,) of the antennas [deg].
-        same_m: distance within which devices are on one mast [m].
-
-    Returns:
-        groups of at least two devices, and fewer than all of them.
+    Groups are of at least two devices, and of fewer than all.
     """
-    same_mast = np.linalg.norm(device_m[:, None] - device_m, axis=2) <= same_m
-    apart_deg = np.abs((azimuth_deg[:, None] - azimuth_deg + 180) % 360 - 180)
-    found = {tuple(np.flatnonzero(row).tolist())
-             for same in (same_mast, same_mast & (apart_deg <= SAME_DIRECTION_DEG)) for row in same}
-    return [list(group) for group in sorted(found) if 1 < len(group) < len(device_m)]
+    found = {tuple(other for other in group if other in devices) for device in devices
+             for group in (site_of(links, device), antenna_of(links, device))}
+    return [list(group) for group in sorted(found) if 1 < len(group) < len(devices)]
 
 
 def membership(devices: list[int], groups: list[list[int]]) -> np.ndarray:

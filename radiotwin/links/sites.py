@@ -1,10 +1,12 @@
-"""Masts: devices that share one site."""
+"""Masts: devices that share one site, and those of them that look the same way."""
 
 import numpy as np
 
 from radiotwin.links.link_data import LinkData
 
 SAME_SITE_M = 1.0  # apart at most: sectors of one mast; declared positions are good to that
+SAME_DIRECTION_DEG = 5.0  # azimuths within it are of one antenna, or of two side by side
+MAX_RELATIVES = 4  # more tell nothing new
 
 
 def site_of(links: LinkData, device: int) -> list[int]:
@@ -17,3 +19,26 @@ def site_of(links: LinkData, device: int) -> list[int]:
     apart_m = np.linalg.norm(links.device_m - links.device_m[device], axis=1)
     return [int(other) for other in np.flatnonzero(apart_m <= SAME_SITE_M)
             if other == device or other in links.anchors]
+
+
+def antenna_of(links: LinkData, device: int) -> list[int]:
+    """Return the device and those of its mast whose declared azimuth is the same, in order.
+
+    They are carriers through one antenna, or through antennas side by side. Arguments as of
+    `site_of`.
+    """
+    apart_deg = np.abs((links.boresight_deg - links.boresight_deg[device] + 180) % 360 - 180)
+    return [other for other in site_of(links, device)
+            if other == device or apart_deg[other] <= SAME_DIRECTION_DEG]
+
+
+def relatives_of(links: LinkData, device: int) -> list[int]:
+    """Return whose signals reach a receiver on nearly the same ways as those of a device.
+
+    The others of its antenna, or where there are none of its mast; at most `MAX_RELATIVES`.
+    Arguments as of `site_of`.
+    """
+    for group in (antenna_of(links, device), site_of(links, device)):
+        if len(group) > 1:
+            return [other for other in group if other != device][:MAX_RELATIVES]
+    return []

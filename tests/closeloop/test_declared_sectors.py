@@ -121,9 +121,12 @@ def test_a_sector_that_is_only_planned_is_predicted_by_the_stored_twin(tmp_path)
     assert loop.after.whole.effects[0].effect.is_declared
     corrected_twin(loop, None).save(tmp_path / "twin")
     later = prepare_links(everything.select(planned), None)
-    error_db = later.level_db - rt.Twin.load(tmp_path / "twin").predict(later).mean_db
+    expected = rt.Twin.load(tmp_path / "twin").predict(later)
+    error_db = later.level_db - expected.mean_db
     assert len(error_db) == 200
     assert np.sqrt(np.mean(error_db**2)) < 4.5  # the noise is 3 dB
+    assert np.mean(np.abs(error_db) < 1.645 * expected.sd_db) > 0.85
+    assert expected.sd_db.mean() > 4.0  # its level is another than the others'
 
 
 def test_of_a_sector_that_nothing_tells_the_twin_knows_that_it_knows_little(tmp_path):
