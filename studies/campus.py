@@ -119,6 +119,7 @@ def find_on_campus(seed: int, settings: dict) -> dict:
         "named_db": explained(loop).rmse_db(), "named_bias_db": _bias_db(loop),
         "after_db": error["after"]["rmse_db"], "after_bias_db": error["after"]["bias_db"],
         "combined_db": error["combined"]["rmse_db"], "coverage": coverage(loop),
+        "combined_coverage": error["combined"]["in_90_percent_interval"],
         "baselines_db": {name: scores["rmse_db"] for name, scores in report["baselines"].items()},
         "probabilities": report["posterior"], "notes": report["notes"],
         "effects": [{"name": effect["name"], "parameters": effect["parameters"]}
@@ -186,10 +187,10 @@ def campus_table(rows: pd.DataFrame) -> str:
     named = [name for name in campus_cases(0) if name in by_name.index]
     parts = [markdown(
         ["held out", "base", "base alone [dB]", "named effects", "mean error", "with the rest",
-         "combined", "best of the others", "in 90 %", "named"],
+         "combined", "best of the others", "in 90 %", "combined in 90 %", "named"],
         [[SPLITS[split], f"`{base}`", *(number(row[key], 2) for key in (
             "before_db", "named_db", "named_bias_db", "after_db", "combined_db")),
-          _best(row["baselines_db"]), f"{100 * row['coverage']:.0f} %", counted(row["named"])]
+          _best(row["baselines_db"]), *_in_90(row), counted(row["named"])]
          for name in named if name not in CONTROLS | LACKING | TOLD
          for split, _, base in [name.partition("-")] for row in [by_name.loc[name]]],
         "A campus with its map", ": RMSE of held-out readings")]
@@ -205,10 +206,11 @@ def campus_table(rows: pd.DataFrame) -> str:
     if told:
         parts.append(markdown(
             ["held out", "base with them [dB]", "named effects", "mean error", "with the rest",
-             "combined", "best of the others", "in 90 %", "named", "all azimuths turned by [°]"],
+             "combined", "best of the others", "in 90 %", "combined in 90 %", "named",
+             "all azimuths turned by [°]"],
             [[TOLD[name], *(number(row[key], 2) for key in (
                 "before_db", "named_db", "named_bias_db", "after_db", "combined_db")),
-              _best(row["baselines_db"]), f"{100 * row['coverage']:.0f} %", counted(row["named"]),
+              _best(row["baselines_db"]), *_in_90(row), counted(row["named"]),
               number(_turn_deg(row["effects"]), 1)] for name, row in told],
             "Azimuths declared", ", base `twin`: RMSE of held-out readings"))
     for title, words in (("Controls", CONTROLS), ("Less to learn from", LACKING)):
@@ -224,6 +226,12 @@ def campus_table(rows: pd.DataFrame) -> str:
              for name in named if name in words for row in [by_name.loc[name]]],
             title, ", base `twin`; 60 m blocks held out, or what the row says"))
     return "\n\n".join(parts)
+
+
+def _in_90(row: pd.Series) -> list[str]:
+    """Return the shares of held-out readings in 90 % intervals, with the rest and combined."""
+    return [f"{100 * share:.0f} %" if np.isfinite(share) else "–"
+            for share in (row["coverage"], row.get("combined_coverage", np.nan))]
 
 
 def _turn_deg(effects: list[dict]) -> float:

@@ -5,6 +5,7 @@ from them alone, with blocks of them held out, and so are the other models.
 """
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -24,6 +25,7 @@ from studies.runner import Study
 from studies.tables import markdown, number
 
 READINGS = (250, 500, 1000, 2000, 4000)
+WAYS = {"scattered": "scattered over the campus", "drives": "of some squares of 60 m"}
 SQUARE_M = 60.0  # side of the squares that few drives are drawn by
 QUADRANTS = ("south-west", "north-west", "south-east", "north-east")
 TWIN, NAMED = "twin", "named effects alone"
@@ -128,14 +130,19 @@ def _percent(share: float) -> str:
 
 
 def readings_cases(seed: int) -> dict[str, dict]:
-    """Return numbers of readings, scattered over the campus, and of few drives."""
-    return {f"{way}-{count}": {"way": way, "count": count}
-            for count in READINGS for way in ("scattered", "drives")}
+    """Return numbers of readings, scattered over the campus, and of few drives.
+
+    Of undeclared antennas, and with their azimuths declared.
+    """
+    return {f"{told}{way}-{count}": {"way": way, "count": count, "told": bool(told)}
+            for told in ("", "told-") for count in READINGS for way in WAYS}
 
 
 def learn_from_few(seed: int, settings: dict) -> dict:
     """Learn from some readings, and predict all others."""
     with campus() as (measured, scene):
+        if settings["told"]:
+            measured = with_azimuths(measured)
         chosen = _drawn(measured, settings["way"], settings["count"], np.random.default_rng(seed))
         return learn_from(measured, scene, np.isin(np.arange(len(measured.table)), chosen), seed)
 
@@ -155,35 +162,38 @@ def readings_table(rows: pd.DataFrame) -> str:
     """Return errors by number of readings."""
     models = list(rows.iloc[0]["rmse_db"])
     parts = []
-    for way, title in (("scattered", "Readings scattered over the campus"),
-                       ("drives", "Readings of some squares of 60 m")):
-        own = rows[rows["name"].str.startswith(way)]
+    for told, way in product(("", "told-"), WAYS):
+        own = rows[rows["name"].str.startswith(told + way)]
+        if own.empty:
+            continue
         grouped = own.groupby(own["name"].str.rpartition("-")[2].astype(int))
         parts.append(markdown(
             ["readings", *(f"`{name}`" for name in models)],
             [[f"{count:,}", *(number(np.mean([each[name] for each in group["rmse_db"]]), 2)
                               for name in models)] for count, group in grouped],
-            title, ": RMSE of all others [dB]"))
+            f"Readings {WAYS[way]}" + ", azimuths declared" * bool(told),
+            ": RMSE of all others [dB]"))
     return "\n\n".join(parts)
 
 
 def readings_figure(rows: pd.DataFrame) -> dict[str, Figure]:
     """Return the learning curves."""
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
-    for axes, way in zip(figure.subplots(1, 2, sharey=True), ("scattered", "drives")):
-        own = rows[rows["name"].str.startswith(way)]
+    figure = Figure(figsize=(9, 6.6), layout="constrained")
+    kinds = product(("", "told-"), WAYS)
+    for axes, (told, way) in zip(figure.subplots(2, 2, sharex=True, sharey=True).flat, kinds):
+        own = rows[rows["name"].str.startswith(told + way)]
         for name in rows.iloc[0]["rmse_db"]:
             error_db = own.groupby(own["name"].str.rpartition("-")[2].astype(int))["rmse_db"].apply(
                 lambda group, name=name: np.mean([each[name] for each in group]))
             axes.plot(error_db.index, error_db, marker="o", label=name.replace("_", " "),
                       linewidth=2.5 if name == "twin" else 1.2)
-        axes.set(xscale="log", xlabel="readings learnt from", title={
-            "scattered": "scattered over the campus", "drives": "all of some 60 m squares"}[way])
+        axes.set(xscale="log", title=WAYS[way] + ", azimuths declared" * bool(told))
         axes.set_xticks(READINGS, [f"{count:,}" for count in READINGS])
         axes.minorticks_off()
         axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    figure.axes[0].set_ylabel("RMSE of all other readings [dB]")
+    figure.supxlabel("readings learnt from")
+    figure.supylabel("RMSE of all other readings [dB]")
     return {"readings": figure}
 
 

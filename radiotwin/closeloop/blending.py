@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import nnls
+from scipy.stats import t as student
 
 from radiotwin.closeloop.baselines import LAWS, Part, fitted_law
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.closeloop.predictor import HALF_M, CombinedPrediction, residual_forests
-from radiotwin.effects.blend import FORESTS, NAMED, REST, Blend
+from radiotwin.effects.blend import FORESTS, NAMED, REST, Blend, sd_factor
 from radiotwin.effects.correlated_shadowing import MAX_Z, receivers_move
 
 MIN_WEIGHT = 0.02  # a member that has less, near and far, is left out
@@ -28,9 +29,8 @@ def make_blend(model: CrossValidatedModel, prediction: CombinedPrediction,
         seed: of the trees.
     """
     whole, fit = model.whole, model.fits[0]
-    weights = {name: pair for name, pair in zip(prediction.names, prediction.weights.T, strict=True)
-               if pair.max() >= MIN_WEIGHT}
-    if set(weights) == {NAMED} or not receivers_move(whole.links):
+    weights = _members(prediction)
+    if _is_physics_alone(model, prediction):
         return None
     total = np.sum(list(weights.values()), axis=0)
     forests = {}
@@ -42,7 +42,7 @@ def make_blend(model: CrossValidatedModel, prediction: CombinedPrediction,
                               whole.links.device])[whole.train]
     places = np.unique(places, axis=0)
     declared = np.flatnonzero(np.isfinite(whole.links.boresight_deg))
-    near, far = _sd_ratio(model, prediction)
+    near, far = _sd_ratio(model, prediction, np.ones(len(whole.links), dtype=bool))
     return Blend({name: (float(pair[0]), float(pair[1])) for name, pair in
                   ((name, pair / total) for name, pair in weights.items())},
                  HALF_M, (near, far), places[:, :3], places[:, 3].astype(int),
@@ -56,11 +56,48 @@ def needs_rest(prediction: CombinedPrediction) -> bool:
         prediction.weights[:, prediction.names.index(REST)].max() >= MIN_WEIGHT)
 
 
-def _sd_ratio(model: CrossValidatedModel, prediction: CombinedPrediction) -> tuple[float, float]:
-    """Return the error's sd over that of named effects, near and far, from held-out links."""
-    scale_db = model.held_out(lambda fold, fit: fold.predict(fit).scale_db)
-    z = (model.links.level_db - prediction.mean_db) / scale_db
+def held_out_coverage(model: CrossValidatedModel, prediction: CombinedPrediction) -> float:
+    """Return the share of held-out readings in the central 90 % intervals of a twin's prediction.
+
+    How wide those of a fold are is learnt from the other folds. Arguments as of `make_blend`.
+
+    Returns:
+        in 0..1; NaN where no reading is predicted.
+    """
+    dof = model.whole.dof
+    half = np.full(len(model.links), student.ppf(0.95, dof))
+    if _is_physics_alone(model, prediction):
+        mean_db, scale_db = model.held_out_reading
+    else:
+        mean_db, scale_db = prediction.mean_db, _scale_db(model)
+        for number in range(len(model.folds)):
+            out = model.index == number
+            half[out] *= sd_factor(prediction.share[out], _sd_ratio(model, prediction, ~out))
+    z = np.abs(model.links.level_db - mean_db) / scale_db
     known = np.isfinite(z)
+    return float((z[known] <= half[known]).mean()) if known.any() else np.nan
+
+
+def _members(prediction: CombinedPrediction) -> dict[str, np.ndarray]:
+    """Return the weights (2,) of the members that count, by name."""
+    return {name: pair for name, pair in zip(prediction.names, prediction.weights.T, strict=True)
+            if pair.max() >= MIN_WEIGHT}
+
+
+def _is_physics_alone(model: CrossValidatedModel, prediction: CombinedPrediction) -> bool:
+    return set(_members(prediction)) == {NAMED} or not receivers_move(model.links)
+
+
+def _scale_db(model: CrossValidatedModel) -> np.ndarray:
+    """Return the error scale (n,) of named effects on held-out links [dB]."""
+    return model.held_out(lambda fold, fit: fold.predict(fit).scale_db)
+
+
+def _sd_ratio(model: CrossValidatedModel, prediction: CombinedPrediction,
+              rows: np.ndarray) -> tuple[float, float]:
+    """Return the error's sd over that of named effects, near and far, from some held-out links."""
+    z = (model.links.level_db - prediction.mean_db) / _scale_db(model)
+    known = np.isfinite(z) & rows
     if not known.any():
         return 1.0, 1.0
     share = prediction.share[known]

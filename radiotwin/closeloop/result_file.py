@@ -10,6 +10,7 @@ import numpy as np
 
 from radiotwin import __version__
 from radiotwin.closeloop.advice import compare_with_baselines
+from radiotwin.closeloop.blending import held_out_coverage
 from radiotwin.closeloop.cross_validation import CrossValidatedModel, without_quality
 from radiotwin.closeloop.posterior import Step
 from radiotwin.closeloop.result_schema import ReportRecord
@@ -61,7 +62,8 @@ def make_report(loop: Loop) -> dict[str, Any]:
                                        "after": scores(loop.after, rows)}
                                for label, rows in groups.items()}
     predicted = loop.prediction
-    error["combined"] = errors(links.level_db, predicted.mean_db)
+    error["combined"] = errors(links.level_db, predicted.mean_db) | {
+        "in_90_percent_interval": held_out_coverage(loop.explained, predicted)}
     baselines = {name: errors(links.level_db, mean_db)
                  for name, mean_db in predicted.baselines.items()}
     combination = [{"name": name, "weight_near": near, "weight_far": far} for name, near, far in
@@ -214,10 +216,12 @@ def _difference(found: ReceiverDifference, links: LinkData) -> dict[str, Any]:
 
 
 def _shadowing(score: CandidateScore, model: CrossValidatedModel, rank: int) -> dict[str, Any]:
-    field, relative_sd = model.shadowing[0].field, model.shadowing[0].relative_sd
-    sd_db = relative_sd * float(model.fits[0].scale_db.mean())
+    field, relatives = model.shadowing[0].field, model.shadowing[0].relatives
+    sd_db = model.shadowing[0].relative_sd * float(model.fits[0].scale_db.mean())
     numbers = {"length_m": (field.length_m, "m"), "share": (field.share, "of the variance"),
                "receiver_share": (field.kind_share, "of the variance"), "sigma_db": (sd_db, "dB")}
+    if relatives is not None:
+        numbers["relatives_share"] = relatives.passed_on, "of their residual"
     return {"name": score.name, "variant": "", "rank": rank, "params": {},
             "parameters": {name: {"value": value, "low": np.nan, "high": np.nan, "unit": unit}
                            for name, (value, unit) in numbers.items()},

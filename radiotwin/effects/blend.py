@@ -43,6 +43,12 @@ def far_share(away_m: np.ndarray, half_m: float) -> np.ndarray:
     return 1 - half_m / (away_m + half_m)
 
 
+def sd_factor(share: np.ndarray, sd_ratio: tuple[float, float]) -> np.ndarray:
+    """Return the ratio of standard deviations (n,) at `far_share` (n,), as of `Blend`."""
+    near, far = np.square(sd_ratio)
+    return np.sqrt((1 - share) * near + share * far)
+
+
 @dataclass(frozen=True, eq=False)
 class Blend:
     """Members beside named effects, and the weights of all; devices stand still, receivers move.
@@ -98,8 +104,7 @@ class Blend:
         names = list(self.weights)
         blended_db = combine(np.column_stack([members[name] for name in names]), share,
                              np.transpose([self.weights[name] for name in names]))
-        near, far = np.square(self.sd_ratio)
-        return blended_db, scale_db * np.sqrt((1 - share) * near + share * far)
+        return blended_db, scale_db * sd_factor(share, self.sd_ratio)
 
     def _declared(self, links: LinkData) -> LinkData:
         """Return links with the azimuths that were declared where this was fitted, no others."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from radiotwin.closeloop.bases import make_bases
-from radiotwin.closeloop.blending import make_blend
+from radiotwin.closeloop.blending import held_out_coverage, make_blend
 from radiotwin.closeloop.cross_validation import cross_validate, training_parts
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.closeloop.predictor import CombinedPrediction
@@ -85,3 +85,18 @@ def test_a_damaged_combination_is_refused(blended, change):
     change(given["fitted"]["blend"])
     with pytest.raises(BadInput, match="damaged"):
         Twin.decode(json.dumps(given), channel, "it")
+
+
+def test_intervals_hold_what_they_say_on_links_that_had_no_part_in_their_width(blended):
+    assert 0.84 < held_out_coverage(blended.model, blended.prediction) < 0.97
+    one = blended.model.index == 0
+    off_db = np.where(one, 40.0, 0.0)  # the flight that is off by 40 dB must not make its own intervals wide
+    off = replace(blended.prediction, mean_db=blended.prediction.mean_db + off_db)
+    assert held_out_coverage(blended.model, off) < 1 - 0.9 * one.mean()
+
+
+def test_where_named_effects_are_all_their_own_intervals_count(blended):
+    weights = np.zeros((2, 5))
+    weights[:, 0] = 1.0
+    alone = replace(blended.prediction, weights=weights, mean_db=blended.prediction.mean_db + 40.0)
+    assert 0.8 < held_out_coverage(blended.model, alone) < 1.0  # the other members' levels are not asked
