@@ -134,14 +134,16 @@ def readings_cases(seed: int) -> dict[str, dict]:
 
     Of undeclared antennas, and with their azimuths declared.
     """
-    return {f"{told}{way}-{count}": {"way": way, "count": count, "told": bool(told)}
-            for told in ("", "told-") for count in READINGS for way in WAYS}
+    undeclared = {f"{way}-{count}": {"way": way, "count": count}
+                  for count in READINGS for way in WAYS}
+    return undeclared | {f"told-{name}": settings | {"told": True}
+                         for name, settings in undeclared.items()}
 
 
 def learn_from_few(seed: int, settings: dict) -> dict:
     """Learn from some readings, and predict all others."""
     with campus() as (measured, scene):
-        if settings["told"]:
+        if settings.get("told"):
             measured = with_azimuths(measured)
         chosen = _drawn(measured, settings["way"], settings["count"], np.random.default_rng(seed))
         return learn_from(measured, scene, np.isin(np.arange(len(measured.table)), chosen), seed)
