@@ -87,9 +87,10 @@ def _figures_of(rows: list[Any]) -> dict[str, str]:
         "right first, of cases of the catalogue": _share(map(is_first, known)),
         f"… of those of {NOTICEABLE_DB:g} dB and more": _share(
             is_first(row) for row in known if row.size_db >= NOTICEABLE_DB),
-        f"… of those where being told the truth lowers the error by {100 - 100 * TELLING:.0f} % and more":
-            _share(is_first(row) for row in known
-                   if row.oracle_rmse_db <= TELLING * row.before["rmse_db"]),
+        "… of those where being told the truth lowers the error by "
+        f"{100 - 100 * TELLING:.0f} % and more": _share(
+            is_first(row) for row in known
+            if row.oracle_rmse_db <= TELLING * row.before["rmse_db"]),
         "right first, of cases with one of either kind": _share(map(is_first, mixed)),
         "false names a case of the catalogue": number(
             float(np.mean([len(false_names(row)) for row in known])) if known else None, 2),

@@ -95,18 +95,29 @@ def _scale_db(model: CrossValidatedModel) -> np.ndarray:
 
 def _sd_ratio(model: CrossValidatedModel, prediction: CombinedPrediction,
               rows: np.ndarray) -> tuple[float, float]:
-    """Return the error's sd over that of named effects, near and far, from some held-out links."""
+    """Return the error's sd over that of named effects, near and far.
+
+    The greater of two estimates each: from some held-out links, and from these and whole quadrants
+    that were held out. A map extrapolates, and few places do not tell what that costs.
+    """
     z = (model.links.level_db - prediction.mean_db) / _scale_db(model)
     known = np.isfinite(z) & rows
-    if not known.any():
+    here = np.column_stack([z, prediction.share])[known]
+    if not len(here):
         return 1.0, 1.0
-    share = prediction.share[known]
+    ratios = [_fitted_ratio(links, model.whole.dof)
+              for links in (here, np.vstack([here, prediction.away]))]
+    near, far = np.max(ratios, axis=0)
+    return float(near), float(far)
+
+
+def _fitted_ratio(links: np.ndarray, dof: float) -> np.ndarray:
+    """Return the sd ratio near and far (2,), from links (n, 2): error over scale, and far share."""
+    z, share = links.T
     columns = np.column_stack([1 - share, share])
-    dof = model.whole.dof
-    square = np.clip(z[known], -MAX_Z, MAX_Z) ** 2 * (dof - 2) / dof
+    square = np.clip(z, -MAX_Z, MAX_Z) ** 2 * (dof - 2) / dof
     # Where there is little far away, as near; where nearly nothing is, as much as is known.
     prior = 1e-2 * len(square) * np.eye(2)
     found, _ = nnls(np.vstack([columns, prior]), np.concatenate(
         [square, prior.sum(axis=1) * square.mean()]))
-    near, far = np.sqrt(np.maximum(found, MIN_SD_RATIO**2))
-    return float(near), float(far)
+    return np.sqrt(np.maximum(found, MIN_SD_RATIO**2))

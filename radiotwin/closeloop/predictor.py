@@ -61,6 +61,8 @@ class CombinedPrediction:
         members: (n, k) held-out prediction of each member [dB].
         share: (n,) how far a link is from the measurements that it was predicted by.
         baselines: (n,) held-out prediction of other models [dB], by name.
+        away: (r, 2) of links with a quadrant of the area held out: error over the scale of named
+            effects, and how far away they are; what extrapolation costs.
     """
 
     mean_db: np.ndarray
@@ -69,6 +71,7 @@ class CombinedPrediction:
     members: np.ndarray
     share: np.ndarray
     baselines: dict[str, np.ndarray] = field(default_factory=dict)
+    away: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +86,7 @@ class _Learnt:
     names: list[str]
 
     def held_out(self, group: np.ndarray, groups: list[int],
-                 seed: int) -> tuple[np.ndarray, np.ndarray]:
+                 seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Hold out groups of its training links, fit to the others, and predict.
 
         Of the physics the coefficients are fitted again, and of rest and kriging the values. What
@@ -96,7 +99,8 @@ class _Learnt:
             seed: of trees and samples.
 
         Returns:
-            (r, k) measured minus predicted by each member [dB], and (r,) far shares.
+            (r, k) measured minus predicted by each member [dB], (r,) far shares, and (r,) error
+            scales of named effects [dB].
         """
         rows = np.flatnonzero(self.model.train)
         if len(rows) > MAX_INNER_LINKS:
@@ -104,7 +108,7 @@ class _Learnt:
             rows = np.sort(rng.choice(rows, MAX_INNER_LINKS, replace=False))
         part = self.part.select(rows)
         whole = self.model.restrict(rows, self.model.effects)
-        errors, shares = [np.zeros((0, len(self.names)))], [np.zeros(0)]
+        errors, shares, scales = [np.zeros((0, len(self.names)))], [np.zeros(0)], [np.zeros(0)]
         for each in groups:
             out = group[rows] == each
             test = np.flatnonzero(out & np.isfinite(part.links.level_db))
@@ -116,7 +120,8 @@ class _Learnt:
             inner = _Learnt(model, fit, rest, self.kriging, part, self.names)
             errors.append(part.links.level_db[test, None] - inner.members_db(test, seed))
             shares.append(shares_of(part.links, ~out, test))
-        return np.concatenate(errors), np.concatenate(shares)
+            scales.append(model.predict(fit).scale_db[test])
+        return np.concatenate(errors), np.concatenate(shares), np.concatenate(scales)
 
     def members_db(self, test: np.ndarray, seed: int) -> np.ndarray:
         """Return what members (m, k) predict of rows (m,), by few trees and known correlations."""
@@ -161,12 +166,13 @@ def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: S
             *(baselines[name][test] for name in laws)])
         others = [(number + step) % count for step in range(1, count)][:INNER_FOLDS]
         mean_db[test] = combine(members[test], share[test], _weights(
-            *learnt.held_out(model.index, others, seed), names))
+            *learnt.held_out(model.index, others, seed)[:2], names))
     error_db = links.level_db[:, None] - members
-    far = learnt.held_out(_quadrant(links), [0, 1, 2, 3], seed) if learnt else (
-        error_db[:0], share[:0])
-    weights = _weights(np.vstack([error_db, far[0]]), np.concatenate([share, far[1]]), names)
-    return CombinedPrediction(mean_db, names, weights, members, share, baselines)
+    far_db, far_share, far_scale_db = learnt.held_out(
+        _quadrant(links), [0, 1, 2, 3], seed) if learnt else (error_db[:0], share[:0], share[:0])
+    weights = _weights(np.vstack([error_db, far_db]), np.concatenate([share, far_share]), names)
+    away = np.column_stack([combine(far_db, far_share, weights) / far_scale_db, far_share])
+    return CombinedPrediction(mean_db, names, weights, members, share, baselines, away)
 
 
 def _quadrant(links: LinkData) -> np.ndarray:
