@@ -170,9 +170,11 @@ def readings_table(rows: pd.DataFrame) -> str:
             continue
         grouped = own.groupby(own["name"].str.rpartition("-")[2].astype(int))
         parts.append(markdown(
-            ["readings", *(f"`{name}`" for name in models)],
+            ["readings", *(f"`{name}`" for name in models), "twin's in 90 %"],
             [[f"{count:,}", *(number(np.mean([each[name] for each in group["rmse_db"]]), 2)
-                              for name in models)] for count, group in grouped],
+                              for name in models),
+              _percent(group["coverage"].mean() if "coverage" in group else np.nan)]
+             for count, group in grouped],
             f"Readings {WAYS[way]}" + ", azimuths declared" * bool(told),
             ": RMSE of all others [dB]"))
     return "\n\n".join(parts)
@@ -184,6 +186,8 @@ def readings_figure(rows: pd.DataFrame) -> dict[str, Figure]:
     kinds = product(("", "told-"), WAYS)
     for axes, (told, way) in zip(figure.subplots(2, 2, sharex=True, sharey=True).flat, kinds):
         own = rows[rows["name"].str.startswith(told + way)]
+        if own.empty:
+            continue
         for name in rows.iloc[0]["rmse_db"]:
             error_db = own.groupby(own["name"].str.rpartition("-")[2].astype(int))["rmse_db"].apply(
                 lambda group, name=name: np.mean([each[name] for each in group]))
