@@ -182,7 +182,7 @@ def readings_table(rows: pd.DataFrame) -> str:
 
 def readings_figure(rows: pd.DataFrame) -> dict[str, Figure]:
     """Return the learning curves."""
-    figure = Figure(figsize=(9, 6.6), layout="constrained")
+    figure = Figure(figsize=(10.5, 6.4), layout="constrained")
     kinds = product(("", "told-"), WAYS)
     for axes, (told, way) in zip(figure.subplots(2, 2, sharex=True, sharey=True).flat, kinds):
         own = rows[rows["name"].str.startswith(told + way)]
@@ -193,11 +193,13 @@ def readings_figure(rows: pd.DataFrame) -> dict[str, Figure]:
                 lambda group, name=name: np.mean([each[name] for each in group]))
             axes.plot(error_db.index, error_db, marker="o", label=name.replace("_", " "),
                       linewidth=2.5 if name == "twin" else 1.2)
-        axes.set(xscale="log", title=WAYS[way] + ", azimuths declared" * bool(told))
+        axes.set_title(WAYS[way] + ", azimuths declared" * bool(told), fontsize=10)
+        axes.set(xscale="log")
         axes.set_xticks(READINGS, [f"{count:,}" for count in READINGS])
         axes.minorticks_off()
         axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper",
+                  fontsize=8)
     figure.supxlabel("readings learnt from")
     figure.supylabel("RMSE of all other readings [dB]")
     return {"readings": figure}
