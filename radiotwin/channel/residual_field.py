@@ -62,7 +62,9 @@ class ResidualField:
         fields: the points of each series, by its index.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, max_pairs: float = MAX_PAIRS) -> None:
+        """Make an empty field; of more points squared, over all series, neighbours are merged."""
+        self.max_pairs = max_pairs
         self.share, self.kind_share, self.length_m = 0.5, 0.0, 50.0
         self.fields: dict[int, _Field] = {}
 
@@ -96,7 +98,7 @@ class ResidualField:
                     kind: np.ndarray | None = None) -> Self:
         """Return a field of the same correlation with other points, as of `fit`."""
         kind = np.zeros(len(series), dtype=int) if kind is None else kind
-        field = type(self)()
+        field = type(self)(self.max_pairs)
         field.share, field.kind_share, field.length_m = self.share, self.kind_share, self.length_m
         field._store(series, position_m, residual, kind)
         field._factor()
@@ -106,7 +108,7 @@ class ResidualField:
                kind: np.ndarray) -> dict[int, np.ndarray]:
         """Store the points, as of `fit`; return the rows of each series."""
         numbers = np.unique(series)
-        limit = int(np.clip(np.sqrt(MAX_PAIRS / max(len(numbers), 1)), MIN_POINTS, MAX_POINTS))
+        limit = int(np.clip(np.sqrt(self.max_pairs / max(len(numbers), 1)), MIN_POINTS, MAX_POINTS))
         order = np.argsort(series, kind="stable")
         rows_of_series = dict(zip(map(int, numbers), np.split(
             order, np.searchsorted(series[order], numbers[1:])), strict=True))

@@ -8,8 +8,8 @@ from scipy.stats import t as student
 
 from radiotwin.closeloop.baselines import LAWS, Part, fitted_law
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
-from radiotwin.closeloop.predictor import HALF_M, CombinedPrediction, residual_forests
-from radiotwin.effects.blend import FORESTS, NAMED, REST, Blend, sd_factor
+from radiotwin.closeloop.predictor import HALF_M, CombinedPrediction, grown_forests
+from radiotwin.effects.blend import FORESTS, NAMED, REST, TREES_ALONE, Blend, sd_factor
 from radiotwin.effects.correlated_shadowing import MAX_Z, receivers_move
 
 MIN_WEIGHT = 0.02  # a member that has less, near and far, is left out
@@ -34,15 +34,15 @@ def make_blend(model: CrossValidatedModel, prediction: CombinedPrediction,
         return None
     total = np.sum(list(weights.values()), axis=0)
     forests = {}
-    if set(weights) & set(FORESTS):
-        forests = residual_forests(whole, fit, Part(whole.links), seed)
+    if set(weights) & set(FORESTS + TREES_ALONE):
+        forests = grown_forests(whole, fit, Part(whole.links), seed)
     laws = {kind.name: fitted_law(kind, whole.links, whole.train)
             for kind in LAWS if kind.name in weights}
     places = np.column_stack([np.round(whole.links.receiver_m / SAME_M) * SAME_M,
                               whole.links.device])[whole.train]
     places = np.unique(places, axis=0)
     declared = np.flatnonzero(np.isfinite(whole.links.boresight_deg))
-    near, far = _sd_ratio(model, prediction, np.ones(len(whole.links), dtype=bool))
+    near, far = _sd_ratio(model, prediction)
     return Blend({name: (float(pair[0]), float(pair[1])) for name, pair in
                   ((name, pair / total) for name, pair in weights.items())},
                  HALF_M, (near, far), places[:, :3], places[:, 3].astype(int),
@@ -64,18 +64,19 @@ def held_out_coverage(model: CrossValidatedModel, prediction: CombinedPrediction
     Returns:
         in 0..1; NaN where no reading is predicted.
     """
-    dof = model.whole.dof
-    half = np.full(len(model.links), student.ppf(0.95, dof))
+    half = student.ppf(0.95, model.whole.dof)
     if _is_physics_alone(model, prediction):
         mean_db, scale_db = model.held_out_reading
     else:
-        mean_db, scale_db = prediction.mean_db, _scale_db(model)
+        mean_db, (scale_db, unheard_db) = prediction.mean_db, model.held_out_scales
+        factor = np.ones(len(scale_db))
         for number in range(len(model.folds)):
             out = model.index == number
-            half[out] *= sd_factor(prediction.share[out], _sd_ratio(model, prediction, ~out))
+            factor[out] = sd_factor(prediction.share[out], _sd_ratio(model, prediction, number))
+        scale_db = np.hypot(scale_db * factor, unheard_db)
     z = np.abs(model.links.level_db - mean_db) / scale_db
     known = np.isfinite(z)
-    return float((z[known] <= half[known]).mean()) if known.any() else np.nan
+    return float((z[known] <= half).mean()) if known.any() else np.nan
 
 
 def _members(prediction: CombinedPrediction) -> dict[str, np.ndarray]:
@@ -88,25 +89,27 @@ def _is_physics_alone(model: CrossValidatedModel, prediction: CombinedPrediction
     return set(_members(prediction)) == {NAMED} or not receivers_move(model.links)
 
 
-def _scale_db(model: CrossValidatedModel) -> np.ndarray:
-    """Return the error scale (n,) of named effects on held-out links [dB]."""
-    return model.held_out(lambda fold, fit: fold.predict(fit).scale_db)
-
-
 def _sd_ratio(model: CrossValidatedModel, prediction: CombinedPrediction,
-              rows: np.ndarray) -> tuple[float, float]:
+              but: int = -1) -> tuple[float, float]:
     """Return the error's sd over that of named effects, near and far.
 
-    The greater of two estimates each: from some held-out links, and from these and whole quadrants
+    The greater of two estimates each: from held-out links, and from these and whole quadrants
     that were held out. A map extrapolates, and few places do not tell what that costs.
+
+    Args:
+        model: as of `make_blend`.
+        prediction: likewise.
+        but: a fold whose links have no part in it; -1: all have.
     """
-    z = (model.links.level_db - prediction.mean_db) / _scale_db(model)
-    known = np.isfinite(z) & rows
-    here = np.column_stack([z, prediction.share])[known]
+    scale_db, unheard_db = model.held_out_scales
+    # What levels that nobody knows are off by is not the combination's error.
+    square = (model.links.level_db - prediction.mean_db) ** 2 - unheard_db**2
+    z = np.sqrt(np.maximum(square, 0.0)) / scale_db
+    here = np.column_stack([z, prediction.share])[np.isfinite(z) & (model.index != but)]
     if not len(here):
         return 1.0, 1.0
-    ratios = [_fitted_ratio(links, model.whole.dof)
-              for links in (here, np.vstack([here, prediction.away]))]
+    away = prediction.away[prediction.away[:, 2] != but, :2]
+    ratios = [_fitted_ratio(links, model.whole.dof) for links in (here, np.vstack([here, away]))]
     near, far = np.max(ratios, axis=0)
     return float(near), float(far)
 

@@ -70,12 +70,19 @@ class CrossValidatedModel:
     @cached_property
     def held_out_reading(self) -> tuple[np.ndarray, np.ndarray]:
         """(n,) predicted reading and (n,) its error scale [dB], with shadowing; NaN = none."""
-        mean_db, scale_db = np.full((2, len(self.index)), np.nan)
-        for number, (model, fit) in enumerate(zip(self.folds, self.fits[1:], strict=True)):
-            own, reading = self.index == number, model.predict(fit)
-            mean_db[own], scale_db[own] = reading.mean_db[own], reading.scale_db[own]
+        mean_db = self.held_out(lambda model, fit: model.predict(fit).mean_db)
+        scale_db, unheard_db = self.held_out_scales
         shift, left = self.held_out_shadowing
-        return mean_db + shift * scale_db, scale_db * left
+        return mean_db + shift * scale_db, np.hypot(scale_db * left, unheard_db)
+
+    @cached_property
+    def held_out_scales(self) -> tuple[np.ndarray, np.ndarray]:
+        """`FoldModel.scales_db` of held-out links, without shadowing [dB]."""
+        scale_db, unheard_db = np.full((2, len(self.index)), np.nan)
+        for number, (model, fit) in enumerate(zip(self.folds, self.fits[1:], strict=True)):
+            own = self.index == number
+            scale_db[own], unheard_db[own] = (each[own] for each in model.scales_db(fit))
+        return scale_db, unheard_db
 
     @cached_property
     def held_out_nll(self) -> np.ndarray:

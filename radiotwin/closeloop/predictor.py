@@ -30,7 +30,7 @@ from radiotwin.closeloop.baselines import (
 )
 from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
-from radiotwin.effects.blend import FORESTS, NAMED, REST, far_share
+from radiotwin.effects.blend import FORESTS, NAMED, REST, TREES_ALONE, far_share
 from radiotwin.effects.correlated_shadowing import (
     CorrelatedShadowing,
     receivers_move,
@@ -61,8 +61,8 @@ class CombinedPrediction:
         members: (n, k) held-out prediction of each member [dB].
         share: (n,) how far a link is from the measurements that it was predicted by.
         baselines: (n,) held-out prediction of other models [dB], by name.
-        away: (r, 2) of links with a quadrant of the area held out: error over the scale of named
-            effects, and how far away they are; what extrapolation costs.
+        away: (r, 3) of links with a quadrant of the area held out: error over the scale of named
+            effects, how far away they are, and their fold; what extrapolation costs.
     """
 
     mean_db: np.ndarray
@@ -71,7 +71,7 @@ class CombinedPrediction:
     members: np.ndarray
     share: np.ndarray
     baselines: dict[str, np.ndarray] = field(default_factory=dict)
-    away: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    away: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class _Learnt:
     names: list[str]
 
     def held_out(self, group: np.ndarray, groups: list[int],
-                 seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+                 seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Hold out groups of its training links, fit to the others, and predict.
 
         Of the physics the coefficients are fitted again, and of rest and kriging the values. What
@@ -99,8 +99,8 @@ class _Learnt:
             seed: of trees and samples.
 
         Returns:
-            (r, k) measured minus predicted by each member [dB], (r,) far shares, and (r,) error
-            scales of named effects [dB].
+            (r, k) measured minus predicted by each member [dB], (r,) far shares, (r,) error scales
+            of named effects [dB], and (r,) rows of the links.
         """
         rows = np.flatnonzero(self.model.train)
         if len(rows) > MAX_INNER_LINKS:
@@ -109,6 +109,7 @@ class _Learnt:
         part = self.part.select(rows)
         whole = self.model.restrict(rows, self.model.effects)
         errors, shares, scales = [np.zeros((0, len(self.names)))], [np.zeros(0)], [np.zeros(0)]
+        tested = [np.zeros(0, dtype=int)]
         for each in groups:
             out = group[rows] == each
             test = np.flatnonzero(out & np.isfinite(part.links.level_db))
@@ -120,8 +121,10 @@ class _Learnt:
             inner = _Learnt(model, fit, rest, self.kriging, part, self.names)
             errors.append(part.links.level_db[test, None] - inner.members_db(test, seed))
             shares.append(shares_of(part.links, ~out, test))
-            scales.append(model.predict(fit).scale_db[test])
-        return np.concatenate(errors), np.concatenate(shares), np.concatenate(scales)
+            scales.append(model.scales_db(fit)[0][test])
+            tested.append(rows[test])
+        return (np.concatenate(errors), np.concatenate(shares), np.concatenate(scales),
+                np.concatenate(tested))
 
     def members_db(self, test: np.ndarray, seed: int) -> np.ndarray:
         """Return what members (m, k) predict of rows (m,), by few trees and known correlations."""
@@ -135,8 +138,8 @@ def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: S
                         seed: int) -> CombinedPrediction:
     """Return the held-out prediction by all that was learnt.
 
-    Trees upon the physics are members, and trees alone are not: where physics is of no use to
-    them, it does no harm either.
+    Trees upon the physics are members, and trees alone, too: a pattern that fits what was measured
+    may be wrong beyond.
 
     Args:
         model: with all effects that have a name.
@@ -148,7 +151,8 @@ def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: S
     parts = [Part(each.links) for each in model.folds]
     baselines, kriging = held_out_baselines(model, parts, criteria, seed)
     laws = [kind.name for kind in laws_for(links, criteria) if kind is not LogDistance]
-    names = [NAMED, *FORESTS, *([REST] if with_rest or model.shadowing else []), *laws]
+    rest_too = [REST] if with_rest or model.shadowing else []
+    names = [NAMED, *FORESTS, *TREES_ALONE, *rest_too, *laws]
     members, share = np.full((len(links), len(names)), np.nan), np.ones(len(links))
     mean_db = np.full(len(links), np.nan)
     learnt: _Learnt | None = None
@@ -168,10 +172,12 @@ def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: S
         mean_db[test] = combine(members[test], share[test], _weights(
             *learnt.held_out(model.index, others, seed)[:2], names))
     error_db = links.level_db[:, None] - members
-    far_db, far_share, far_scale_db = learnt.held_out(
-        _quadrant(links), [0, 1, 2, 3], seed) if learnt else (error_db[:0], share[:0], share[:0])
+    far_db, far_share, far_scale_db, far_rows = learnt.held_out(
+        _quadrant(links), [0, 1, 2, 3], seed) if learnt else (
+        error_db[:0], share[:0], share[:0], model.index[:0])
     weights = _weights(np.vstack([error_db, far_db]), np.concatenate([share, far_share]), names)
-    away = np.column_stack([combine(far_db, far_share, weights) / far_scale_db, far_share])
+    away = np.column_stack([combine(far_db, far_share, weights) / far_scale_db, far_share,
+                            model.index[far_rows]])
     return CombinedPrediction(mean_db, names, weights, members, share, baselines, away)
 
 
@@ -217,21 +223,24 @@ def _weights(error_db: np.ndarray, share: np.ndarray, names: list[str]) -> np.nd
     return convex_weights(error_db[known], share[known], PULL)
 
 
-def residual_forests(model: FoldModel, fit: FitResult, part: Part, seed: int,
-                     trees: int = TREES) -> dict[str, Forest]:
-    """Grow trees, by the names in `FORESTS`, on the standardised residual of training links.
+def grown_forests(model: FoldModel, fit: FitResult, part: Part, seed: int,
+                  trees: int = TREES) -> dict[str, Forest]:
+    """Grow trees on training links: on the standardised residual (`FORESTS`), and on the levels.
 
-    They are not told which receiver it is: its effects have names, and a map has none.
+    A blank counts as the named effects' mean below the limit. They are not told which receiver it
+    is: its effects have names, and a map has none.
     """
     rows = np.flatnonzero(model.train)
     z = standardised_residual(model, fit)
-    return {name: grow_trees(kind, part.common[rows], z, seed, trees)
-            for name, kind in zip(FORESTS, (EXTRA_TREES, BOOSTING), strict=True)}
+    level_db = model.predict(fit).mean_db[rows] + z * model.scales_db(fit)[0][rows]
+    return {name: grow_trees(kind, part.common[rows], target, seed, trees)
+            for names, target in ((FORESTS, z), (TREES_ALONE, level_db))
+            for name, kind in zip(names, (EXTRA_TREES, BOOSTING), strict=True)}
 
 
 def physics_db(model: FoldModel, fit: FitResult, rest: CorrelatedShadowing | None, part: Part,
                test: np.ndarray, seed: int, trees: int = TREES) -> np.ndarray:
-    """Return what named effects predict, alone, with trees upon them, and with the rest [dB].
+    """Return what named effects and trees predict, alone and together, and with the rest [dB].
 
     Args:
         model: n links, of which some are learnt from.
@@ -243,17 +252,19 @@ def physics_db(model: FoldModel, fit: FitResult, rest: CorrelatedShadowing | Non
         trees: number of them.
 
     Returns:
-        (m, 3), or (m, 4) with the rest, level of a link that is detected.
+        (m, 5), or (m, 6) with the rest, level of a link that is detected.
     """
-    reading = model.predict(fit)
-    mean_db, scale_db, limit_db = (each[test] for each in (
-        reading.mean_db, reading.scale_db, model.limit_db))
+    mean_db, limit_db, scale_db, unheard_db = (each[test] for each in (
+        model.predict(fit).mean_db, model.limit_db, *model.scales_db(fit)))
     losses = model.losses.select(test)
-    forests = residual_forests(model, fit, part, seed, trees)
-    added: list[tuple] = [(0.0, 1.0), *((forest.predict(part.common[test]), 1.0)
-                                        for forest in forests.values())]
+    added: list[tuple] = [(0.0, 1.0)]
+    for name, forest in grown_forests(model, fit, part, seed, trees).items():
+        predicted = forest.predict(part.common[test])
+        alone = name in TREES_ALONE
+        added.append(((predicted - mean_db) / scale_db if alone else predicted, 1.0))
     if rest is not None:
         added.append(rest.at(model.links.select(test)))
     return np.column_stack([
-        mean_if_detected(mean_db + shift * scale_db, scale_db * left, limit_db, model.dof, losses)
+        mean_if_detected(mean_db + shift * scale_db, np.hypot(scale_db * left, unheard_db),
+                         limit_db, model.dof, losses)
         for shift, left in added])

@@ -221,7 +221,8 @@ def _shadowing(score: CandidateScore, model: CrossValidatedModel, rank: int) -> 
     numbers = {"length_m": (field.length_m, "m"), "share": (field.share, "of the variance"),
                "receiver_share": (field.kind_share, "of the variance"), "sigma_db": (sd_db, "dB")}
     if relatives is not None:
-        numbers["relatives_share"] = relatives.passed_on, "of their residual"
+        share = float(np.mean(list(relatives.passed_on.values())))
+        numbers["relatives_share"] = share, "of their residual"
     return {"name": score.name, "variant": "", "rank": rank, "params": {},
             "parameters": {name: {"value": value, "low": np.nan, "high": np.nan, "unit": unit}
                            for name, (value, unit) in numbers.items()},

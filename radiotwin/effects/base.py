@@ -44,8 +44,10 @@ class Term:
         columns: (n, q) added times coefficients, which the regression fits.
         prior_sd_db: (q,) prior standard deviation of each coefficient around zero.
         inputs: (n, …) what the effect's `response` needs of each link; None = nothing.
-        random_effect_sd_db: (n,) standard deviation of what it adds to links of which nothing was
-            learnt [dB]; None = all are known.
+        random_effect_sd_db: (n,) standard deviation of what it adds to each link by itself [dB];
+            None = nothing.
+        unheard_sd_db: (n,) standard deviation of a level that links have in common and of which
+            nothing was learnt, as of a device without a reading [dB]; None = all are known.
     """
 
     offset_db: np.ndarray
@@ -53,13 +55,15 @@ class Term:
     prior_sd_db: np.ndarray
     inputs: np.ndarray | None = None
     random_effect_sd_db: np.ndarray | None = None
+    unheard_sd_db: np.ndarray | None = None
 
     def select(self, rows: np.ndarray) -> Term:
         """Return the term of the links of a mask or an index array."""
-        sd_db = self.random_effect_sd_db
-        return Term(self.offset_db[rows], self.columns[rows], self.prior_sd_db,
-                    None if self.inputs is None else self.inputs[rows],
-                    None if sd_db is None else sd_db[rows])
+        inputs, scatter_db, unheard_db = (
+            None if each is None else each[rows]
+            for each in (self.inputs, self.random_effect_sd_db, self.unheard_sd_db))
+        return Term(self.offset_db[rows], self.columns[rows], self.prior_sd_db, inputs,
+                    scatter_db, unheard_db)
 
     @classmethod
     def of_columns(cls, columns: np.ndarray, prior_sd_db: float) -> Term:

@@ -29,6 +29,7 @@ from radiotwin.measurement_columns import MAX_ANGLE_DEG
 
 NAMED, REST = "named", "named_and_rest"
 FORESTS = ("named_and_trees", "named_and_boosting")  # members, learnt of what named effects leave
+TREES_ALONE = ("extra_trees", "hist_gradient_boosting")  # members, learnt of the levels
 LAWS = {each.name: each for each in (SegmentedLogDistance, RegressionKriging)}
 MAX_SD_RATIO = 100.0
 
@@ -59,7 +60,8 @@ class Blend:
         sd_ratio: standard deviation of the error over that of named effects, near and far.
         measured_m: (p, 3) receivers' positions [m], and
         measured_device: (p,) the device that was measured there.
-        forests: of the standardised residual of named effects, by name (`FORESTS`).
+        forests: by name, of the standardised residual of named effects (`FORESTS`), or of the
+            levels (`TREES_ALONE`) [dB].
         laws: fitted to the levels, by name.
         boresights_deg: (j, 2) device, and its declared azimuth [deg]; forests know of these.
     """
@@ -98,7 +100,8 @@ class Blend:
         if self.forests:
             features = link_features(self._declared(links), receivers=False)
             for name, forest in self.forests.items():
-                members[name] = mean_db + forest.predict(features) * scale_db
+                predicted = forest.predict(features)
+                members[name] = predicted if name in TREES_ALONE else mean_db + predicted * scale_db
         for name, law in self.laws.items():
             members[name] = law.predict(geometry)[0]
         names = list(self.weights)
@@ -157,7 +160,7 @@ class Blend:
             parts = {each.removeprefix(f"{name}/"): array for each, array in arrays.items()
                      if each.startswith(f"{name}/")}
             own |= {f"{name}/{each}" for each in parts}
-            if name in FORESTS:
+            if name in FORESTS + TREES_ALONE:
                 forests[name] = Forest.from_state(parts, given, width)
             else:
                 laws[name] = LAWS[name].from_state(

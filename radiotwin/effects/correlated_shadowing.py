@@ -83,7 +83,7 @@ class CorrelatedShadowing:
         series, position_m, kind = _points(links, move)
         points = series, position_m, (z - z.mean()) / relative_sd
         field = (like.field.with_points(*points, kind) if like
-                 else fitted_field("shadowing", *points, seed, kind))
+                 else fitted_field("shadowing", ResidualField(), *points, seed, kind))
         return cls(field, relative_sd, move, relatives=relatives)
 
     def at(self, links: LinkData) -> tuple[np.ndarray, np.ndarray]:

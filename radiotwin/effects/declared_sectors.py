@@ -7,11 +7,12 @@ holds for a sector that nobody has measured, too, which a pattern learnt for eac
 does not.
 """
 
+from collections import Counter
 from itertools import product
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 from typing_extensions import override
 
 from radiotwin.effects.antenna_params import allowed_of
@@ -40,10 +41,10 @@ from radiotwin.effects.sector_antenna import (
     SectorPattern,
 )
 from radiotwin.effects.sector_levels import (
-    DEVICE_SD_DB,
     GROUP_SD_DB,
     level_groups,
     membership,
+    own_sd_db,
     unheard_sd_db,
 )
 from radiotwin.links import LinkData
@@ -78,6 +79,14 @@ class DeclaredSectors(SectorAntenna):
         unheard_sd_db: dict[DeviceIndex, Decibels] = Field(
             {}, description="How uncertain the level of each device without a reading is.")
 
+        @model_validator(mode="after")
+        def _check_groups(self) -> Self:
+            counts = Counter(device for group in self.groups for device in group)
+            if any(len(set(group)) < max(len(group), 2) for group in self.groups) \
+                    or not set(counts) <= set(self.devices) or max(counts.values(), default=0) > 2:
+                raise ValueError("groups are not of two devices and more, each in two at most")
+            return self
+
     @override
     def unavailable(self, links: LinkData) -> str | None:
         if len(_declared(links)) < MIN_DEVICES:
@@ -93,7 +102,8 @@ class DeclaredSectors(SectorAntenna):
         if nats <= MIN_NATS:
             return []
         groups = level_groups(view.links, declared)
-        unheard = unheard_sd_db(declared, groups, set(view.links.device.tolist()), LEVEL_SD_DB)
+        heard = view.links.device[np.isfinite(view.links.level_db)]
+        unheard = unheard_sd_db(declared, groups, set(heard.tolist()), LEVEL_SD_DB)
         return [self.Params(devices=_turned(view.links, declared, shape, offset_deg),
                             straight=self.straight, azimuth_offset_deg=offset_deg, groups=groups,
                             unheard_sd_db=unheard)]
@@ -109,13 +119,13 @@ class DeclaredSectors(SectorAntenna):
     def term(self, links: LinkData, params: Any, level_at: LevelAt) -> Term:
         own = super().term(links, params, level_at)
         shared = _shared(params)
-        unheard_sd_db = np.zeros(len(links))
-        for device, sd_db in params.unheard_sd_db.items():
-            unheard_sd_db[links.device == device] = sd_db
+        sd_db = np.zeros(len(links))
+        for device, level_sd_db in params.unheard_sd_db.items():
+            sd_db[links.device == device] = level_sd_db
         return Term(own.offset_db, own.columns @ np.column_stack([shared, np.eye(len(shared))]),
                     np.r_[LEVEL_SD_DB, np.full(len(params.groups), GROUP_SD_DB),
-                          np.full(len(params.devices), DEVICE_SD_DB)],
-                    random_effect_sd_db=unheard_sd_db)
+                          own_sd_db(list(params.devices), params.groups)],
+                    unheard_sd_db=sd_db)
 
     @override
     def variation(self, params: Any) -> Variation:

@@ -144,24 +144,23 @@ class EffectModel:
         """Return the levels that are expected of links, see `Prediction`."""
         model, result = self.on_links(links)
         regression = model.regression()
-        reading = regression.predict(result)
-        mean_db, scale_db = reading.mean_db, reading.scale_db
-        unheard_sd_db: np.ndarray | float = 0.0
+        mean_db = regression.predict(result).mean_db
+        scale_db, unheard_db = model.scales_db(result)
         if self.unheard is not None:
             of_them = np.isin(links.device, self.unheard.devices)
             mean_db = mean_db + self.unheard.mean_db * of_them
-            unheard_sd_db = self.unheard.sd_db * of_them
+            unheard_db = np.hypot(unheard_db, self.unheard.sd_db * of_them)
         shift, left = np.zeros(len(links)), np.ones(len(links))
         if self.shadowing is not None and self.shadowing.receivers_move:
             shift, left = self.shadowing.at(links)
         if self.blend is not None:
             mean_db, scale_db = self.blend.apply(model.links, mean_db, scale_db, shift)
         else:
-            mean_db = mean_db + shift * self.scale_db[model.group]
+            mean_db = mean_db + shift * scale_db
             scale_db = scale_db * left
         return Prediction(
-            mean_db, np.hypot(scale_db * np.sqrt(self.dof / (self.dof - 2)), unheard_sd_db),
-            detection_probability(mean_db, scale_db, model.limit_db, self.dof,
+            mean_db, np.hypot(scale_db * np.sqrt(self.dof / (self.dof - 2)), unheard_db),
+            detection_probability(mean_db, np.hypot(scale_db, unheard_db), model.limit_db, self.dof,
                                   regression.losses))
 
 

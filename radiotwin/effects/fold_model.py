@@ -195,11 +195,30 @@ class FoldModel:
         most = max(every, key=lambda each: float(np.mean(each.drop)))
         return Losses(1.0 - kept, most.drop, most.drop_db)
 
+    def scales_db(self, result: FitResult) -> tuple[np.ndarray, np.ndarray]:
+        """Return (n,) error scale of readings of known devices, and (n,) sd of levels nobody knows.
+
+        What is interpolated counts in units of the first; both together make the scale of
+        `predict`. [dB]
+        """
+        whole = self.predict(result).scale_db
+        if all(each.term.unheard_sd_db is None for each in self.effects):
+            return whole, np.zeros(len(whole))
+        known = replace(self.regression(), random_effect_sd_db=self._scatter_sd_db(slice(None)))
+        scale_db = known.predict(result).scale_db
+        return scale_db, np.sqrt(np.maximum(whole**2 - scale_db**2, 0.0))
+
+    def _scatter_sd_db(self, rows: np.ndarray | slice) -> np.ndarray | float:
+        return _joined_sd_db([each.term.random_effect_sd_db for each in self.effects], rows)
+
     def _random_effect_sd_db(self, rows: np.ndarray | slice) -> np.ndarray | float:
-        """Return (n,) the sd of what was learnt of other links only; 0 where there is none."""
-        variances = [each.term.random_effect_sd_db[rows] ** 2 for each in self.effects
-                     if each.term.random_effect_sd_db is not None]
-        return np.sqrt(sum(variances))
+        """Return (n,) the sd of all that is not learnt of a link; 0 where there is none."""
+        unheard = [each.term.unheard_sd_db for each in self.effects]
+        return np.hypot(self._scatter_sd_db(rows), _joined_sd_db(unheard, rows))
+
+
+def _joined_sd_db(parts: list[np.ndarray | None], rows: np.ndarray | slice) -> np.ndarray | float:
+    return np.sqrt(sum(each[rows] ** 2 for each in parts if each is not None))
 
 
 def response(effects: list[AppliedEffect], stage: str, rows: np.ndarray | slice) -> Response | None:

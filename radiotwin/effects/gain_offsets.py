@@ -75,7 +75,7 @@ class _GainOffset(GainEffect):
         index = self._index(links)
         unknown = ~np.isin(index, params.members)
         return replace(Term.of_columns(one_hot(index, params.members), PRIOR_SD_DB),
-                       random_effect_sd_db=np.where(unknown, params.offsets_sd_db, 0.0))
+                       unheard_sd_db=np.where(unknown, params.offsets_sd_db, 0.0))
 
     @override
     def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:

@@ -16,13 +16,22 @@ DEVICE_SD_DB = 3.0  # between carriers of an antenna: powers and cables differ
 
 
 def level_groups(links: LinkData, devices: list[int]) -> list[list[int]]:
-    """Return those of some devices that are on one mast, and that look one way from it.
+    """Return those of some devices that are on one mast, and those that look one way from it.
 
-    Groups are of at least two devices, and of fewer than all.
+    Groups are of at least two devices; one that is both, a mast of one direction, is in it twice.
     """
-    found = {tuple(other for other in group if other in devices) for device in devices
-             for group in (site_of(links, device), antenna_of(links, device))}
-    return [list(group) for group in sorted(found) if 1 < len(group) < len(devices)]
+    found = [{tuple(other for other in group_of(links, device) if other in devices)
+              for device in devices} for group_of in (site_of, antenna_of)]
+    return [list(group) for kind in found for group in sorted(kind) if len(group) > 1]
+
+
+def own_sd_db(devices: list[int], groups: list[list[int]]) -> np.ndarray:
+    """Return the standard deviation of what no other device shares (k,) [dB].
+
+    That of a device, and of a mast or a direction that it has for itself.
+    """
+    alone = 2 - membership(devices, groups).sum(axis=1)
+    return np.sqrt(DEVICE_SD_DB**2 + GROUP_SD_DB**2 * alone)
 
 
 def membership(devices: list[int], groups: list[list[int]]) -> np.ndarray:
@@ -45,7 +54,7 @@ def unheard_sd_db(devices: list[int], groups: list[list[int]], heard: set[int],
     """
     member = membership(devices, groups)
     covariance = common_sd_db**2 + GROUP_SD_DB**2 * member @ member.T
-    covariance += DEVICE_SD_DB**2 * np.eye(len(devices))
+    covariance += np.diag(own_sd_db(devices, groups) ** 2)
     known = np.isin(devices, list(heard))
     cross = covariance[np.ix_(~known, known)]
     explained = np.einsum("ij,ji->i", cross, np.linalg.solve(covariance[np.ix_(known, known)],

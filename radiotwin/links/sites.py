@@ -27,18 +27,27 @@ def antenna_of(links: LinkData, device: int) -> list[int]:
     They are carriers through one antenna, or through antennas side by side. Arguments as of
     `site_of`.
     """
-    apart_deg = np.abs((links.boresight_deg - links.boresight_deg[device] + 180) % 360 - 180)
-    return [other for other in site_of(links, device)
-            if other == device or apart_deg[other] <= SAME_DIRECTION_DEG]
+    found, mast = {device}, np.array(site_of(links, device))
+    for _ in mast:  # what is near a member is one, too, so that the groups of a mast are disjoint
+        apart_deg = np.abs((links.boresight_deg[mast, None] - links.boresight_deg[sorted(found)]
+                            + 180) % 360 - 180)
+        found |= set(mast[(apart_deg <= SAME_DIRECTION_DEG).any(axis=1)].tolist())
+    return sorted(found)
 
 
-def relatives_of(links: LinkData, device: int) -> list[int]:
+def relatives_of(links: LinkData, device: int, heard: set[int]) -> list[int]:
     """Return whose signals reach a receiver on nearly the same ways as those of a device.
 
-    The others of its antenna, or where there are none of its mast; at most `MAX_RELATIVES`.
-    Arguments as of `site_of`.
+    The others of its antenna that were heard, or where there are none of its mast.
+
+    Args:
+        links: with the devices' positions.
+        device: index of a device.
+        heard: devices with a reading.
+
+    Returns:
+        at most `MAX_RELATIVES` devices.
     """
-    for group in (antenna_of(links, device), site_of(links, device)):
-        if len(group) > 1:
-            return [other for other in group if other != device][:MAX_RELATIVES]
-    return []
+    others = ([other for other in group if other != device and other in heard]
+              for group in (antenna_of(links, device), site_of(links, device)))
+    return next(filter(None, others), [])[:MAX_RELATIVES]

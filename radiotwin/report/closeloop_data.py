@@ -191,8 +191,7 @@ def collect(loop: Loop) -> LoopData:
     dependences = [*significant(before, loop.criteria), *loop.remaining]
     interpolated_db = None
     if model.shadowing:
-        scale_db = model.held_out(lambda fold, fit: fold.predict(fit).scale_db)
-        interpolated_db = model.held_out_shadowing[0] * scale_db
+        interpolated_db = model.held_out_shadowing[0] * model.held_out_scales[0]
     return LoopData(
         links, loop.base, loop.before.held_out_mean_db, model.held_out_mean_db,
         model is not loop.before, [score.name for score in loop.selection.scores if score.kept],

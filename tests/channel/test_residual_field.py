@@ -62,7 +62,6 @@ def test_a_saved_field_predicts_the_same():
 
 def test_many_series_stay_within_the_memory_that_is_said(monkeypatch):
     """200 series of 150 points on fields of 60 m: coarser than measured, fitted to some, and the length is found."""
-    monkeypatch.setattr(residual_field, "MAX_PAIRS", 200 * 70**2)
     monkeypatch.setattr(residual_field, "MAX_SERIES_TO_FIT", 20)
     rng = np.random.default_rng(5)
     other_m, values = [], []
@@ -71,9 +70,9 @@ def test_many_series_stay_within_the_memory_that_is_said(monkeypatch):
         apart_m = np.linalg.norm(position_m[:, None] - position_m[None], axis=2)
         values.append(np.linalg.cholesky(np.exp(-apart_m / 60.0) + 1e-6 * np.eye(150)) @ rng.normal(size=150))
         other_m.append(position_m)
-    field = ResidualField().fit(np.repeat(np.arange(200), 150), np.concatenate(other_m), np.concatenate(values), 0)
+    field = ResidualField(200 * 70**2).fit(np.repeat(np.arange(200), 150), np.concatenate(other_m), np.concatenate(values), 0)
     sizes = np.array([len(each.residual) for each in field.fields.values()])
-    assert len(sizes) == 200 and (sizes**2).sum() <= residual_field.MAX_PAIRS and sizes.min() > 20
+    assert len(sizes) == 200 and (sizes**2).sum() <= field.max_pairs and sizes.min() > 20
     assert field.length_m == pytest.approx(60.0, rel=0.25) and field.share > 0.9
     mean, _ = field.predict(np.arange(200), np.array([position_m[0] for position_m in other_m]))
     assert np.corrcoef(mean, [value[0] for value in values])[0, 1] > 0.7

@@ -105,9 +105,9 @@ def test_where_named_effects_are_all_their_own_intervals_count(blended):
 def test_what_extrapolation_costs_widens_intervals_far_from_measured_places(blended):
     """Held-out links lie near others; quadrants that were held out have three times their error."""
     z = np.random.default_rng(0).normal(0, 3.0, 400)
-    away = np.column_stack([z, np.full(400, 0.9)])
+    away = np.column_stack([z, np.full(400, 0.9), np.zeros(400)])
     wider = make_blend(blended.model, replace(blended.prediction, away=away), 0).sd_ratio
     usual = blended.twin.fitted.blend.sd_ratio
     assert wider[1] > 1.3 * usual[1] and wider[0] >= usual[0]
-    sure = np.column_stack([z / 30, np.full(400, 0.9)])  # quadrants that happen to fit make none narrower
+    sure = np.column_stack([z / 30, np.full(400, 0.9), np.zeros(400)])  # quadrants that happen to fit make none narrower
     assert make_blend(blended.model, replace(blended.prediction, away=sure), 0).sd_ratio >= usual

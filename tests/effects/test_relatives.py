@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from radiotwin.effects.relatives import Relatives, RelativesState
-from radiotwin.effects.sector_levels import GROUP_SD_DB, level_groups, unheard_sd_db
+from radiotwin.effects.sector_levels import GROUP_SD_DB, level_groups, own_sd_db, unheard_sd_db
 from radiotwin.links import LinkData
 from radiotwin.links.sites import antenna_of, relatives_of
 
@@ -40,11 +40,17 @@ def shadows(rng, links, group):
 def test_relatives_are_the_carriers_of_an_antenna_or_else_the_sectors_of_a_mast():
     links = links_of(np.random.default_rng(0), 1)
     assert [antenna_of(links, device) for device in (0, 4, 8)] == [[0, 1], [4, 5], [8]]
-    assert [relatives_of(links, device) for device in (0, 5, 6, 8)] == [[1], [4], [7], []]
+    everyone = set(range(9))
+    assert [relatives_of(links, device, everyone) for device in (0, 5, 6, 8)] == [[1], [4], [7], []]
+    # Two planned carriers of one direction tell nothing of each other.
+    assert relatives_of(links, 0, everyone - {0, 1}) == [2, 3]
     undeclared = links_of(np.random.default_rng(0), 1, declared=False)
-    assert [relatives_of(undeclared, device) for device in (0, 5, 8)] == [[1, 2, 3], [4, 6, 7], []]
+    assert [relatives_of(undeclared, device, everyone) for device in (0, 5, 8)] == [[1, 2, 3], [4, 6, 7], []]
     # A device that was located, not declared, may be on the mast by mistake.
-    assert relatives_of(replace(undeclared, anchors=frozenset({0, 1, 4})), 0) == [1]
+    assert relatives_of(replace(undeclared, anchors=frozenset({0, 1, 4})), 0, everyone) == [1]
+    # Azimuths of 30, 34 and 38 degrees are one group, whichever of them is asked for.
+    steps = replace(links, boresight_deg=np.array([30.0, 34, 38, 212, *AZIMUTHS_DEG[4:]]))
+    assert [antenna_of(steps, device) for device in range(4)] == [[0, 1, 2], [0, 1, 2], [0, 1, 2], [3]]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -54,7 +60,7 @@ def test_an_unheard_carrier_is_predicted_by_the_other_one_as_surely_as_said(seed
     z = shadows(rng, links, DIRECTION) + 0.4 * rng.normal(size=len(links))
     heard = links.device != 0
     relatives = Relatives.fit(links.select(heard), z[heard], None, seed)
-    assert relatives.passed_on > 0.6
+    assert relatives.passed_on[0] > 0.6 and relatives.passed_on[1] < 0.25  # whose only relatives are of another direction
     mean, left = relatives.at(links.select(~heard))
     error = z[~heard] - mean
     assert error.std() < 0.88 * z[~heard].std()
@@ -68,7 +74,7 @@ def test_fields_that_have_nothing_in_common_are_not_passed_on(seed):
     rng = np.random.default_rng(seed)
     links = links_of(rng)
     z = shadows(rng, links, np.arange(9)) + 0.4 * rng.normal(size=len(links))
-    assert Relatives.fit(links, z, None, seed).passed_on < 0.25
+    assert max(Relatives.fit(links, z, None, seed).passed_on.values()) < 0.25
 
 
 def test_what_is_stored_says_the_same():
@@ -79,7 +85,9 @@ def test_what_is_stored_says_the_same():
     again = Relatives.of(RelativesState.model_validate(stored))
     np.testing.assert_allclose(again.at(links), relatives.at(links), atol=0.02)  # positions to a decimetre
     with pytest.raises(ValueError, match="passed_on"):
-        RelativesState.model_validate(stored | {"passed_on": 1.5})
+        RelativesState.model_validate(stored | {"passed_on": [1.5] * 8})
+    with pytest.raises(ValueError, match="not of the devices"):
+        Relatives.of(RelativesState.model_validate(stored | {"passed_on": [0.5]}))
 
 
 def test_with_nobody_beside_it_nothing_is_said():
@@ -91,14 +99,17 @@ def test_with_nobody_beside_it_nothing_is_said():
 
 def test_levels_are_nested_in_masts_and_directions():
     links = links_of(np.random.default_rng(0), 1)
-    assert level_groups(links, list(range(8))) == [[0, 1], [0, 1, 2, 3], [2, 3], [4, 5], [4, 5, 6, 7], [6, 7]]
+    groups = level_groups(links, list(range(9)))
+    assert groups == [[0, 1, 2, 3], [4, 5, 6, 7], [0, 1], [2, 3], [4, 5], [6, 7]]
+    assert own_sd_db(list(range(9)), groups).tolist() == [3.0] * 8 + [pytest.approx(np.sqrt(27))]  # a mast for itself
     assert level_groups(links, [0, 2, 8]) == [[0, 2]]  # of three directions two are on a mast
+    assert level_groups(links, [0, 1]) == [[0, 1], [0, 1]]  # a mast of one direction
 
 
 def test_how_uncertain_an_unheard_level_is_against_drawn_ones():
     """A hundred thousand networks, and the regression of one device's level on those of the others."""
     rng = np.random.default_rng(6)
-    groups = [[0, 1], [0, 1, 2, 3], [2, 3], [4, 5]]
+    groups = [[0, 1, 2, 3], [4, 5], [0, 1], [2, 3], [4, 5]]
     level_db = 15.0 * rng.normal(size=(100_000, 1)) + 3.0 * rng.normal(size=(100_000, 6))
     for group in groups:
         level_db[:, group] += GROUP_SD_DB * rng.normal(size=(100_000, 1))
@@ -109,3 +120,7 @@ def test_how_uncertain_an_unheard_level_is_against_drawn_ones():
     fewer = unheard_sd_db(list(range(6)), groups, {4}, 15.0)
     assert sorted(fewer) == [0, 1, 2, 3, 5]
     assert found[0] < fewer[0] and fewer[5] < fewer[0]  # its own carrier tells most of it
+    # A mast that nobody has heard: between masts, directions and devices there are 3 dB each, heard ones known.
+    many = [[2 * mast, 2 * mast + 1] for mast in range(200) for _ in range(2)]
+    alone = unheard_sd_db(list(range(401)), many, set(range(400)), 15.0)
+    assert alone == {400: pytest.approx(np.sqrt(27), rel=0.02)}
