@@ -21,7 +21,9 @@ from radiotwin.closeloop.folds import make_folds
 from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.base import GainEffect
 from radiotwin.effects.blend import Blend
+from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
 from radiotwin.effects.declared_sectors import DeclaredSectors
+from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.registry import BUILT_IN
 from radiotwin.effects.sector_antenna import SectorPattern
 from radiotwin.links import prepare_links
@@ -219,3 +221,32 @@ def test_trees_of_a_stored_blend_know_the_azimuths_and_nobody_need_tell_them_aga
     np.testing.assert_allclose(again.apply(later, zero, one, zero)[0], expected_db, atol=1e-5)
     with pytest.raises(ValueError, match="belongs to no device"):
         Blend.from_state(arrays | {"boresights_deg": azimuths + [6, 0]}, settings, 6)
+
+
+def test_a_held_out_sector_is_predicted_as_the_twin_that_lacks_it_predicts_it():
+    """The rest counts in units of what heard sectors scatter by, however uncertain the level of an unheard one is."""
+    links = prepare_links(network(8), None)
+    folds = make_folds(links, 0, "device")
+    result = SelectionResult(cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds)))
+    take_declared(result, [effect() for effect in BUILT_IN], 0, lambda _: None)
+    fields = [CorrelatedShadowing.fit(each, fit, 0) for each, fit in zip(result.model.models, result.model.fits)]
+    model = result.model.with_shadowing(fields)
+    mean_db, scale_db = model.held_out_reading
+    spread_db, unheard_db = model.held_out_scales
+    assert np.median(unheard_db) > 3.0 and np.median(spread_db) < 4.0
+    for number, (fold, fit, field) in enumerate(zip(model.folds, model.fits[1:], fields[1:])):
+        own = model.index == number
+        assert fold.links.device[own].min() == fold.links.device[own].max()
+        twin = replace(EffectModel.of(fold, fit), shadowing=field).predict(links.select(own))
+        np.testing.assert_allclose(mean_db[own], twin.mean_db, atol=1e-6)
+        left = field.at(links.select(own))[1]
+        t_sd = np.sqrt(model.whole.dof / (model.whole.dof - 2))
+        np.testing.assert_allclose(twin.sd_db, np.hypot(spread_db[own] * left * t_sd, unheard_db[own]), rtol=1e-6)
+        assert (scale_db[own] > unheard_db[own]).all()
+
+
+@pytest.mark.parametrize("groups", [[[0]] * 5000, [[0, 0]], [[0, 9]], [[0, 1]] * 3])
+def test_groups_of_levels_in_a_file_are_those_of_its_devices(groups):
+    shape = SectorPattern()
+    with pytest.raises(ValueError, match="groups are not of two devices"):
+        DeclaredSectors.Params(devices={0: shape, 1: shape}, groups=groups)
