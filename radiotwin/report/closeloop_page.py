@@ -109,11 +109,11 @@ def _cards(report: dict) -> list[tuple[str, str]]:
     if prediction:
         cards.append(("best prediction, RMSE",
                       f"{words.number(prediction['combined_rmse_db'])} dB"))
+        inside = (report["error"].get("combined") or {}).get("in_90_percent_interval")
+        if inside is not None:
+            cards.append(("held-out readings in its 90 % intervals", f"{100 * inside:.0f} %"))
         cards.append((f"{name_label(prediction['best_baseline'])} alone",
                       f"{words.number(prediction['best_baseline_rmse_db'])} dB"))
-    inside = (report["error"].get("combined") or {}).get("in_90_percent_interval")
-    if inside is not None:
-        cards.append(("held-out readings in its 90 % intervals", f"{100 * inside:.0f} %"))
     for key, label, unit in CARDS:
         before, after = (words.number(report["error"][when].get(key))
                          for when in ("before", "after"))

@@ -176,3 +176,13 @@ def test_names_in_words():
     assert variable_label("time_in_flight_s") == ("time in flight", "s")
     assert variable_label("odd_length_m") == ("odd length", "m")
     assert join_names(["a", "b", "a", "c"]) == "a, b and c"
+
+
+def test_the_page_tells_how_far_intervals_can_be_trusted(tmp_path):
+    prediction = {"best_baseline": "regression_kriging", "best_baseline_rmse_db": 5.5, "combined_rmse_db": 1.9,
+                  "advice": "kriging is worse"}
+    error = report()["error"] | {"combined": SCORES | {"rmse_db": 1.9, "in_90_percent_interval": 0.874}}
+    text = page(report(prediction=prediction, error=error), tmp_path)
+    assert "held-out readings in its 90 % intervals" in text and "87 %" in text
+    error["combined"] = SCORES  # of a file that was written before
+    assert "in its 90 % intervals" not in page(report(prediction=prediction, error=error), tmp_path)
