@@ -70,19 +70,23 @@ class CrossValidatedModel:
     @cached_property
     def held_out_reading(self) -> tuple[np.ndarray, np.ndarray]:
         """(n,) predicted reading and (n,) its error scale [dB], with shadowing; NaN = none."""
-        mean_db = self.held_out(lambda model, fit: model.predict(fit).mean_db)
-        scale_db, unheard_db = self.held_out_scales
+        mean_db, scale_db, unheard_db = self._held_out_parts
         shift, left = self.held_out_shadowing
         return mean_db + shift * scale_db, np.hypot(scale_db * left, unheard_db)
 
-    @cached_property
+    @property
     def held_out_scales(self) -> tuple[np.ndarray, np.ndarray]:
-        """`FoldModel.scales_db` of held-out links, without shadowing [dB]."""
-        scale_db, unheard_db = np.full((2, len(self.index)), np.nan)
+        """(n,) error scale without shadowing, and (n,) sd of unheard levels [dB]; NaN = none."""
+        return self._held_out_parts[1:]
+
+    @cached_property
+    def _held_out_parts(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        mean_db, scale_db, unheard_db = np.full((3, len(self.index)), np.nan)
         for number, (model, fit) in enumerate(zip(self.folds, self.fits[1:], strict=True)):
             own = self.index == number
-            scale_db[own], unheard_db[own] = (each[own] for each in model.scales_db(fit))
-        return scale_db, unheard_db
+            mean_db[own], scale_db[own], unheard_db[own] = (
+                each[own] for each in model.predict_parts(fit))
+        return mean_db, scale_db, unheard_db
 
     @cached_property
     def held_out_nll(self) -> np.ndarray:

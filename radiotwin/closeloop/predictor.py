@@ -121,7 +121,7 @@ class _Learnt:
             inner = _Learnt(model, fit, rest, self.kriging, part, self.names)
             errors.append(part.links.level_db[test, None] - inner.members_db(test, seed))
             shares.append(shares_of(part.links, ~out, test))
-            scales.append(model.scales_db(fit)[0][test])
+            scales.append(model.predict_parts(fit)[1][test])
             tested.append(rows[test])
         return (np.concatenate(errors), np.concatenate(shares), np.concatenate(scales),
                 np.concatenate(tested))
@@ -232,7 +232,8 @@ def grown_forests(model: FoldModel, fit: FitResult, part: Part, seed: int,
     """
     rows = np.flatnonzero(model.train)
     z = standardised_residual(model, fit)
-    level_db = model.predict(fit).mean_db[rows] + z * model.scales_db(fit)[0][rows]
+    mean_db, scale_db, _ = model.predict_parts(fit)
+    level_db = mean_db[rows] + z * scale_db[rows]
     return {name: grow_trees(kind, part.common[rows], target, seed, trees)
             for names, target in ((FORESTS, z), (TREES_ALONE, level_db))
             for name, kind in zip(names, (EXTRA_TREES, BOOSTING), strict=True)}
@@ -254,8 +255,8 @@ def physics_db(model: FoldModel, fit: FitResult, rest: CorrelatedShadowing | Non
     Returns:
         (m, 5), or (m, 6) with the rest, level of a link that is detected.
     """
-    mean_db, limit_db, scale_db, unheard_db = (each[test] for each in (
-        model.predict(fit).mean_db, model.limit_db, *model.scales_db(fit)))
+    limit_db, mean_db, scale_db, unheard_db = (each[test] for each in (
+        model.limit_db, *model.predict_parts(fit)))
     losses = model.losses.select(test)
     added: list[tuple] = [(0.0, 1.0)]
     for name, forest in grown_forests(model, fit, part, seed, trees).items():

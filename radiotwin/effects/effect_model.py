@@ -143,9 +143,7 @@ class EffectModel:
     def predict(self, links: LinkData) -> Prediction:
         """Return the levels that are expected of links, see `Prediction`."""
         model, result = self.on_links(links)
-        regression = model.regression()
-        mean_db = regression.predict(result).mean_db
-        scale_db, unheard_db = model.scales_db(result)
+        mean_db, scale_db, unheard_db = model.predict_parts(result)
         if self.unheard is not None:
             of_them = np.isin(links.device, self.unheard.devices)
             mean_db = mean_db + self.unheard.mean_db * of_them
@@ -161,7 +159,7 @@ class EffectModel:
         return Prediction(
             mean_db, np.hypot(scale_db * np.sqrt(self.dof / (self.dof - 2)), unheard_db),
             detection_probability(mean_db, np.hypot(scale_db, unheard_db), model.limit_db, self.dof,
-                                  regression.losses))
+                                  model.losses))
 
 
 def device_sd_db(model: FoldModel, result: FitResult) -> float:

@@ -195,18 +195,19 @@ class FoldModel:
         most = max(every, key=lambda each: float(np.mean(each.drop)))
         return Losses(1.0 - kept, most.drop, most.drop_db)
 
-    def scales_db(self, result: FitResult) -> tuple[np.ndarray, np.ndarray]:
-        """Return (n,) error scale of readings of known devices, and (n,) sd of levels nobody knows.
+    def predict_parts(self, result: FitResult) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return mean of the readings, error scale without unheard levels, and sd of these [dB].
 
-        What is interpolated counts in units of the first; both together make the scale of
-        `predict`. [dB]
+        (n,) each. What is interpolated counts in units of the second; with the third it makes the
+        scale of `predict`.
         """
-        whole = self.predict(result).scale_db
+        reading = self.predict(result)
+        mean_db, whole = reading.mean_db, reading.scale_db
         if all(each.term.unheard_sd_db is None for each in self.effects):
-            return whole, np.zeros(len(whole))
+            return mean_db, whole, np.zeros(len(whole))
         known = replace(self.regression(), random_effect_sd_db=self._scatter_sd_db(slice(None)))
         scale_db = known.predict(result).scale_db
-        return scale_db, np.sqrt(np.maximum(whole**2 - scale_db**2, 0.0))
+        return mean_db, scale_db, np.sqrt(np.maximum(whole**2 - scale_db**2, 0.0))
 
     def _scatter_sd_db(self, rows: np.ndarray | slice) -> np.ndarray | float:
         return _joined_sd_db([each.term.random_effect_sd_db for each in self.effects], rows)

@@ -1,4 +1,4 @@
-"""What the residual of a device's relatives says of it: sectors of one mast, see the same city."""
+"""The residual of a device's relatives: sectors of one mast look over the same city."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def written_field(field: ResidualField) -> dict[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Relatives:
-    """What devices' relatives say of them, see `radiotwin.links.sites.relatives_of`.
+    """Prediction of devices by their relatives, see `radiotwin.links.sites.relatives_of`.
 
     Attributes:
         field: for each device of the residual of its relatives, never its own, in units of its
@@ -106,11 +106,11 @@ class Relatives:
         near = [device for device in field.fields
                 if set(antenna_of(links, device)) & (heard - {device})]
         passed_on: dict[int, float] = {}
-        for kind in (near, sorted(set(field.fields) - set(near))):
-            mine = np.isin(links.device, kind)
+        for alike in (near, sorted(set(field.fields) - set(near))):
+            mine = np.isin(links.device, alike)
             # Where none of the kind was heard itself, as much as of all.
             share = _slope(mean[mine], z[mine]) if mine.any() else _slope(mean, z)
-            passed_on |= dict.fromkeys(kind, share)
+            passed_on |= dict.fromkeys(alike, share)
         return cls(field, relative_sd, passed_on)
 
     def mean(self, links: LinkData) -> np.ndarray:
