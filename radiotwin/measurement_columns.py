@@ -18,6 +18,7 @@ MAX_COORDINATE_M = 1e7  # a quarter of a meridian
 FREQUENCIES_HZ = (1e6, 450e9)  # as of a scene; materials of ITU-R P.2040 end at 450 GHz
 MAX_TIME_S = 1e11  # the year 5138; milliseconds since 1970 lie beyond
 MAX_SPAN_S = 3.2e9  # a century, the longest campaign
+MAX_TILT_DEG = 90.0
 MAX_ANGLE_DEG = 1e6  # thousands of turns in one direction, which some compasses count
 MAX_POWER_DBM = 300.0  # as of a level
 MAX_QUALITY = 1e15  # whole numbers are exact up to there
@@ -109,6 +110,9 @@ def refuse_limits(refuse: Callable[[np.ndarray, str], None], name: str,
             refuse(numbers - np.nanmin(numbers) > MAX_SPAN_S,
                    f"is more than a century ({MAX_SPAN_S:g} s) after the first time, "
                    f"{np.nanmin(numbers):g} s; is one of them wrong, or in another unit?")
+    if name == "tilt_deg":
+        refuse(np.abs(numbers) > MAX_TILT_DEG,
+               f"is no tilt; allowed are -{MAX_TILT_DEG:g} (down) to {MAX_TILT_DEG:g} (up)")
     for ending, limit in (("_deg", MAX_ANGLE_DEG), ("tx_power_dbm", MAX_POWER_DBM),
                           ("quality", MAX_QUALITY)):
         if name.endswith(ending):

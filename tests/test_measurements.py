@@ -99,6 +99,7 @@ def test_bad_rows_name_file_row_and_column(write, text, message):
     ("device,x_m,y_m,z_m,role\na,1,2,3,anchr\n", r"row 2, column role: 'anchr'; allowed are"),
     ("device,x_m,y_m,z_m,role\na,,2,3,anchor\n", r"row 2: anchor 'a' has no x_m, y_m"),
     ("device,x_m,y_m,z_m,role\na,1,2,3e7,anchor\n", r"row 2, column z_m: '3e7' is too far away"),
+    ("device,x_m,y_m,z_m,role,tilt_deg\na,1,2,3,anchor,-91\n", r"row 2, column tilt_deg: '-91' is no tilt; allowed are -90"),
     ("device,x_m,y_m,x_m,role\na,1,2,3,anchor\n", r"row 1: column 'x_m' occurs twice"),
     ("device,x_m,y_m,z_m,role\na,1,2,3,anchor\na,1,2,3,anchor\n", r"row 3, column device: 'a' occurs twice"),
 ])

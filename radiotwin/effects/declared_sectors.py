@@ -1,10 +1,10 @@
 """Sector antennas of which only the direction is known: a planner's table has it, not the pattern.
 
 All declared devices have one pattern (3GPP TR 38.901 V17, Table 7.3-1, as in `sector_antenna`),
-each turned to its own azimuth, and levels that have much in common (`sector_levels`). All azimuths
-may be off by one small angle (a compass, another north); by a large one the table is wrong. So it
-holds for a sector that nobody has measured, too, which a pattern learnt for each device by itself
-does not.
+each turned to its own azimuth and tilt, and levels that have much in common (`sector_levels`). All
+azimuths may be off by one small angle (a compass, another north), and all tilts (what is electrical
+is in few tables); by a large one the table is wrong. So it holds for a sector that nobody has
+measured, too, which a pattern learnt for each device by itself does not.
 """
 
 from collections import Counter
@@ -50,7 +50,9 @@ from radiotwin.effects.sector_levels import (
 from radiotwin.links import LinkData
 
 MIN_DEVICES = 2  # of declared azimuth; of one, the pattern is that of `SectorAntenna`
+TILT_SD_DEG = 4.0  # by which declared tilts are off: electrical ones are a few degrees
 MAX_TURN_DEG = 20.0  # by which compasses, maps and declination are off; more is a wrong table
+OFFSETS = ("azimuth_offset_deg", "tilt_offset_deg")  # numbers that all devices share
 TURNS_DEG = (0.0, -45.0, 45.0, -90.0, 90.0, -135.0, 135.0, 180.0)  # that are tried first
 
 
@@ -74,6 +76,10 @@ class DeclaredSectors(SectorAntenna):
         azimuth_offset_deg: float = quantity(
             0.0, unit="deg", low=-180.0, high=180.0, step=5.0, prior_sd=5.0,
             description="By which all declared azimuths are off, clockwise.")
+        tilt_offset_deg: float = quantity(
+            0.0, unit="deg", low=-60.0, high=80.0, step=4.0,
+            description="By which all declared tilts are off, upwards; without any, the tilt.")
+        has_tilts: bool = Field(False, description="Whether tilts are declared.")
         groups: list[list[DeviceIndex]] = Field(
             [], description="Devices whose levels have more in common: of a mast, of a direction.")
         unheard_sd_db: dict[DeviceIndex, Decibels] = Field(
@@ -105,8 +111,14 @@ class DeclaredSectors(SectorAntenna):
         heard = view.links.device[np.isfinite(view.links.level_db)]
         unheard = unheard_sd_db(declared, groups, set(heard.tolist()), LEVEL_SD_DB)
         return [self.Params(devices=_turned(view.links, declared, shape, offset_deg),
-                            straight=self.straight, azimuth_offset_deg=offset_deg, groups=groups,
-                            unheard_sd_db=unheard)]
+                            straight=self.straight, azimuth_offset_deg=offset_deg,
+                            tilt_offset_deg=shape.tilt_deg, groups=groups, unheard_sd_db=unheard,
+                            has_tilts=bool(np.isfinite(view.links.tilt_deg[declared]).any()))]
+
+    @override
+    def neg_log_prior(self, params: Any) -> float:
+        tilt = 0.5 * (params.tilt_offset_deg / TILT_SD_DEG) ** 2 if params.has_tilts else 0.0
+        return super().neg_log_prior(params) + tilt
 
     @override
     def implausible(self, params: Any, coefficients: np.ndarray) -> str | None:
@@ -130,19 +142,25 @@ class DeclaredSectors(SectorAntenna):
     @override
     def variation(self, params: Any) -> Variation:
         fields = _numbers()
-        shape = next(iter(params.devices.values()))
-        values = np.array([params.azimuth_offset_deg, *(getattr(shape, name) for name in fields if
-                                              name != "azimuth_offset_deg")])
+        first = next(iter(params.devices.values()))
+        values = np.array([getattr(params if name in OFFSETS else first, name) for name in fields])
         steps, low, high = (np.array([each[key] for each in fields.values()], dtype=float)
                             for key in ("step", "low", "high"))
+        # Each antenna's own tilt stays within its bounds.
+        own_deg = [pattern.tilt_deg for pattern in params.devices.values()]
+        bounds, at = quantities(SectorPattern)["tilt_deg"], [*fields].index("tilt_offset_deg")
+        low[at] = values[at] + bounds["low"] - min(own_deg)
+        high[at] = values[at] + bounds["high"] - max(own_deg)
 
         def changed(numbers: np.ndarray) -> DeclaredSectors.Params:
-            offset_deg, *shape = numbers.tolist()
-            update = dict(zip([*fields][1:], shape, strict=True))
-            devices = {device: pattern.model_copy(update=update | {
-                "azimuth_deg": pattern.azimuth_deg + offset_deg - params.azimuth_offset_deg})
+            found = dict(zip(fields, numbers.tolist(), strict=True))
+            offsets = {name: found.pop(name) for name in OFFSETS}
+            turn_deg, up_deg = (each - getattr(params, name) for name, each in offsets.items())
+            devices = {device: pattern.model_copy(update=found | {
+                "azimuth_deg": pattern.azimuth_deg + turn_deg,
+                "tilt_deg": pattern.tilt_deg + up_deg})
                 for device, pattern in params.devices.items()}
-            return params.model_copy(update={"devices": devices, "azimuth_offset_deg": offset_deg})
+            return params.model_copy(update={"devices": devices} | offsets)
 
         return Variation(values, steps, low, high, changed)
 
@@ -153,6 +171,8 @@ class DeclaredSectors(SectorAntenna):
         reported = {name: Parameter.normal(value, sd, field["unit"], allowed_of(name, field))
                     for (name, field), value, sd in zip(_numbers().items(), values,
                                                         estimate.params_sd, strict=True)}
+        if not params.has_tilts:
+            reported["tilt_deg"] = reported.pop("tilt_offset_deg")
         if links.city is None or params.straight:
             reported.pop("scattered_db")
         # The common one is the channel's.
@@ -184,10 +204,10 @@ def _shared(params: Any) -> np.ndarray:
 
 
 def _numbers() -> dict[str, dict]:
-    """Return what is searched for, the turn first: name -> step, bounds and unit."""
-    shape = {name: field for name, field in quantities(SectorPattern).items()
-             if name != "azimuth_deg"}
-    return {"azimuth_offset_deg": quantities(DeclaredSectors.Params)["azimuth_offset_deg"]} | shape
+    """Return what is searched for: name -> step, bounds and unit."""
+    common, shape = quantities(DeclaredSectors.Params), quantities(SectorPattern)
+    return {name: common[name] for name in OFFSETS} | {
+        name: field for name, field in shape.items() if name not in ("azimuth_deg", "tilt_deg")}
 
 
 def _declared(links: LinkData) -> list[int]:
@@ -198,10 +218,19 @@ def _declared(links: LinkData) -> list[int]:
 
 def _turned(links: LinkData, devices: list[int], shape: SectorPattern,
             offset_deg: float) -> dict[int, SectorPattern]:
-    """Return device -> a pattern, turned to the azimuth that is declared for it, and further."""
+    """Return device -> a pattern, turned to what is declared for it, and further.
+
+    A tilt that is not declared is the median of those that are, or else 0; that of `shape` is
+    added.
+    """
+    known = links.tilt_deg[devices]
+    usual = float(np.median(known[np.isfinite(known)])) if np.isfinite(known).any() else 0.0
+    bounds = quantities(SectorPattern)["tilt_deg"]
+    tilts_deg = np.clip(np.where(np.isfinite(known), known, usual) + shape.tilt_deg,
+                        bounds["low"], bounds["high"])
     return {device: shape.model_copy(
-        update={"azimuth_deg": float(links.boresight_deg[device]) + offset_deg})
-        for device in devices}
+        update={"azimuth_deg": float(links.boresight_deg[device]) + offset_deg, "tilt_deg": tilt})
+        for device, tilt in zip(devices, tilts_deg.tolist(), strict=True)}
 
 
 def _best_shape(view: ResidualView, devices: list[int],

@@ -56,6 +56,7 @@ class LinkData:
             within a flight only; stays that of all the data, too.
         boresight_deg: (k,) declared azimuth of each device's antenna, clockwise from north [deg];
             NaN where none is, and where None is given.
+        tilt_deg: (k,) declared tilt of each device's antenna, upwards [deg]; likewise.
         evidence: (n,) piece of evidence of each link, see `radiotwin.links.with_evidence`; None
             before a residual has been looked at.
     """
@@ -88,6 +89,7 @@ class LinkData:
     time_restarts: bool = None  # type: ignore[assignment]
     evidence: np.ndarray | None = None
     boresight_deg: np.ndarray = None  # type: ignore[assignment]
+    tilt_deg: np.ndarray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         timed = np.isfinite(self.time_s).any()
@@ -96,7 +98,8 @@ class LinkData:
             "last_s": lambda: float(np.nanmax(self.time_s)) if timed else np.nan,
             "time_in_flight_s": self._time_in_flight_s, "tracks": self._tracks,
             "time_restarts": lambda: clocks_restart(self.tracks),
-            "boresight_deg": lambda: np.full(len(self.device_names), np.nan)}
+            "boresight_deg": lambda: np.full(len(self.device_names), np.nan),
+            "tilt_deg": lambda: np.full(len(self.device_names), np.nan)}
         for name, derive in derived.items():
             if getattr(self, name) is None:
                 object.__setattr__(self, name, derive())

@@ -10,6 +10,7 @@ from radiotwin.links.checks import (
     MIN_LINKS,
     check_names,
     check_positions,
+    check_tilts,
     find_fill_value,
     refuse_empty_levels,
     require_one_frame,
@@ -88,7 +89,8 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     if scene is not None and scene.city.terrain is not None:
         low = np.isnan(declared_z_m) & measurements.is_anchor
         device_m[low, 2] += scene.city.ground_height_m(*device_m[low, :2].T)
-    notes += check_names(measurements) + check_positions(receiver_m, device_m, scene)
+    notes += check_names(measurements) + check_tilts(measurements)
+    notes += check_positions(receiver_m, device_m, scene)
     from_middle_m = np.abs(receiver_m[:, :2] - np.median(receiver_m[:, :2], axis=0)).max(axis=1)
     leave_out(from_middle_m > MAX_EXTENT_M,
               f"their receiver is more than {MAX_EXTENT_M / 1000:.0f} km from the others")
@@ -160,7 +162,8 @@ def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | N
         scene.city if scene is not None else None,
         is_gain, anchors, notes, _column(table, "pitch_deg"), _column(table, "roll_deg"),
         _column(table, "quality"),
-        boresight_deg=_column(measurements.devices, "azimuth_deg")[kept_devices])
+        boresight_deg=_column(measurements.devices, "azimuth_deg")[kept_devices],
+        tilt_deg=_column(measurements.devices, "tilt_deg")[kept_devices])
     declared_db = None
     if scene is not None:
         declared_db = scene.config.gain_limit_db if is_gain else scene.config.radio.sensitivity_dbm

@@ -22,6 +22,7 @@ PARAMETERS = {
     "warm_up_each_flight_db": "excess at take-off", "ageing_db": "change from first to last",
     "step_db": "step", "step_time_s": "time of the step", "time_constant_s": "time constant",
     "azimuth_deg": "boresight", "azimuth_offset_deg": "common error of the azimuths",
+    "tilt_offset_deg": "common error of the tilts",
     "front_to_back_db": "front-to-back ratio", "tilt_deg": "tilt",
     "vertical_beamwidth_deg": "vertical beamwidth", "beamwidth_deg": "beamwidth",
     "lean_azimuth_deg": "azimuth of the tilt, from the heading",

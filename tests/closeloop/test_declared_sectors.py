@@ -26,6 +26,7 @@ from radiotwin.effects.declared_sectors import DeclaredSectors
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.registry import BUILT_IN
 from radiotwin.effects.sector_antenna import SectorPattern
+from radiotwin.effects.uncertainty import estimates
 from radiotwin.links import prepare_links
 from radiotwin.links.features import link_features
 from radiotwin.measurements import Measurements
@@ -36,8 +37,8 @@ AZIMUTHS_DEG = (20.0, 140.0, 260.0)
 NAMES = [f"{mast}{sector}" for mast in "AB" for sector in range(3)]
 
 
-def network(seed, noise_db=3.0, points=400):
-    """Drive through the streets below two masts of three sectors."""
+def network(seed, noise_db=3.0, points=400, tilts_deg=None):
+    """Drive through the streets below two masts of three sectors, flat or with tilts of each mast's own."""
     rng = np.random.default_rng(seed)
     parts = []
     for flight in range(5):
@@ -49,6 +50,9 @@ def network(seed, noise_db=3.0, points=400):
             off = np.radians(np.degrees(np.arctan2(to_m[:, 0], to_m[:, 1])) - AZIMUTHS_DEG[number % 3])
             antenna_db = 10 * np.log10(0.006 + 0.994 * np.cos(off / 2) ** 8)
             distance_m = np.hypot(np.linalg.norm(to_m, axis=1), 23.5)
+            if tilts_deg is not None:
+                above = -np.arcsin(23.5 / distance_m) - np.radians(tilts_deg[number // 3])
+                antenna_db += 10 * np.log10(0.01 + 0.99 * np.cos(np.clip(above, -1.5, 1.5)) ** 50)
             level_db = -30 - 30 * np.log10(distance_m) + antenna_db + (number % 3 - 1)
             parts.append(pd.DataFrame({
                 "time_s": 1000.0 * flight + np.arange(len(place_m)), "flight": f"f{flight}", "receiver": "car",
@@ -68,8 +72,12 @@ def taken(measurements):
     result = SelectionResult(base)
     others = take_declared(result, [effect() for effect in BUILT_IN], 0, lambda _: None)
     assert len(others) == len(BUILT_IN) - 2
+    whole, parameters = result.model.whole, {}
+    for each, estimate in zip(whole.effects, estimates(whole, result.model.fits[0]), strict=True):
+        parameters |= each.effect.parameters(links, each.params, estimate)
     return SimpleNamespace(before_db=base.rmse_db(), after_db=result.model.rmse_db(), scores=result.scores,
-                           variants=[each.effect.variant for each in result.model.whole.effects],
+                           params=whole.effects[0].params if whole.effects else None, parameters=parameters,
+                           variants=[each.effect.variant for each in whole.effects],
                            note=(result.model.links.notes or [""])[-1])
 
 
@@ -152,6 +160,37 @@ def test_of_a_sector_that_nothing_tells_the_twin_knows_that_it_knows_little(tmp_
     assert abs(np.mean(error_db)) < 4.0
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_declared_tilts_that_differ_predict_better_than_one_for_all(seed):
+    measurements = network(seed, tilts_deg=(-3.0, -20.0))
+    told = measurements.devices.assign(tilt_deg=np.repeat([-3.0, -20.0], 3))
+    flat, tilted = taken(measurements), taken(replace(measurements, devices=told))
+    assert flat.variants == tilted.variants == [DeclaredSectors.variant]
+    assert tilted.after_db < flat.after_db
+    # cos^50 is 3 dB down 9.6° above and below; one tilt for all makes it 13 to 67°.
+    assert tilted.parameters["vertical_beamwidth_deg"].value == pytest.approx(19.2, abs=5)
+    patterns = list(tilted.params.devices.values())
+    assert patterns[0].tilt_deg - patterns[3].tilt_deg == pytest.approx(17.0)
+    assert abs(tilted.params.tilt_offset_deg) < 8
+    assert tilted.parameters.keys() - flat.parameters.keys() == {"tilt_offset_deg"}
+    assert flat.parameters.keys() - tilted.parameters.keys() == {"tilt_deg"}
+
+
+def test_a_sector_without_a_declared_tilt_has_that_of_the_others():
+    measurements = network(3, tilts_deg=(-3.0, -20.0))
+    told = measurements.devices.assign(tilt_deg=[-3.0, -3.0, np.nan, -20.0, np.nan, -3.0])
+    tilts_deg = [each.tilt_deg for each in taken(replace(measurements, devices=told)).params.devices.values()]
+    np.testing.assert_allclose(np.subtract(tilts_deg, tilts_deg[0]), [0, 0, 0, -17, 0, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("tilts_deg", "told"), [([6.0] * 5 + [0.0], True), ([6.0] * 5 + [-2.0], False), ([-6.0] * 6, False)])
+def test_tilts_that_are_probably_downtilts_are_told(tilts_deg, told):
+    measurements = network(3, points=50)
+    devices = measurements.devices.assign(tilt_deg=tilts_deg)
+    notes = prepare_links(replace(measurements, devices=devices), None).notes
+    assert any("5 of 6 declared tilts are above zero, which is upwards" in note for note in notes) == told
+
+
 def test_one_declared_azimuth_is_too_few():
     measurements = network(3)
     devices = measurements.devices.assign(azimuth_deg=[20.0] + [np.nan] * 5)
@@ -166,9 +205,10 @@ def test_all_sectors_share_a_pattern_and_a_level_and_keep_their_azimuths():
     params = DeclaredSectors.Params(devices={device: shape.model_copy(update={"azimuth_deg": azimuth})
                                            for device, azimuth in enumerate(links.boresight_deg)})
     variation = DeclaredSectors().variation(params)
-    wider = variation.params(variation.values + np.array([3.0, 5.0, 0, 0, 0, 0]))
+    wider = variation.params(variation.values + np.array([3.0, 2.0, 5.0, 0, 0, 0]))
     assert [each.azimuth_deg for each in wider.devices.values()] == [23, 143, 263] * 2
     assert {each.beamwidth_deg for each in wider.devices.values()} == {85.0}
+    assert {each.tilt_deg for each in wider.devices.values()} == {2.0}
     term = DeclaredSectors().term(links, params, None)
     np.testing.assert_allclose(term.columns[:, 0], 1.0)  # of a sector without a reading, too
     np.testing.assert_allclose(term.columns[:, 1:].sum(axis=1), 1.0)
