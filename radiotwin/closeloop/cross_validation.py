@@ -103,6 +103,21 @@ class CrossValidatedModel:
             model.usable, mean_if_detected(*reading, model.limit_db, model.dof,
                                            model.losses), np.nan))
 
+    @cached_property
+    def unforeseen(self) -> np.ndarray:
+        """(n,) bool, links on which a fault acts that was not there when their fold learnt.
+
+        What happens on a flight cannot be known before it: such links say nothing of the rest.
+        """
+        found = np.zeros(len(self.index), dtype=bool)
+        for number, fold in enumerate(self.folds):
+            for applied, place in zip(self.whole.effects, same_effects(self.whole, fold),
+                                      strict=True):
+                if applied.effect.within_flights and place is None:
+                    found |= (self.index == number) & (
+                        (applied.term.offset_db != 0) | (applied.term.columns != 0).any(axis=1))
+        return found
+
     def rmse_db(self, rows: np.ndarray | None = None) -> float:
         """Return the held-out RMSE of the detected links of a mask (n,), or of all [dB]."""
         error = self.links.level_db - self.held_out_mean_db
@@ -117,6 +132,17 @@ class CrossValidatedModel:
             own = np.flatnonzero(self.index == number)
             shift[own], left[own] = shadowing.at(self.folds[number].links.select(own))
         return shift, left
+
+
+def same_effects(whole: FoldModel, fold: FoldModel) -> list[int | None]:
+    """Return the place in a fold of each effect of the whole; None for what it has not found."""
+    places: list[int | None] = []
+    place = 0
+    for each in whole.effects:
+        there = place < len(fold.effects) and fold.effects[place].effect is each.effect
+        places.append(place if there else None)
+        place += there
+    return places
 
 
 def without_quality(model: CrossValidatedModel) -> CrossValidatedModel:

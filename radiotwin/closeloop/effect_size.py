@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import t
 
-from radiotwin.closeloop.cross_validation import CrossValidatedModel
-from radiotwin.closeloop.intervals import QUANTILE, same_effects
+from radiotwin.closeloop.cross_validation import CrossValidatedModel, same_effects
+from radiotwin.closeloop.intervals import QUANTILE
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.params import Parameter
 from radiotwin.inference.censored_regression import FitResult

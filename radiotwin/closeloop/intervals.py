@@ -3,7 +3,9 @@
 Of each parameter the wider of two intervals: from the curvature of the likelihood and the scores of
 places and flights (`radiotwin.effects.uncertainty`), and from its values in the models that were
 fitted without one fold each (delete-a-group jackknife; Efron and Tibshirani 1993, 'An introduction
-to the bootstrap', Sec. 11.5), for which everything, the base as well, was fitted again.
+to the bootstrap', Sec. 11.5), for which everything, the base as well, was fitted again. A fold
+whose other links do not tell a parameter, such as that of the flight on which something happened,
+has only the prior's value of it, and does not count.
 """
 
 from __future__ import annotations
@@ -13,15 +15,15 @@ from dataclasses import replace
 import numpy as np
 from scipy.stats import t
 
-from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.closeloop.cross_validation import CrossValidatedModel, same_effects
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.params import Estimate, Parameter
 from radiotwin.effects.uncertainty import estimates
-from radiotwin.inference.censored_regression import FitResult
 
 QUANTILE = 0.95  # upper end of a 90 % interval
 MAX_SHARE = 0.5  # of what is allowed, which an interval may span: more is less than one bit learnt
 LEVELS_DB = 120.0  # span of changes of a level that can be at all, where no bounds are given
+MAX_WIDTH = 3.0  # of a fold's interval, over that of all links: a wider one is the prior's
 MIN_FOLDS = 0.5  # share of the folds that must have found the parameter, too
 
 
@@ -31,48 +33,41 @@ def effect_parameters(model: CrossValidatedModel) -> list[dict[str, Parameter]]:
     Args:
         model: of all links, and of those outside each fold.
     """
-    of_whole = estimates(model.whole, model.fits[0])
-    return [{name: _checked(_widened(parameter, values), len(values), len(model.folds))
-             for name, (parameter, values) in _with_fold_values(model, number, estimate).items()}
-            for number, estimate in enumerate(of_whole)]
+    of_whole, *of_folds = (estimates(each, fit)
+                           for each, fit in zip(model.models, model.fits, strict=True))
+    found = []
+    for number, (applied, estimate) in enumerate(zip(model.whole.effects, of_whole, strict=True)):
+        reported = applied.effect.parameters(model.links, applied.params, estimate)
+        folds = [_of_fold(fold, own, model.whole, number)
+                 for fold, own in zip(model.folds, of_folds, strict=True)]
+        found.append({name: _with_folds(parameter, [fold[name] for fold in folds if name in fold],
+                                        len(folds)) for name, parameter in reported.items()})
+    return found
 
 
-def _with_fold_values(model: CrossValidatedModel, number: int, estimate: Estimate,
-                      ) -> dict[str, tuple[Parameter, np.ndarray]]:
-    """Return each parameter of an effect, and its value in each of the folds that have it."""
-    applied = model.whole.effects[number]
-    reported = applied.effect.parameters(model.links, applied.params, estimate)
-    folds = [_values(fold, fit, model.whole, number)
-             for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
-    return {name: (parameter, np.array([fold[name] for fold in folds if name in fold]))
-            for name, parameter in reported.items()}
-
-
-def _values(fold: FoldModel, fit: FitResult, whole: FoldModel, number: int) -> dict[str, float]:
-    """Return the values of an effect's parameters in one fold; empty where it was not found."""
+def _of_fold(fold: FoldModel, own: list[Estimate], whole: FoldModel,
+             number: int) -> dict[str, Parameter]:
+    """Return an effect's parameters in one fold; empty where it was not found."""
     place = same_effects(whole, fold)[number]
     if place is None:
         return {}
-    applied, effect = fold.effects[place], whole.effects[number].effect
-    coefficients = fit.coefficients[fold.coefficient_slices[place]]
-    variation = effect.variation(applied.params)
-    count = 0 if variation is None else len(variation.values)
-    certain = Estimate(coefficients, np.zeros((len(coefficients), len(coefficients))),
-                       np.zeros((2, count)))
-    params = effect.like(applied.params, whole.effects[number].params)
-    return {name: each.value
-            for name, each in effect.parameters(fold.links, params, certain).items()}
+    effect = whole.effects[number].effect
+    params = effect.like(fold.effects[place].params, whole.effects[number].params)
+    return effect.parameters(fold.links, params, own[place])
 
 
-def same_effects(whole: FoldModel, fold: FoldModel) -> list[int | None]:
-    """Return the place in a fold of each effect of the whole; None for what it has not found."""
-    places: list[int | None] = []
-    place = 0
-    for each in whole.effects:
-        there = place < len(fold.effects) and fold.effects[place].effect is each.effect
-        places.append(place if there else None)
-        place += there
-    return places
+def _with_folds(parameter: Parameter, folds: list[Parameter], count: int) -> Parameter:
+    """Return a parameter in view of what it is in those of some folds that have it."""
+    most = MAX_WIDTH * _width(parameter)
+    values = [each.value for each in folds if not most > 0 or _width(each) <= most]
+    return _checked(_widened(parameter, np.array(values)), len(folds), count)
+
+
+def _width(parameter: Parameter) -> float:
+    """Return the width of a parameter's interval, of its logarithm where ratios count."""
+    ends = np.array([parameter.low, parameter.high])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return float(np.diff(np.log(ends) if parameter.allowed.is_log else ends)[0])
 
 
 def _widened(parameter: Parameter, values: np.ndarray) -> Parameter:

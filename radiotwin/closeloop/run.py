@@ -223,8 +223,8 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
 
 def _dependences(model: CrossValidatedModel, seed: int) -> list[ResidualDependence]:
     mean_db = model.held_out_mean_db
-    return residual_dependences(model.links, model.links.level_db - mean_db,
-                                model.held_out_reading[1], mean_db, seed)
+    residual_db = np.where(model.unforeseen, np.nan, model.links.level_db - mean_db)
+    return residual_dependences(model.links, residual_db, model.held_out_reading[1], mean_db, seed)
 
 
 def _noise_floor_db(links: LinkData, criteria: SelectionCriteria) -> float:

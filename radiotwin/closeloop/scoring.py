@@ -161,7 +161,7 @@ def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score
     Without pieces of evidence `block` (n,) the gain may hang on a few positions.
     """
     gain = model.held_out_nll - extended.held_out_nll
-    usable, los = np.isfinite(gain), model.links.los
+    usable, los = np.isfinite(gain) & ~model.unforeseen, model.links.los
     if not usable.any():
         return replace(score, reason="no held-out link can be judged with it")
     design_effect = model.whole.view(model.fits[0]).design_effect

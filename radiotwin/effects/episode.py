@@ -48,6 +48,7 @@ MIN_DEVIATION_SD = 0.3  # between windows; independent links have 1
 MIN_MEMBER_LINKS = 5  # of a device or receiver in the episode, to be asked whether it agrees
 MIN_KNOWN, MIN_DEVICES = 0.5, 4  # share that is compared, or else devices that must be there
 MIN_MEMBERS = 0.7  # share of them that must agree: it acts on all
+MIN_OVERLAP = 0.3  # of what two windows span together, for them to be one episode
 SAME_SHARE = 0.9  # of a flight's links: an episode of one receiver that long is a faulty flight
 PRIOR_SD_DB, PRIOR_SD_DB_KM = 15.0, 30.0
 
@@ -121,7 +122,7 @@ class Episode(GainEffect):
         rows = _timed_rows(view.links, params.receiver, params.flight)
         window = _strongest(view.links, value_db, weight, rows) \
             if len(rows) >= MIN_LINKS else None
-        if window is None or window.start_s > params.end_s or window.end_s < params.start_s:
+        if window is None or not _is_same(window, params):
             return []
         return [params.model_copy(update={key: value for key, value in window._asdict().items()
                                           if key not in ("nats", "form")})]
@@ -175,6 +176,13 @@ class Episode(GainEffect):
                                                 estimate.coefficients_sd[0], unit),
                 "start_s" + member: Parameter(params.start_s, *params.start_within_s, "s"),
                 "end_s" + member: Parameter(params.end_s, *params.end_within_s, "s")}
+
+
+def _is_same(window: _Window, params: Any) -> bool:
+    """Return whether a window is mostly that of an episode: else it is of something else."""
+    both_s = min(window.end_s, params.end_s) - max(window.start_s, params.start_s)
+    either_s = max(window.end_s, params.end_s) - min(window.start_s, params.start_s)
+    return both_s >= 0 and both_s >= MIN_OVERLAP * either_s
 
 
 def _inside(links: LinkData, params: Any) -> np.ndarray:

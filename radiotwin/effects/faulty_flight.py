@@ -44,6 +44,7 @@ MIN_ALL_FLIGHTS = 4  # of all receivers, for one that scatters more to stand out
 MIN_DEVICE_LINKS = 5  # of a device, to be asked whether it agrees
 MIN_DEVICES = 0.7  # share of the devices that must agree: a fault of the receiver acts on all
 MIN_OFFSET_DB = 2.0  # a smaller one changes no decision
+FAR_SD, MIN_USUAL_SD_DB = 4.0, 0.5  # of flights' levels, robust: what is farther is no usual one
 MIN_SCATTER = 1.5  # times the others'
 MIN_SCATTER_DB = 1e-3
 # Of flights' log scatters and log roughnesses, before any is seen, and the flights that it counts
@@ -215,7 +216,8 @@ def _disagreement(flight: _Flight, flights: list[_Flight], links: LinkData) -> t
                                                         strict=True))]
     p_value, added_db = min(noisy)
     if not _is_first_or_last(flight, links):
-        p_value = min(p_value, *(_offset_p_value(flight, others, kind) for kind in range(2)))
+        p_value = min(p_value, *(_offset_p_value(flight, others, kind, links)
+                                  for kind in range(2)))
     return min(STATISTICS * p_value, 1.0), min(added_db, 50.0)
 
 
@@ -234,21 +236,23 @@ def _excess(own: float, usual: np.ndarray, prior_sd: float) -> tuple[float, floa
     return float(t.sf(excess / sd, freedom + PRIOR_FREEDOM)), float(added_db)
 
 
-def _offset_p_value(flight: _Flight, others: list[_Flight], kind: int) -> float:
+def _offset_p_value(flight: _Flight, others: list[_Flight], kind: int, links: LinkData) -> float:
     """Return the p-value of a flight's level against others'; 1 if it is small or unknown."""
-    levels_db = {receiver: np.array([each.levels_db[kind] for each in others
-                                     if each.receiver == receiver
-                                     and np.isfinite(each.levels_db[kind])])
-                 for receiver in {each.receiver for each in others}}
-    same_db = levels_db.get(flight.receiver, np.zeros(0))
-    if len(same_db) < MIN_FLIGHTS - 1:
+    known = [each for each in others if np.isfinite(each.levels_db[kind])]
+    level_db = np.array([each.levels_db[kind] for each in known])
+    receiver = np.array([each.receiver for each in known])
+    same = receiver == flight.receiver
+    if same.sum() < MIN_FLIGHTS - 1:
         return 1.0
-    own_db = flight.levels_db[kind] - float(np.median(same_db))
+    own_db = flight.levels_db[kind] - float(np.median(level_db[same]))
     if not abs(own_db) >= MIN_OFFSET_DB:
         return 1.0
-    every_db = np.concatenate([each for each in levels_db.values() if len(each)])
-    freedom = max(len(every_db) - sum(len(each) > 0 for each in levels_db.values()), 1)
-    sd_db = max(float(np.sqrt((every_db**2).sum() / freedom)), 0.1)
+    # A first or last flight that is far off is a step in time, and says nothing of how much the
+    # others differ: one of 20 dB would hide a fault of 15.
+    far = np.abs(level_db) > FAR_SD * max(robust_sd(level_db), MIN_USUAL_SD_DB)
+    usual = ~far | [not _is_first_or_last(each, links) for each in known]
+    freedom = max(int(usual.sum()) - len(np.unique(receiver[usual])), 1)
+    sd_db = max(float(np.sqrt((level_db[usual]**2).sum() / freedom)), 0.1)
     return float(2 * t.sf(abs(own_db) / sd_db, freedom))
 
 

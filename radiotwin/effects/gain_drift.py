@@ -169,7 +169,8 @@ class _GainDrift(GainEffect):
                 result[f"time_constant_s[{name}]"] = Parameter.log_normal(
                     value, next(log_sd), "s", Allowed(1.0, float(np.exp(MAX_LOG_S)), is_log=True))
             elif form == "step":
-                result[f"step_time_s[{name}]"] = Parameter(value, value, value, "s")
+                result[f"step_time_s[{name}]"] = Parameter(
+                    value, *_gap_s(links, self.index(links) == member, value), "s")
         return result
 
 
@@ -229,6 +230,14 @@ def _shape(drift: Drift, links: LinkData, time_s: np.ndarray,
         return (time_s >= number).astype(float)
     low, high = span_s or (np.nanmin(time_s), np.nanmax(time_s))  # twins of version 0.1 have none
     return (time_s - number) / max(high - low, 1.0)
+
+
+def _gap_s(links: LinkData, mine: np.ndarray, when_s: float) -> tuple[float, float]:
+    """Return the times of the readings before and after a step: it was somewhere between."""
+    time_s = links.time_s[mine & np.isfinite(links.time_s) & np.isfinite(links.level_db)]
+    before, after = time_s[time_s < when_s], time_s[time_s >= when_s]
+    return (float(before.max()) if len(before) else when_s,
+            float(after.min()) if len(after) else when_s)
 
 
 def _candidates(links: LinkData, residual_db: np.ndarray,
