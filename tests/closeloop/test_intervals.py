@@ -97,6 +97,16 @@ def test_the_jackknife_is_that_of_efron(values, allowed, reach):
     assert (widened.high - 10.0, 10.0 - widened.low) == pytest.approx((reach, reach), rel=1e-3)
 
 
+def test_a_fold_that_has_only_the_prior_of_a_parameter_does_not_count():
+    """Such as that of the one flight on which something happened."""
+    known = Parameter(10.0, 9.5, 10.5, "dB")
+    telling = [Parameter(value, value - 0.6, value + 0.6, "dB") for value in (9.9, 10.1, 10.0, 10.0)]
+    prior = Parameter(0.5, -20.0, 21.0, "dB")
+    assert intervals._with_folds(known, [*telling, prior], 5) == known
+    contradicting = Parameter(4.0, 3.5, 4.5, "dB")
+    assert intervals._with_folds(known, [*telling, contradicting], 5).low < 6.0
+
+
 def test_a_parameter_that_most_folds_do_not_find_is_not_determined():
     known = Parameter(10.0, 9.0, 11.0, "dB")
     assert intervals._checked(known, 4, 6).determined and not intervals._checked(known, 2, 6).determined

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from radiotwin.effects.comparison import by_precision, mean_by_precision
-from radiotwin.effects.episode import Episode
+from radiotwin.effects.episode import Episode, _is_same, _Window
 from radiotwin.effects.faulty_flight import FaultyFlight
 
 FLIGHTS, SLOTS, DEVICES, NOISE_DB, HIDDEN_DB = 6, 60, 5, 2.0, 12.0
@@ -53,6 +53,14 @@ def test_a_faulty_flight_is_found(flown, fault, seed):
     assert (params.receiver, params.flight) == (1, "f3")
     if fault == "noise":
         assert params.noise_sd_db == pytest.approx(5.0, abs=1.5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_step_of_another_receiver_does_not_hide_a_faulty_flight(flown, seed):
+    """A last flight that is 25 dB off is a step in time, and does not make a fault of 6 dB usual."""
+    (params,) = FaultyFlight().propose(flown(seed, lambda links, rng: FAULTS["offset"](links, rng) - 25.0 * (
+        (links.receiver == 0) & (links.flight == FLIGHTS - 1))))
+    assert (params.receiver, params.flight) == (1, "f3")
 
 
 def test_its_term_acts_on_that_flight_only(flown):
@@ -161,3 +169,11 @@ def test_a_value_counts_by_the_scatter_of_its_class_and_outliers_no_more_than_fo
     assert abs(mean_by_precision(value_db, weight)) < 0.3
     unknown_db = np.where(los, given.residual_db, np.nan)
     assert not by_precision(given, unknown_db)[1][~los].any()
+
+
+@pytest.mark.parametrize(("low_s", "high_s", "same"), [(400, 440, True), (430, 470, False), (300, 900, False), (418, 441, True)])
+def test_the_window_of_a_fold_is_that_of_the_episode_if_they_are_mostly_the_same(low_s, high_s, same):
+    params = Episode.Params(receiver=0, start_s=420.0, end_s=440.0, start_within_s=(420.0, 420.0),
+                            end_within_s=(440.0, 440.0), form="loss")
+    window = _Window(20.0, low_s, high_s, (low_s, low_s), (high_s, high_s), "loss")
+    assert _is_same(window, params) == same

@@ -1,0 +1,69 @@
+"""A fault on one flight, which that flight held out cannot show: in worlds that are made here."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import radiotwin as rt
+from radiotwin.effects.gain_drift import Drift, ReceiverDrift
+from radiotwin.effects.params import Estimate
+from radiotwin.measurements import Measurements
+
+LOSS_DB, BEGIN_S, END_S = 9.0, 330.0, 365.0
+
+
+def campaign(seed, loss_db=LOSS_DB):
+    """Fly five times past six devices, with shadows of 4 dB that stay; all lose some decibels for 35 s of one flight."""
+    rng = np.random.default_rng(seed)
+    devices_m = np.column_stack([rng.uniform(0, 400, (6, 2)), np.full(6, 2.0)])
+    parts = []
+    for flight in range(5):
+        for uav in range(2):
+            phase = np.linspace(0, 2 * np.pi, 60) + rng.uniform(0, 2 * np.pi)
+            place_m = np.column_stack([200 + 150 * np.cos(phase), 200 + 150 * np.sin(2 * phase), np.full(60, 50.0)])
+            time_s = 150.0 * flight + np.arange(60) * 1.5
+            for number, device_m in enumerate(devices_m):
+                shadow_db = 4 * np.sin(place_m[:, 0] / 23 + 5 * number) * np.sin(place_m[:, 1] / 31 + 3 * number)
+                level_db = -35 - 25 * np.log10(np.linalg.norm(place_m - device_m, axis=1)) + shadow_db
+                level_db -= loss_db * ((time_s >= BEGIN_S) & (time_s <= END_S))
+                parts.append(pd.DataFrame({
+                    "time_s": time_s, "flight": f"f{flight}", "receiver": f"u{uav}", "receiver_x_m": place_m[:, 0],
+                    "receiver_y_m": place_m[:, 1], "receiver_z_m": 50.0, "device": f"d{number}",
+                    "gain_db": level_db + rng.normal(0, 1.0, 60)}))
+    devices = pd.DataFrame({"device": [f"d{number}" for number in range(6)], "x_m": devices_m[:, 0],
+                            "y_m": devices_m[:, 1], "z_m": 2.0, "role": "anchor", "frequency_hz": 2.4e9})
+    return Measurements(pd.concat(parts, ignore_index=True), devices)
+
+
+@pytest.fixture(scope="module")
+def found():
+    """Loop on a campaign in which each flight is held out in turn."""
+    return rt.close_loop(campaign(0), base="log-distance", hold_out="flight")
+
+
+def test_an_episode_is_as_well_known_as_the_flight_it_was_on_tells(found):
+    [episode] = [each for each in rt.make_report(found)["effects"] if each["name"] == "episode"]
+    loss, start, end = (episode["parameters"][f"{name}[all]"] for name in ("loss_db", "start_s", "end_s"))
+    assert loss["low"] < LOSS_DB < loss["high"] < loss["low"] + 5
+    assert start["low"] - 1.5 <= BEGIN_S <= start["high"] + 1.5 and start["high"] - start["low"] < 30
+    assert end["low"] - 1.5 <= END_S <= end["high"] + 1.5 and end["high"] - end["low"] < 30
+    assert loss["determined"] and start["determined"] and end["determined"]
+
+
+def test_nobody_knew_the_episode_before_its_flight_and_nothing_else_is_judged_by_it(found):
+    model = found.after
+    during = (model.links.time_s >= BEGIN_S) & (model.links.time_s <= END_S)
+    np.testing.assert_array_equal(model.unforeseen, during)
+    assert not found.before.unforeseen.any()
+    assert "time_s" not in {each.variable for each in found.remaining}
+
+
+def test_a_step_is_somewhere_between_two_readings():
+    links = SimpleNamespace(receiver=np.repeat([0, 1], 6), receiver_names=["u0", "u1"],
+                            time_s=np.tile([0.0, 10.0, 20.0, 80.0, 90.0, np.nan], 2), level_db=np.zeros(12))
+    links.level_db[2] = np.nan  # which shows nothing
+    params = ReceiverDrift.Params(receivers={0: Drift("step", 50.0)})
+    when = ReceiverDrift().parameters(links, params, Estimate(np.zeros(2), np.eye(2), np.zeros((2, 0))))["step_time_s[u0]"]
+    assert (when.low, when.value, when.high) == (10.0, 50.0, 80.0)
