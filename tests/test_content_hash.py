@@ -18,7 +18,7 @@ from radiotwin.scene.materials import itu_material
 DIFFERENT = [None, False, True, 0, 1, 0.0, -0.0, 1.0, float("nan"), "", "1", b"1", "ab", ("a", "b"), ("ab",), ((), ("a",)),
              (("a",), ()), {}, {"a": 1}, {"a": 2}, {"b": 1}, {1, 2}, np.zeros(0), np.zeros(2), np.zeros((2, 1)),
              np.zeros((1, 2)), np.zeros(2, dtype=np.float32), np.zeros(2, dtype=int), np.array([0.0, -0.0]),
-             np.array(["a", "b"]), ReceiverDrift, ReceiverDrift(), ReceiverDrift(steps_only=True), LocalizeSettings(),
+             np.array(["a", "b"]), ReceiverDrift, ReceiverDrift(), ReceiverDrift(between_flights=True), LocalizeSettings(),
              LocalizeSettings(swarms=7), "\ud800"]
 
 

@@ -38,7 +38,6 @@ def compare_with_baselines(error: dict[str, Any],
                   f"better than the best other model ({words} alone: {best_db:.2f} dB).")
     after_db = error["after"]["rmse_db"]
     if after_db is not None and after_db > best_db:
-        advice += (f" What was named explains, but predicts worse than {words}: {after_db:.2f} dB "
-                   "by itself.")
+        advice += f" The base with all that was found is behind {words}: {after_db:.2f} dB."
     return {"best_baseline": best, "best_baseline_rmse_db": best_db,
             "combined_rmse_db": combined_db, "advice": advice}

@@ -23,6 +23,7 @@ from radiotwin.closeloop.cross_validation import (
     cross_validate,
     training_parts,
 )
+from radiotwin.closeloop.effect_size import effect_size_db
 from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.scoring import (
     Candidate,
@@ -48,7 +49,7 @@ def select_change_points(result: SelectionResult, links: LinkData, base: Base, f
         seed: of folds and permutations.
         on_progress: called with what is being done.
     """
-    for effect in (ReceiverDrift(steps_only=True), DeviceDrift(steps_only=True)):
+    for effect in (ReceiverDrift(between_flights=True), DeviceDrift(between_flights=True)):
         if folds.by == "flight" and not effect.unavailable(links):
             _select_one_kind(result, effect, links, base, seed, on_progress)
 
@@ -75,6 +76,12 @@ def _select_one_kind(result: SelectionResult, effect: ReceiverDrift | DeviceDrif
         score, extended = score_candidate(model, candidate, block, 1, step, seed, criteria)
         if extended is None:
             result.scores.append(score)
+            return
+        size_db = effect_size_db(extended, step)
+        if not size_db.low > 0:
+            result.scores.append(replace(score, passed=False, reason=(
+                "links that are held out may show nothing of it: "
+                f"{size_db.value:.1f} dB ({size_db.low:.1f} to {size_db.high:.1f})")))
             return
         model = extended
         params = candidate.whole.effects[-1].params

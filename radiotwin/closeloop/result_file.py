@@ -226,7 +226,8 @@ def _shadowing(score: CandidateScore, model: CrossValidatedModel, rank: int) -> 
     return {"name": score.name, "variant": "", "rank": rank, "params": {},
             "parameters": {name: {"value": value, "low": np.nan, "high": np.nan, "unit": unit}
                            for name, (value, unit) in numbers.items()},
-            "confused_with": [], "indistinguishable_from": [],
+            "confused_with": [], "indistinguishable_from": [], "probability": None,
+            "size_db": None, "uses": [], "is_declared": False,
             "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value}}
 
 

@@ -81,9 +81,9 @@ class SelectionResult:
         return self.looked_at[1]
 
     def keep(self, score: CandidateScore, model: CrossValidatedModel) -> None:
-        """Take over a model with one more effect."""
+        """Take over a model with one more effect; it may have been scored in other folds."""
         self.model = model
-        self.scores.append(replace(score, kept=True))
+        self.scores.append(replace(score, kept=True, rmse_db=model.rmse_db()))
         self.rivals.append([])
 
 

@@ -32,7 +32,8 @@ from radiotwin.effects.params import (
     Seconds,
 )
 from radiotwin.effects.residual_view import LevelAt, ResidualView
-from radiotwin.links import LinkData
+from radiotwin.links import LinkData, evidence_blocks
+from radiotwin.links.sites import site_of
 
 MIN_LINKS = 60  # with a time, of a receiver or a flight
 MIN_INSIDE = 20  # links between the two times, and outside
@@ -46,7 +47,8 @@ APART = 2.5  # then it must explain so many times what any other window does
 MAX_P_VALUE = 0.01  # that one of the windows differs like that by chance
 MIN_DEVIATION_SD = 0.3  # between windows; independent links have 1
 MIN_MEMBER_LINKS = 5  # of a device or receiver in the episode, to be asked whether it agrees
-MIN_KNOWN, MIN_DEVICES = 0.5, 4  # share that is compared, or else devices that must be there
+MIN_KNOWN, MIN_SITES = 0.5, 4  # share that is compared, or else sites of devices there must be
+LOW_M, MIN_PLACES = 10.0, 20  # height of receivers in streets, and places that they must have been
 MIN_MEMBERS = 0.7  # share of them that must agree: it acts on all
 MIN_OVERLAP = 0.3  # of what two windows span together, for them to be one episode
 SAME_SHARE = 0.9  # of a flight's links: an episode of one receiver that long is a faulty flight
@@ -153,11 +155,10 @@ class Episode(GainEffect):
 
     @override
     def implausible(self, params: Params, coefficients: np.ndarray) -> str | None:
-        if params.form == "loss":
-            return None
         if coefficients[0] < 0:
-            return f"it would have to amplify, by {-coefficients[0]:.1f} dB/km"
-        if params.frequency_hz is not None:
+            unit = "dB" if params.form == "loss" else "dB/km"
+            return f"it would have to amplify, by {-coefficients[0]:.1f} {unit}"
+        if params.form == "attenuation" and params.frequency_hz is not None:
             most_db_km = max_gas_db_km(params.frequency_hz) + max_rain_db_km(params.frequency_hz)
             if coefficients[0] > most_db_km:
                 return (f"{coefficients[0]:.3g} dB/km are more than air and rain take at "
@@ -245,8 +246,7 @@ def _best_window(ends_s: np.ndarray, time_s: np.ndarray, rest_db: np.ndarray, we
         power = np.maximum(xx - x**2 / total, 0) + prior**-2
         # The logarithm pays for the choice among the windows.
         nats = np.where(allowed & (xx > 0), 0.5 * xd**2 / power, -np.inf) - np.log(allowed.sum())
-        if form == "attenuation":
-            nats = np.where(xd < 0, nats, -np.inf)
+        nats = np.where(xd < 0, nats, -np.inf)  # what comes and goes takes away
         start, end = np.unravel_index(int(nats.argmax()), nats.shape)
         if best is None or nats[start, end] > best.nats:
             likely = nats > nats[start, end] - INTERVAL_NATS
@@ -276,12 +276,17 @@ def _agrees(links: LinkData, value_db: np.ndarray, weight: np.ndarray, known: np
             rows: np.ndarray, inside: np.ndarray) -> bool:
     """Return whether most devices, and most receivers, show the change.
 
-    Where no other flight was, there must be several: what a map lacks hides few at once.
+    Where no other flight was, there must be several sites: what a map lacks hides few at once, but
+    all sectors of a mast. From who is in a street it hides all, and so there must be many places.
     """
     mine, others = rows[inside[rows]], rows[~inside[rows]]
-    if known[mine].mean() < MIN_KNOWN and len(
-            frequent_labels(links.device[mine], MIN_MEMBER_LINKS)) < MIN_DEVICES:
-        return False
+    if known[mine].mean() < MIN_KNOWN:
+        devices = frequent_labels(links.device[mine], MIN_MEMBER_LINKS)
+        sites = {min(site_of(links, device)) for device in devices}
+        pieces = np.unique(np.column_stack([links.device, evidence_blocks(links)])[mine], axis=0)
+        places = np.median(np.unique(pieces[:, 0], return_counts=True)[1])
+        if len(sites) < MIN_SITES or (places < MIN_PLACES and _is_low(links, mine)):
+            return False
     outside_db = mean_by_precision(value_db[others], weight[others])
     change_db = mean_by_precision(value_db[mine], weight[mine]) - outside_db
     if abs(change_db) < MIN_DB:
@@ -290,6 +295,13 @@ def _agrees(links: LinkData, value_db: np.ndarray, weight: np.ndarray, known: np
                            MIN_MEMBER_LINKS, 0.3 * change_db) >= MIN_MEMBERS
                for label in (links.device, links.receiver)
                if np.bincount(label[mine]).max() >= MIN_MEMBER_LINKS)
+
+
+def _is_low(links: LinkData, rows: np.ndarray) -> bool:
+    """Return whether receivers are below most roofs."""
+    place_m = links.receiver_m[rows]
+    ground_m = 0.0 if links.city is None else links.city.ground_height_m(*place_m[:, :2].T)
+    return bool(np.median(place_m[:, 2] - ground_m) < LOW_M)
 
 
 def _is_another(links: LinkData, params: Any, inside: np.ndarray) -> bool:

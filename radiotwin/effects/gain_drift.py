@@ -77,8 +77,9 @@ class _GainDrift(GainEffect):
     forms: ClassVar[tuple[str, ...]]
     end: ClassVar[str]
 
-    def __init__(self, steps_only: bool = False) -> None:
-        self._forms = ("step",) if steps_only else self.forms
+    def __init__(self, between_flights: bool = False) -> None:
+        self._forms = ("step",) if between_flights else self.forms
+        self._between_flights = between_flights
 
     def index(self, links: LinkData) -> np.ndarray:
         """Return the index (n,) of the receiver or device of each link."""
@@ -119,7 +120,8 @@ class _GainDrift(GainEffect):
                 continue
             nats, form, number = max(
                 each for each in _candidates(links.select(rows), view.residual_db[rows],
-                                             view.weight[rows]) if each[1] in self._forms)
+                                             view.weight[rows], self._between_flights)
+                if each[1] in self._forms)
             if nats > MIN_NATS:
                 # Other links must not change these times.
                 keep = form == "ageing" or not self.of_receiver
@@ -240,9 +242,12 @@ def _gap_s(links: LinkData, mine: np.ndarray, when_s: float) -> tuple[float, flo
             float(after.min()) if len(after) else when_s)
 
 
-def _candidates(links: LinkData, residual_db: np.ndarray,
-                weight: np.ndarray) -> Iterator[tuple[float, str, float]]:
-    """Yield (nats, form, number) of each form that the times of one member's links allow."""
+def _candidates(links: LinkData, residual_db: np.ndarray, weight: np.ndarray,
+                between_flights: bool) -> Iterator[tuple[float, str, float]]:
+    """Yield (nats, form, number) of each form that the times of one member's links allow.
+
+    Steps, if so asked, between flights only: within one, places change with time.
+    """
     time_s, comparable = links.time_s, not links.time_restarts
     yield 0.0, "step", float(time_s.mean())
 
@@ -263,6 +268,9 @@ def _candidates(links: LinkData, residual_db: np.ndarray,
     sums = np.cumsum(weight[order]), np.cumsum((weight * residual_db)[order])
     gaps = np.flatnonzero(np.diff(time_s[order]) > 0)
     gaps = gaps[(gaps >= MIN_SIDE) & (gaps < len(order) - MIN_SIDE)]
+    if between_flights:
+        flight = links.flight[order]
+        gaps = gaps[flight[gaps] != flight[gaps + 1]]
     if len(gaps) and comparable:
         total, moment = sums[0][-1], sums[1][-1]
         before, moment_before = sums[0][gaps], sums[1][gaps]

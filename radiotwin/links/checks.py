@@ -1,6 +1,6 @@
 """Checks of measured data: levels, names, positions and units that are probably not meant."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import pandas as pd
@@ -15,6 +15,7 @@ from radiotwin.scene import Scene
 MIN_LINKS = 60  # that anything can be learnt from; half of them detected
 MIN_LINKS_OF_RECEIVER = 5
 CLOSE_M, MIN_POSITIONS = 0.1, 3  # so many positions so close to each other are hardly in metres
+MIN_HEAP, HEAP_RATIO = 10, 5  # equal levels that no tail has, and how far above the next values
 MAX_NAMED = 5  # names in a message
 MAX_OUTSIDE = 0.5  # share of the links
 GROUND_M, ROOFS = 0.5, 0.95  # above it something is built; share of its corners that are roofs
@@ -226,9 +227,30 @@ def find_fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
     if len(values) < 3:
         return None, 0.0
     steps = np.diff(values)
-    heap = counts[0] >= 10 and counts[0] > 5 * counts[1:6].max()
+    heap = counts[0] >= MIN_HEAP and counts[0] > HEAP_RATIO * counts[1:6].max()
     gap = counts[0] >= 3 and steps[0] > 10 * np.median(steps[:20]) and steps[0] > 3.0
     return (float(values[0]), counts[0] / len(seen)) if heap or gap else (None, 0.0)
+
+
+def ceiling_notes(receiver: np.ndarray, names: Sequence[str], level_db: np.ndarray) -> list[str]:
+    """Return a note where receivers read no more than some level: their highest value is a heap.
+
+    Args:
+        receiver: (n,) index of each link's receiver.
+        names: of the receivers.
+        level_db: (n,) [dB]; NaN = not detected.
+    """
+    found = []
+    for number, levels in pd.Series(level_db).dropna().groupby(receiver[np.isfinite(level_db)]):
+        values, counts = np.unique(levels, return_counts=True)
+        if (len(levels) >= MIN_LINKS and len(values) > HEAP_RATIO and counts[-1] >= MIN_HEAP
+                and counts[-1] > HEAP_RATIO * counts[-6:-1].max()):
+            found.append(f"{names[number]} ({counts[-1] / len(levels):.0%} at {values[-1]:g})")
+    if not found:
+        return []
+    which = _shortened(found)
+    return [f"readings are heaped at the highest value of receiver {which}: it reads no "
+            "more, and what was stronger is taken for just that"]
 
 
 def _shortened(names: Iterable[object]) -> str:

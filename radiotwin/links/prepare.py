@@ -8,6 +8,7 @@ import pandas as pd
 from radiotwin.errors import BadInput
 from radiotwin.links.checks import (
     MIN_LINKS,
+    ceiling_notes,
     check_names,
     check_positions,
     check_tilts,
@@ -152,6 +153,7 @@ def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | N
         notes.append(f"{turned.sum():,} headings lie beyond 360° (such as "
                      f"{heading_deg[turned][0]:g}) and are taken for their remainder; heading_deg "
                      "is in degrees, clockwise from north")
+    notes += ceiling_notes(receiver, receiver_names, level_db)
     is_gain = measurements.level_column == "gain_db"
     anchors = frozenset(np.flatnonzero(measurements.is_anchor[kept_devices]).tolist())
     links = LinkData(

@@ -78,8 +78,8 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
     candidates = report["candidates"]
     verdict = words.BADGES[report["verdict"]]
     if report["verdict"] == "effect":
-        sure = words.least_probability(report) >= words.SURE
-        verdict = (verdict if sure else "probable: ") + join_names(words.cause_names(report))
+        verdict = verdict if words.is_sure(report) else "probable: "
+        verdict += join_names(words.cause_names(report))
     pictures = [read_picture(folder, name, title, text) for name, title, text in FIGURES]
     return {
         "lead": words.closeloop_summary(report), "rivals": words.rivals(report),

@@ -53,31 +53,38 @@ def closeloop_summary(report: dict) -> str:
 
 def cause_names(report: dict) -> list[str]:
     """Return the names of the effects that explain something, with counts and probabilities."""
-    causes = [each for each in report["effects"]
-              if each["name"] not in INTERPOLATIONS and not each.get("is_declared")]
-    counts = Counter(name_label(each["name"]) for each in causes)
+    counts = Counter(name_label(each["name"]) for each in _causes(report))
     return [name if count == 1 else f"{name} ({count} times)" for name, count in counts.items()]
 
 
-def least_probability(report: dict) -> float:
-    """Return the probability of the least probable cause that was found; 1 where none has one."""
-    return min((each["probability"] for each in report["effects"]
-                if each.get("probability") is not None), default=1.0)
+def is_sure(report: dict) -> bool:
+    """Return whether each cause that was found has a probability of at least `SURE`.
+
+    Steps between flights have none; a report of version 0.1 tells none at all.
+    """
+    return not report["posterior"] or all(
+        (each.get("probability") or 0.0) >= SURE for each in _causes(report))
 
 
 def rivals(report: dict) -> str:
-    """Say how probable the causes are that were found, and what else it may be; or nothing."""
-    found = [f"{name_label(each['name'])} {probability(each['probability'])}"
-             for each in report["effects"] if each.get("probability") is not None]
+    """Say how probable the causes are that were found, and what else the first one may be."""
+    known = [each for each in _causes(report) if each.get("probability") is not None]
+    found = [f"{name_label(each['name'])} {probability(each['probability'])}" for each in known]
     text = f"Probability that it is there: {join_names(found)}. " if found else ""
-    step = next(iter(report["posterior"]), None)
-    if step is None:
+    first = next((rank for rank, each in enumerate(report["effects"], 1)
+                  if each in _causes(report)), 0)
+    # What acts on one flight comes before the steps of which rivals are known.
+    step = next((each for each in report["posterior"] if each["step"] == first), None)
+    if step is None or report["effects"][first - 1].get("probability") is None:
         return text
     named = {each["name"] for each in report["effects"]}
-    others = [f"{_cause(each['name'])} {probability(each['probability'])}"
-              for each in step["probabilities"]
-              if each["name"] not in named and (each["probability"] or 0) >= LIKELY]
-    return text + (f"What else it may be: {join_names(others[:MAX_NAMED])}." if others else "")
+    others = {each["name"]: each["probability"] or 0.0 for each in step["probabilities"]
+              if each["name"] not in named}
+    left = 1.0 - report["effects"][first - 1]["probability"]
+    share = min(1.0, left / max(sum(others.values()), 1e-9))
+    likely = [f"{_cause(name)} {probability(share * each)}" for name, each in others.items()
+              if share * each >= LIKELY]
+    return text + (f"What else it may be: {join_names(likely[:MAX_NAMED])}." if likely else "")
 
 
 def detectable(report: dict) -> str:
@@ -120,6 +127,12 @@ def probability(value: float | None) -> str:
     return "> 0.99" if value > 0.99 else "< 0.01" if value < 0.01 else f"{value:.2f}"
 
 
+def _causes(report: dict) -> list[dict]:
+    """Return the effects that were found and explain something."""
+    return [each for each in report["effects"]
+            if each["name"] not in INTERPOLATIONS and not each.get("is_declared")]
+
+
 def _largest_first(report: dict) -> list[dict]:
     return sorted(report.get("receivers_compared", []),
                   key=lambda each: -abs(each["difference_db"]["value"]))
@@ -150,13 +163,17 @@ def _effect(report: dict) -> str:
     interpolated = any(each["name"] in INTERPOLATIONS for each in report["effects"])
     after = explained[-1] if explained and interpolated else error["after"]["rmse_db"]
     it = "it" if len(causes) == 1 else "them"
-    least = least_probability(report)
+    known = [each["probability"] for each in _causes(report)
+             if each.get("probability") is not None]
     lacked, sure = "lacked", ""
-    if least < SURE:
+    if not is_sure(report):
         lacked = "probably lacked"
-        sure = f" (probability {probability(least)}{' and more' * (len(causes) > 1)})"
+        if len(known) == len(_causes(report)):
+            sure = f" (probability {probability(min(known))}{' and more' * (len(causes) > 1)})"
+    before = error["before"]["rmse_db"]
+    falls = "falls" if after < before else "goes"
     text = (f"The model {lacked} {join_names(causes)}{sure}. With {it} the RMSE on held-out links "
-            f"falls from {number(error['before']['rmse_db'])} to {number(after)} dB.")
+            f"{falls} from {number(before)} to {number(after)} dB.")
     if report["remaining"]["drivers"]:
         text += f" The remaining residual depends on {join_names(drivers(report))}."
     return text
@@ -167,8 +184,14 @@ def _none(report: dict) -> str:
 
 
 def _unexplained(report: dict) -> str:
-    text = (f"Something is missing that no effect of the catalogue explains{_of(report, OTHER)}: "
-            f"the residual is {number(report['error']['before']['rmse_db'])} dB RMSE")
+    found: list[dict] = next((each["probabilities"] for each in report["posterior"]), [])
+    if not found or found[0]["name"] == OTHER:
+        text = f"Something is missing that no effect of the catalogue explains{_of(report, OTHER)}"
+    else:  # the base is wrong by places, whatever its likeliest cause
+        likely = _likely([each for each in found if each["name"] != NONE])
+        text = "Something is missing, and no name for it is probable enough"
+        text += f" (likeliest: {likely})" if likely else ""
+    text += f": the residual is {number(report['error']['before']['rmse_db'])} dB RMSE"
     names = drivers(report)
     text += f" and depends on {join_names(names)}." if names else "."
     return f"{text} {_sizes(report)}".strip()
@@ -179,14 +202,19 @@ def _undecided(report: dict) -> str:
     text = "Undecided: these measurements do not tell."
     if step is None:
         return text
-    likely = [each for each in step["probabilities"] if (each["probability"] or 0) >= LIKELY]
-    text += " Likeliest: " + join_names(
-        [f"{_cause(each['name'])} ({probability(each['probability'])})"
-         for each in likely[:MAX_NAMED]]) + "."
-    advice = [SETTLES[each["name"]] for each in likely if each["name"] in SETTLES]
+    text += f" Likeliest: {_likely(step['probabilities'])}."
+    advice = [SETTLES[each["name"]] for each in step["probabilities"]
+              if (each["probability"] or 0) >= LIKELY and each["name"] in SETTLES]
     if advice:
         text += f" To settle it: {'; '.join(dict.fromkeys(advice[:2]))}."
     return f"{text} {_sizes(report)}".strip()
+
+
+def _likely(probabilities: list[dict]) -> str:
+    """Name what is likeliest, with probabilities; empty where nothing is likely."""
+    likely = [each for each in probabilities if (each["probability"] or 0) >= LIKELY]
+    return join_names([f"{_cause(each['name'])} ({probability(each['probability'])})"
+                       for each in likely[:MAX_NAMED]])
 
 
 def _of(report: dict, name: str) -> str:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from radiotwin.errors import BadInput
 from radiotwin.report.closeloop_page import write_closeloop_page
-from radiotwin.report.closeloop_words import closeloop_summary
+from radiotwin.report.closeloop_words import closeloop_summary, rivals
 from radiotwin.report.labels import join_names, parameter_label, variable_label
 
 SCORES = {"n": 900, "bias_db": 0.04, "std_db": 3.0, "correlation": 0.9, "rmse_db": 3.0, "mae_db": 2.2, "nll": 2.5}
@@ -28,7 +28,7 @@ def report(verdict="effect", **changes):
     drivers = [{"variable": "time_in_flight_s", "p_value": 0.0004, "effect_db": 1.5}]
     return {
         "schema": "radiotwin.closeloop/2", "radiotwin_version": "0", "base": "twin", "verdict": verdict,
-        "effects": [DRIFT] if found else [],
+        "effects": [DRIFT | {"probability": 0.95}] if found else [],
         "candidates": [{"name": "receiver_drift", "step": 1, "heldout_rmse_db": 2.0, "heldout_nll_gain": 210.0,
                         "p_value": 1e-9, "kept": found, "reason": "" if found else "gains nothing"},
                        {"name": "foliage", "step": 1, "heldout_rmse_db": None, "heldout_nll_gain": None,
@@ -60,7 +60,8 @@ def page(content, folder):
     ("undecided", "Undecided: these measurements do not tell. Likeliest: nothing is missing (0.70) and antenna pattern (0.29). "
      "To settle it: fly around the device at one distance and one height.", "undecided"),
     ("unexplained",
-     "no effect of the catalogue explains (probability &lt; 0.01): the residual is 3.00 dB RMSE and depends on time in flight",
+     "Something is missing, and no name for it is probable enough (likeliest: antenna pattern (0.29)): the residual is "
+     "3.00 dB RMSE and depends on time in flight",
      "unexplained")])
 def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
     text = page(report(verdict), tmp_path)
@@ -94,10 +95,10 @@ def test_what_an_effect_may_be_taken_for_is_said(tmp_path):
 
 
 def test_how_probable_it_is_and_what_would_have_been_seen_is_said(tmp_path):
-    text = page(report(effects=[DRIFT | {"probability": 0.999, "size_db": {
+    text = page(report(effects=[DRIFT | {"probability": 0.6, "size_db": {
         "value": 4.0, "low": 3.0, "high": 5.0, "unit": "dB", "determined": True}}]), tmp_path)
-    assert "Probability that it is there: receiver drift &gt; 0.99." in text
-    assert "What else it may be: nothing is missing 0.70 and antenna pattern 0.29." in text
+    assert "Probability that it is there: receiver drift 0.60." in text
+    assert "What else it may be: nothing is missing 0.28 and antenna pattern 0.12." in text  # 0.4 are left
     assert "by 4.00 dB (RMS; 90 % interval 3.00 to 5.00)" in text
     assert "would have been named from" in text and "4.20 dB/km" in text
     assert "belong to places" in closeloop_summary(report("none"))
@@ -134,11 +135,34 @@ def test_what_is_not_sure_is_said_to_be_probable(tmp_path):
     assert "The model lacked receiver drift. With it" in closeloop_summary(report(effects=both[:1]))
 
 
+def test_rivals_are_those_of_the_step_at_which_the_cause_was_found(tmp_path):
+    """A fault on one flight is found before: what is likely beside it is no rival of it."""
+    effects = [DRIFT | {"name": "episode", "probability": 0.7}, DRIFT | {"rank": 2, "probability": 0.8}]
+    found = report(effects=effects)
+    found["posterior"][0]["step"] = 2
+    text = rivals(found)
+    assert text == "Probability that it is there: episode 0.70 and receiver drift 0.80. "
+
+
+def test_a_step_between_flights_has_no_probability_and_is_called_probable(tmp_path):
+    text = closeloop_summary(report(effects=[DRIFT | {"probability": None}]))
+    assert "The model probably lacked receiver drift. With it the RMSE on held-out links falls" in text
+    rising = report(effects=[DRIFT | {"probability": 0.7}])
+    rising["error"]["after"] |= {"rmse_db": 3.01}
+    assert "goes from 3.00 to 3.01 dB" in closeloop_summary(rising)
+
+
+def test_something_without_a_likely_name_is_missing():
+    unnamed = report("unexplained")
+    unnamed["posterior"][0]["probabilities"] = [{"name": "not in the catalogue", "probability": 0.9}]
+    assert "missing that no effect of the catalogue explains (probability 0.90): the residual" in closeloop_summary(unnamed)
+
+
 def test_a_last_resort_is_not_called_an_explanation(tmp_path):
     shadowing = DRIFT | {"name": "correlated_shadowing", "rank": 2}
     filled = report("unexplained", effects=[shadowing])
     assert "which explains nothing, brings the RMSE to 3.00 dB" in closeloop_summary(filled)
-    filled = report("effect", effects=[DRIFT, shadowing])
+    filled = report("effect", effects=[DRIFT | {"probability": 0.95}, shadowing])
     filled["error"]["after"] |= {"rmse_db": 1.5}
     text = closeloop_summary(filled)
     assert "lacked receiver drift. With it the RMSE on held-out links falls from 3.00 to 2.00 dB" in text
