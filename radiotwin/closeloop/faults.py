@@ -12,6 +12,8 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from radiotwin.closeloop.bases import Base
 from radiotwin.closeloop.change_points import located_links, with_effect
 from radiotwin.closeloop.cross_validation import (
@@ -28,11 +30,12 @@ from radiotwin.closeloop.scoring import (
     fit_candidate,
 )
 from radiotwin.closeloop.selection import SelectionResult
-from radiotwin.effects.base import Effect
+from radiotwin.effects.base import DetectionEffect, Effect
 from radiotwin.effects.fold_model import AppliedEffect, FoldModel
 from radiotwin.links import LinkData, evidence_blocks
 from radiotwin.links.correlation import devices_move
 
+MIN_SHARED = 0.5  # of a fault's links, on which what is held against it must act, too
 MIN_DEVICES = 4  # of known position, to hold some of them out
 
 
@@ -84,7 +87,7 @@ def _against_lasting(faults: list[Candidate | CandidateScore], effects: list[Eff
     """Return faults, or why one is none: an effect that lasts explains as much of all links.
 
     A receiver that has changed reads less from then on, and so it does in the window that ends
-    where the links do not show it.
+    where the links do not show it. That another one has changed is no reason.
     """
     rivals = {name for each in faults if isinstance(each, Candidate)
               for name in each.effect.confused_with}
@@ -98,13 +101,21 @@ def _against_lasting(faults: list[Candidate | CandidateScore], effects: list[Eff
 
 def _unless_outdone(fault: Candidate, lasting: list[Candidate],
                     step: int) -> Candidate | CandidateScore:
+    here = _acts(fault)
     rival = next((each for each in lasting if each.effect.name in fault.effect.confused_with
-                  and each.gain >= fault.gain), None)
+                  and each.gain >= fault.gain and _acts(each)[here].mean() >= MIN_SHARED), None)
     if rival is None:
         return fault
     return CandidateScore(fault.effect.name, step=step, reason=(
         f"{rival.effect.name} explains as much: {rival.gain:.0f} nats of the links that it is "
         f"fitted to, and this {fault.gain:.0f}"))
+
+
+def _acts(candidate: Candidate) -> np.ndarray:
+    """Return (n,) bool, the links that a candidate says something of."""
+    applied = candidate.whole.effects[-1]
+    blanks = isinstance(applied.effect, DetectionEffect)
+    return blanks | (applied.term.offset_db != 0) | (applied.term.columns != 0).any(axis=1)
 
 
 def drop_idle_faults(result: SelectionResult) -> None:

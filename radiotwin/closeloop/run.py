@@ -197,10 +197,10 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     on_progress("looking at the residual")
     dependences_before = _dependences(before, seed)
     select_faults(selection, effects, links, bases[best], seed, on_progress)
+    select_change_points(selection, links, bases[best], folds, seed, on_progress)
     forward_selection(selection, [effect for effect in effects if not effect.within_flights], seed,
                       on_progress)
     drop_idle_faults(selection)
-    select_change_points(selection, links, bases[best], folds, seed, on_progress)
     on_progress("unknown devices again, beside the effects")
     anew = make_bases(scene, seed, executor)[best]  # which remembers no earlier position
     selection.model = relocate_devices(selection.model, links, anew)

@@ -14,8 +14,11 @@ from radiotwin.measurements import Measurements
 LOSS_DB, BEGIN_S, END_S = 9.0, 330.0, 365.0
 
 
-def campaign(seed, loss_db=LOSS_DB):
-    """Fly five times past six devices, with shadows of 4 dB that stay; all lose some decibels for 35 s of one flight."""
+def campaign(seed, loss_db=LOSS_DB, fault_db=0.0, step_db=0.0):
+    """Fly five times past six devices, with shadows of 4 dB that stay.
+
+    All lose some decibels for 35 s of one flight; u1 reads less on flight 2, and u0 on the last.
+    """
     rng = np.random.default_rng(seed)
     devices_m = np.column_stack([rng.uniform(0, 400, (6, 2)), np.full(6, 2.0)])
     parts = []
@@ -28,6 +31,7 @@ def campaign(seed, loss_db=LOSS_DB):
                 shadow_db = 4 * np.sin(place_m[:, 0] / 23 + 5 * number) * np.sin(place_m[:, 1] / 31 + 3 * number)
                 level_db = -35 - 25 * np.log10(np.linalg.norm(place_m - device_m, axis=1)) + shadow_db
                 level_db -= loss_db * ((time_s >= BEGIN_S) & (time_s <= END_S))
+                level_db -= fault_db * (uav == 1 and flight == 2) + step_db * (uav == 0 and flight == 4)
                 parts.append(pd.DataFrame({
                     "time_s": time_s, "flight": f"f{flight}", "receiver": f"u{uav}", "receiver_x_m": place_m[:, 0],
                     "receiver_y_m": place_m[:, 1], "receiver_z_m": 50.0, "device": f"d{number}",
@@ -58,6 +62,14 @@ def test_nobody_knew_the_episode_before_its_flight_and_nothing_else_is_judged_by
     np.testing.assert_array_equal(model.unforeseen, during)
     assert not found.before.unforeseen.any()
     assert "time_s" not in {each.variable for each in found.remaining}
+
+
+def test_a_faulty_flight_is_no_less_one_because_another_receiver_has_changed():
+    report = rt.make_report(rt.close_loop(campaign(1, loss_db=0.0, fault_db=8.0, step_db=15.0), base="log-distance",
+                                          hold_out="flight"))
+    [fault] = [each for each in report["effects"] if each["name"] == "faulty_flight"]
+    offset = fault["parameters"]["offset_db[u1, flight f2]"]
+    assert offset["low"] < -8.0 < offset["high"] < offset["low"] + 8
 
 
 def test_a_step_is_somewhere_between_two_readings():
