@@ -66,7 +66,7 @@ def test_the_advice_names_the_best_other_model():
     found = compare_with_baselines(error, {"log_distance": scores(9.0), "regression_kriging": scores(3.61)})
     assert found["best_baseline"] == "regression_kriging"
     assert "17 % better" in found["advice"] and "kriging alone: 3.61 dB" in found["advice"]
-    assert "predicts worse than kriging: 4.00 dB" in found["advice"]
+    assert "with all that was found is behind kriging: 4.00 dB" in found["advice"]
 
 
 def test_the_advice_says_where_a_plain_model_would_do():
