@@ -66,7 +66,6 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
     """
     rest_db, noise_db = hypotheses.sizes_db
     step = Step(len(model.whole.effects), hypotheses.unnamed_nats, rest_db, noise_db, {})
-    before_db = model.rmse_db()
     there = model.whole.effect_names
     judged = []
     for score in scores:
@@ -77,10 +76,9 @@ def judge(scores: Sequence[CandidateScore], model: CrossValidatedModel, hypothes
             others = [each.held_out_nats for each in scores if each.name != score.name
                       and each.gain_by_fold.size
                       and (by_levels or not np.isfinite(each.evidence_nats))]
-            fall = np.log(before_db / score.rmse_db) if score.rmse_db > 0 else 0.0
             nats = score.nats, held_out, held_out - max([0.0, *others])
             score = replace(score, features=features(
-                nats, float(np.nan_to_num(fall)), rest_db / noise_db, bool(there - {score.name})))
+                nats, score.rmse_fall, rest_db / noise_db, bool(there - {score.name})))
             probability = probability_of(score.name, score.features)
             low = probability < criteria.min_probability
             why = (f"it is not probable enough ({probability:.2f}; "
@@ -121,7 +119,7 @@ def probability_of_all(scores: Sequence[CandidateScore], other: float, before: C
                           sum(each.held_out_nats for each in scores))
     kinds = {each.name for each in scores} | before.whole.effect_names
     values = features((evidence, held_out, held_out - other),
-                      float(np.nan_to_num(np.log(before.rmse_db() / scores[-1].rmse_db))),
+                      sum(each.rmse_fall for each in scores),
                       rest_over_noise, len(kinds) > 1)
     return min(probability_of(each.name, values) for each in scores)
 

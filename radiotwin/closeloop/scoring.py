@@ -30,6 +30,8 @@ class CandidateScore:
         reason: why not; empty where it was.
         nll_gain: held-out likelihood gained [nats]; NaN where it was not tried.
         rmse_db: held-out RMSE with it [dB].
+        rmse_fall: logarithm of the held-out RMSE without it over that with it, on links of which
+            their fold could know.
         p_value: of no gain, links that err alike counted as one, corrected for the candidates.
         step: number of effects that were there before.
         gain_by_fold: (folds,) `nll_gain` of each fold over the number of links that count as one;
@@ -48,6 +50,7 @@ class CandidateScore:
     reason: str = ""
     nll_gain: float = np.nan
     rmse_db: float = np.nan
+    rmse_fall: float = 0.0
     p_value: float = np.nan
     step: int = 0
     gain_by_fold: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -161,7 +164,8 @@ def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score
     Without pieces of evidence `block` (n,) the gain may hang on a few positions.
     """
     gain = model.held_out_nll - extended.held_out_nll
-    usable, los = np.isfinite(gain) & ~model.unforeseen, model.links.los
+    known, los = np.isfinite(gain), model.links.los
+    usable = known & ~model.unforeseen
     if not usable.any():
         return replace(score, reason="no held-out link can be judged with it")
     design_effect = model.whole.view(model.fits[0]).design_effect
@@ -172,7 +176,8 @@ def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score
 
     total, shares = float(gain[usable].sum()), by_fold(usable)
     per_link = max(gain[rows].mean() for rows in (usable, usable & los) if rows.any())
-    p_value, after_db = min(tried * cross_fit_p_value(shares), 1.0), extended.rmse_db(usable)
+    p_value = min(tried * cross_fit_p_value(shares), 1.0)
+    before_db, after_db = model.rmse_db(usable), extended.rmse_db(usable)
     # A receiver, or a device, is not in every fold.
     moved = np.bincount(model.index[usable], np.abs(gain[usable]), len(model.folds))
     touched = (moved >= MIN_MOVED * moved.max()) \
@@ -195,14 +200,19 @@ def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score
         reason = (f"gains in {(shares[touched] > 0).sum()} of the {touched.sum()} folds only that "
                   "it acts on")
     elif per_link < criteria.min_gain_per_link_nats \
-            and after_db > criteria.max_rmse_ratio * model.rmse_db(usable):
+            and after_db > criteria.max_rmse_ratio * before_db:
         reason = (f"gains {per_link:.3f} nats a link only, {criteria.min_gain_per_link_nats} are "
                   "needed")
-    elif after_db > criteria.max_rmse_rise * model.rmse_db(usable):
+    elif after_db > criteria.max_rmse_rise * before_db:
         reason = (f"the error of held-out links would rise to {after_db:.2f} dB, though they "
                   "become likelier")
     elif los_p > criteria.max_los_p_value:
         reason = ("links with line of sight, where the base is surest, do not support it "
                   f"(p = {los_p:.2g})")
-    return replace(score, reason=reason, passed=not reason, nll_gain=total, rmse_db=after_db,
+    return replace(score, reason=reason, passed=not reason, nll_gain=total,
+                   rmse_db=extended.rmse_db(known), rmse_fall=_fall(before_db, after_db),
                    p_value=p_value, gain_by_fold=shares)
+
+
+def _fall(before_db: float, after_db: float) -> float:
+    return float(np.log(before_db / after_db)) if before_db > 0 and after_db > 0 else 0.0

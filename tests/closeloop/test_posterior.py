@@ -97,7 +97,7 @@ def test_noise_is_told_from_a_rest_that_belongs_to_places(open_ground):
 
 def test_probabilities_sum_to_one_and_a_weak_candidate_is_refused(open_ground):
     model, hypotheses = looked_at(open_ground, 5)
-    scores = [CandidateScore(name, passed=True, nll_gain=10 * nats, rmse_db=model.rmse_db() * 0.99, evidence_nats=nats,
+    scores = [CandidateScore(name, passed=True, nll_gain=10 * nats, rmse_db=model.rmse_db() * 0.99, rmse_fall=0.01, evidence_nats=nats,
                              gain_by_fold=np.full(4, nats / 4)) for name, nats in (("foliage", 3.0), ("interference", 2.0))]
     judged, step = judge(scores, model, hypotheses, CRITERIA)
     assert set(step.probabilities) == {"foliage", "interference", NONE, OTHER}
