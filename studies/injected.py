@@ -196,7 +196,7 @@ def injected_table(rows: pd.DataFrame) -> str:
     for name, row in by_name.reindex(list(FAULTS)).dropna(how="all").iterrows():
         fault = FAULTS[str(name)]
         without = by_name.loc[f"{str(name).split('-')[0]}-nothing"]
-        lines.append([fault.what, _right(fault, row), _new(row, without),
+        lines.append([fault.what, _right(fault, row, without), _new(row, without),
                       _size(fault, row, without), row["verdict"],
                       *(number(row[f"{key}_db"], 2) for key in ("before", "after", "combined",
                                                                 "best_baseline"))])
@@ -206,10 +206,13 @@ def injected_table(rows: pd.DataFrame) -> str:
                     "Faults put into real measurements")
 
 
-def _right(fault: Fault, row: pd.Series) -> str:
+def _right(fault: Fault, row: pd.Series, without: pd.Series) -> str:
+    """Return whether the fault is named: of its member, or else where it is not without it."""
     if not fault.names:
         return "–"
-    found = [number for number, name in enumerate(row["named"]) if name in fault.names]
+    name = fault.parameter[0] if fault.parameter else ""
+    found = [number for number, each in enumerate(row["named"]) if each in fault.names and (
+        name in row["parameters"][number] if name else each not in without["named"])]
     if not found:
         return "no"
     probability = row["probabilities"][found[0]]
