@@ -114,8 +114,7 @@ class CrossValidatedModel:
             for applied, place in zip(self.whole.effects, same_effects(self.whole, fold),
                                       strict=True):
                 if applied.effect.within_flights and place is None:
-                    found |= (self.index == number) & (
-                        (applied.term.offset_db != 0) | (applied.term.columns != 0).any(axis=1))
+                    found |= (self.index == number) & applied.acts
         return found
 
     def rmse_db(self, rows: np.ndarray | None = None) -> float:

@@ -115,7 +115,7 @@ def _acts(candidate: Candidate) -> np.ndarray:
     """Return (n,) bool, the links that a candidate says something of."""
     applied = candidate.whole.effects[-1]
     blanks = isinstance(applied.effect, DetectionEffect)
-    return blanks | (applied.term.offset_db != 0) | (applied.term.columns != 0).any(axis=1)
+    return blanks | applied.acts
 
 
 def drop_idle_faults(result: SelectionResult) -> None:

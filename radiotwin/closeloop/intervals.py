@@ -19,11 +19,11 @@ from radiotwin.closeloop.cross_validation import CrossValidatedModel, same_effec
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.params import Estimate, Parameter
 from radiotwin.effects.uncertainty import estimates
+from radiotwin.inference.sandwich import MAX_WIDTH
 
 QUANTILE = 0.95  # upper end of a 90 % interval
 MAX_SHARE = 0.5  # of what is allowed, which an interval may span: more is less than one bit learnt
 LEVELS_DB = 120.0  # span of changes of a level that can be at all, where no bounds are given
-MAX_WIDTH = 3.0  # of a fold's interval, over that of all links: a wider one is the prior's
 MIN_FOLDS = 0.5  # share of the folds that must have found the parameter, too
 
 

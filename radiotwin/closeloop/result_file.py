@@ -26,6 +26,8 @@ from radiotwin.records import read_record, validated
 SCHEMA, SCHEMA_1 = "radiotwin.closeloop/2", "radiotwin.closeloop/1"
 REMEDY = "run `radiotwin close-loop` again"
 MAX_GROUPS = 100  # thousands of transmitter positions say nothing one by one
+# Of the interpolated rest, and of effects that version 0.1 wrote.
+NOT_KNOWN: dict[str, Any] = {"size_db": None, "uses": [], "is_declared": False, "probability": None}
 
 
 def make_report(loop: Loop) -> dict[str, Any]:
@@ -184,7 +186,7 @@ def _from_version_1(report: dict[str, Any]) -> dict[str, Any]:
     new = {new_names.get(name, name): value for name, value in report.items()}
     new["effects"] = [{("params" if name == "setting" else name): value
                        for name, value in effect.items()}
-                      | {"size_db": None, "uses": [], "is_declared": False, "probability": None}
+                      | NOT_KNOWN
                       for effect in report["effects"]]
     new["error"] = _with_new_bias(report["error"]) | {"combined": None}
     new["baselines"] = _with_new_bias(report["baselines"])
@@ -226,9 +228,8 @@ def _shadowing(score: CandidateScore, model: CrossValidatedModel, rank: int) -> 
     return {"name": score.name, "variant": "", "rank": rank, "params": {},
             "parameters": {name: {"value": value, "low": np.nan, "high": np.nan, "unit": unit}
                            for name, (value, unit) in numbers.items()},
-            "confused_with": [], "indistinguishable_from": [], "probability": None,
-            "size_db": None, "uses": [], "is_declared": False,
-            "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value}}
+            "confused_with": [], "indistinguishable_from": [],
+            "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value}} | NOT_KNOWN
 
 
 def _groups(links: LinkData) -> dict[str, dict[str, np.ndarray]]:

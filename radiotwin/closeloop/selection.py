@@ -273,8 +273,7 @@ def _alike(best: CandidateScore, other: CandidateScore, criteria: SelectionCrite
 def _on_one_mast(model: CrossValidatedModel) -> int:
     """Return how many devices the last effect acts on, if they are all on one mast; else 0."""
     applied, links = model.whole.effects[-1], model.links
-    acts = (applied.term.offset_db != 0) | (applied.term.columns != 0).any(axis=1)
-    devices = np.unique(links.device[acts])
+    devices = np.unique(links.device[applied.acts])
     on_mast = len(devices) and set(devices) <= set(site_of(links, devices[0]))
     return len(devices) if on_mast else 0
 

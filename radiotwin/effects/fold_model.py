@@ -36,6 +36,11 @@ class AppliedEffect:
     params: Any
     term: Term
 
+    @property
+    def acts(self) -> np.ndarray:
+        """(n,) bool, links whose level it may change."""
+        return (self.term.offset_db != 0) | (self.term.columns != 0).any(axis=1)
+
 
 @dataclass(frozen=True, eq=False)
 class FittedEffect:

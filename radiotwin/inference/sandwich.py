@@ -20,7 +20,7 @@ from scipy.stats import norm, t
 
 MIN_CLUSTERS = 1.5  # effective ones, below which a way to cluster says nothing of a parameter
 MAX_LEFT_OUT = 50  # clusters, up to which the fit without each is looked at
-MAX_VARIANCE_RATIO = 9.0  # of a parameter without a cluster: above, no other cluster tells it
+MAX_WIDTH = 3.0  # of an interval without some data, over that with all: a wider one is the prior's
 QUANTILE = 0.95  # upper end of a 90 % interval
 
 
@@ -78,8 +78,8 @@ class Scores:
     def _clustered(self, bread: np.ndarray, own: np.ndarray, count: int) -> np.ndarray:
         """Return the covariance (q, q) by clusters (n,) that err by themselves.
 
-        Few clusters bend the fit towards themselves: then by how far it moves without each. How far
-        the clusters err apart does not show in a parameter without the only one that tells it.
+        Few clusters bend the fit towards themselves: then by how far it moves without each. Without
+        the only cluster that determines a parameter it moves to the prior, which does not count.
         """
         sums = _by_cluster(self.score, own, count)
         if count > MAX_LEFT_OUT:
@@ -90,8 +90,8 @@ class Scores:
         for number in range(count):
             mine = self.root[np.flatnonzero(rows == number)]
             without = np.linalg.inv(every - _dense(mine.T @ mine))
-            told = np.diag(without) <= MAX_VARIANCE_RATIO * np.diag(bread)
-            moves[number] = np.where(told, without @ sums[number], 0.0)
+            determined = np.diag(without) <= MAX_WIDTH**2 * np.diag(bread)
+            moves[number] = np.where(determined, without @ sums[number], 0.0)
         return (count - 1) / count * moves.T @ moves
 
     def _effective_clusters(self, bread: np.ndarray, own: np.ndarray, count: int) -> np.ndarray:

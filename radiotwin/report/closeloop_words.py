@@ -52,7 +52,7 @@ def closeloop_summary(report: dict) -> str:
 
 
 def cause_names(report: dict) -> list[str]:
-    """Return the names of the effects that explain something, with counts and probabilities."""
+    """Return the names of the effects that explain something, with counts."""
     counts = Counter(name_label(each["name"]) for each in _causes(report))
     return [name if count == 1 else f"{name} ({count} times)" for name, count in counts.items()]
 
@@ -68,11 +68,11 @@ def is_sure(report: dict) -> bool:
 
 def rivals(report: dict) -> str:
     """Say how probable the causes are that were found, and what else the first one may be."""
-    known = [each for each in _causes(report) if each.get("probability") is not None]
+    causes = _causes(report)
+    known = [each for each in causes if each.get("probability") is not None]
     found = [f"{name_label(each['name'])} {probability(each['probability'])}" for each in known]
     text = f"Probability that it is there: {join_names(found)}. " if found else ""
-    first = next((rank for rank, each in enumerate(report["effects"], 1)
-                  if each in _causes(report)), 0)
+    first = next((rank for rank, each in enumerate(report["effects"], 1) if each in causes), 0)
     # What acts on one flight comes before the steps of which rivals are known.
     step = next((each for each in report["posterior"] if each["step"] == first), None)
     if step is None or report["effects"][first - 1].get("probability") is None:
@@ -163,12 +163,12 @@ def _effect(report: dict) -> str:
     interpolated = any(each["name"] in INTERPOLATIONS for each in report["effects"])
     after = explained[-1] if explained and interpolated else error["after"]["rmse_db"]
     it = "it" if len(causes) == 1 else "them"
-    known = [each["probability"] for each in _causes(report)
-             if each.get("probability") is not None]
+    found = _causes(report)
+    known = [each["probability"] for each in found if each.get("probability") is not None]
     lacked, sure = "lacked", ""
     if not is_sure(report):
         lacked = "probably lacked"
-        if len(known) == len(_causes(report)):
+        if len(known) == len(found):
             sure = f" (probability {probability(min(known))}{' and more' * (len(causes) > 1)})"
     before = error["before"]["rmse_db"]
     falls = "falls" if after < before else "goes"
