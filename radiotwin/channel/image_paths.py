@@ -10,6 +10,7 @@ from typing_extensions import override
 
 from radiotwin.channel.base import ANY_LEVEL_SD_DB, ChannelModel
 from radiotwin.channel.followed_paths import path_gains
+from radiotwin.channel.published import free_space_db
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.channel.stored import require_names, require_number
 from radiotwin.inference.gaussian import Limit, limits_of
@@ -18,6 +19,8 @@ from radiotwin.links import LinkGeometry
 MIN_NLOS = 30  # links without line of sight that the diffuse power is fitted to
 DIFFUSE_DEFAULT = (-150.0, 3.0)  # nearly nothing; the exponent then does not matter
 DIFFUSE_BOUNDS = np.array([[-150.0, 2.0], [-60.0, 6.0]])
+NEAR_QUANTILE = 0.05  # of links that are nearer than where diffuse power is bounded
+MIN_LOSS_DB = 6.0  # of diffuse power beside free space: one reflection at concrete loses as much
 DIFFUSE_STARTS_DB = (-100.0, -110.0, -120.0, -130.0)
 LOS_SLOPE_SD_DB, NLOS_SLOPE_SD_DB = 1.0, 5.0  # prior: how wrong the fall may be [dB per decade]
 ERROR_SCALE_DB = 4.0  # of the Cauchy loss of the fit of the diffuse power
@@ -74,7 +77,7 @@ class ImagePaths(ChannelModel):
         power = path_gains(nlos)
 
         def loss(numbers: np.ndarray) -> float:
-            inside = np.clip(numbers, *DIFFUSE_BOUNDS)
+            inside = _within_bounds(numbers, links)
             error_db = level_db - with_diffuse_db(power, nlos.distance_m, *inside)
             error_db = error_db - np.median(error_db[known & ~blank])
             error_db = np.where(blank, np.minimum(error_db, 0.0), error_db)[known]
@@ -84,7 +87,7 @@ class ImagePaths(ChannelModel):
         starts = [np.array([start_db, DIFFUSE_DEFAULT[1]]) for start_db in DIFFUSE_STARTS_DB]
         found = minimize(loss, min(starts, key=loss), method="Nelder-Mead",
                          options={"xatol": 0.1, "fatol": 0.5}).x
-        gain_db, exponent = np.clip(found, *DIFFUSE_BOUNDS)
+        gain_db, exponent = _within_bounds(found, links)
         self.diffuse = float(gain_db), float(exponent)
         return self
 
@@ -144,6 +147,20 @@ def stored_diffuse(value: Any) -> tuple[float, float]:
         raise ValueError("the diffuse power is not a gain and an exponent")
     named = dict(zip(("gain", "exponent"), value, strict=True))
     return require_number(named, "gain", -300.0, 100.0), require_number(named, "exponent", 0, 20)
+
+
+def _within_bounds(numbers: np.ndarray, links: LinkGeometry) -> np.ndarray:
+    """Return the diffuse power (2,) that is nearest and weaker than a way in free space.
+
+    A level of links without line of sight is fitted beside it. Where paths bring nothing that
+    readings show, diffuse power above that of free space would take their place, and then that of
+    the links with line of sight.
+    """
+    gain_db, exponent = np.clip(numbers, *DIFFUSE_BOUNDS)
+    near_m = min(float(np.quantile(links.distance_m, NEAR_QUANTILE)), 100.0)
+    most_db = -free_space_db(np.array(100.0), links.frequency_hz) - MIN_LOSS_DB \
+        + 10 * (exponent - 2.0) * np.log10(near_m / 100.0)
+    return np.array([np.clip(gain_db, None, most_db), exponent])
 
 
 def with_diffuse_db(power: np.ndarray, distance_m: np.ndarray, gain_db: float,

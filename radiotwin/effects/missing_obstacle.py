@@ -7,16 +7,16 @@ sight, plus a fitted offset). Exactly: the channel's level over the map with the
 """
 
 from functools import lru_cache
+from itertools import product
 
 import numpy as np
 from pydantic import Field
 from scipy.constants import speed_of_light
 from typing_extensions import override
 
-from radiotwin.effects.arrays import city_of, ends_above, ends_above_ground
+from radiotwin.effects.arrays import city_of, ends_above, ends_above_ground, subsample
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.boxes import (
-    CELL_M,
     HEIGHTS_M,
     Box,
     Crossing,
@@ -43,6 +43,11 @@ from radiotwin.scene.citymap import CONCRETE, CityMap
 
 MIN_NATS = 6.0  # that a cell must gain to be proposed
 MAX_PROPOSALS = 4
+SHIFTS_M = (-8.0, 0.0, 8.0)  # from a cell's centre, to the east and to the north
+SHAPES = (*(((side_m, side_m), (0.0, 45.0)) for side_m in (6.0, 12.0, 24.0)),
+          *((sides_m, (0.0, 45.0, 90.0, 135.0)) for sides_m in ((20.0, 8.0), (36.0, 12.0),
+                                                                (40.0, 24.0))))
+REACH_M, MAX_LINKS = 30.0, 3000  # links so near to a centre, and how many, that shapes are tried on
 NEAR_M = 25.0  # links whose ground tracks stay farther away keep their level, also exactly
 LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)  # of an obstructed link, equally likely
 MAX_LOSS_DB = 50.0  # that a box causes
@@ -80,12 +85,33 @@ class MissingObstacle(GainEffect):
             return []
         nats = obstruction_nats(view.residual_db[rows], view.scale_db[rows],
                                 LOSSES_DB) / view.design_effect
-        centres_m, total = back_project(*ends_above_ground(links, rows),
-                                        nats)
-        side_m = 1.5 * CELL_M
-        return [self.Params(box=Box(x_m, y_m, side_m, side_m, HEIGHTS_M[height], 0.0))
-                for (x_m, y_m), height, gain in best_cells(centres_m, total, MAX_PROPOSALS)
+        centres_m, total = back_project(*ends_above_ground(links, rows), nats)
+        return [self._best_shape(view, rows, centre_m, height)
+                for centre_m, height, gain in best_cells(centres_m, total, MAX_PROPOSALS)
                 if gain > MIN_NATS]
+
+    def _best_shape(self, view: ResidualView, los: np.ndarray, centre_m: np.ndarray,
+                    height: int) -> Params:
+        """Return the box near a cell's centre with which links (r,) with line of sight gain most.
+
+        Of shapes, turns and places that the cell does not tell: a box that is too large hides links
+        that are not obstructed, and a search that starts there ends where it started.
+        """
+        links = view.links
+        around = Box(*centre_m.tolist(), 2 * REACH_M, 2 * REACH_M, max(HEIGHTS_M), 0.0)
+        near = near_box(around, *ends_above_ground(links, los), 0.0)
+        rows = subsample(los[near], MAX_LINKS)
+        mine = links.select(rows)
+
+        def gain_nats(box: Box) -> float:
+            changed_db = self.term(mine, self.Params(box=box), view.level_at).offset_db
+            return float(view.gain_nats(rows, changed_db).sum())
+
+        boxes = (Box(centre_m[0] + east_m, centre_m[1] + north_m, *sides_m, top_m, turn_deg)
+                 for east_m, north_m, (sides_m, turns_deg), top_m
+                 in product(SHIFTS_M, SHIFTS_M, SHAPES, HEIGHTS_M[max(height - 1, 0):height + 2])
+                 for turn_deg in turns_deg)
+        return self.Params(box=max(boxes, key=gain_nats))
 
     @override
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
