@@ -33,9 +33,8 @@ def make_blend(model: CrossValidatedModel, prediction: CombinedPrediction,
     if _is_physics_alone(model, prediction):
         return None
     total = np.sum(list(weights.values()), axis=0)
-    forests = {}
-    if set(weights) & set(FORESTS + TREES_ALONE):
-        forests = grown_forests(whole, fit, Part(whole.links), seed)
+    grown = set(weights) & set(FORESTS + TREES_ALONE)
+    forests = grown_forests(whole, fit, Part(whole.links), seed, names=grown) if grown else {}
     laws = {kind.name: fitted_law(kind, whole.links, whole.train)
             for kind in LAWS if kind.name in weights}
     places = np.column_stack([np.round(whole.links.receiver_m / SAME_M) * SAME_M,
@@ -46,7 +45,7 @@ def make_blend(model: CrossValidatedModel, prediction: CombinedPrediction,
     return Blend({name: (float(pair[0]), float(pair[1])) for name, pair in
                   ((name, pair / total) for name, pair in weights.items())},
                  HALF_M, (near, far), places[:, :3], places[:, 3].astype(int),
-                 {name: forest for name, forest in forests.items() if name in weights}, laws,
+                 forests, laws,
                  np.column_stack([declared, whole.links.boresight_deg[declared]]))
 
 

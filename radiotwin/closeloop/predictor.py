@@ -9,6 +9,7 @@ folds are held out in turn (nested cross-validation).
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -223,20 +224,28 @@ def _weights(error_db: np.ndarray, share: np.ndarray, names: list[str]) -> np.nd
     return convex_weights(error_db[known], share[known], PULL)
 
 
-def grown_forests(model: FoldModel, fit: FitResult, part: Part, seed: int,
-                  trees: int = TREES) -> dict[str, Forest]:
+def grown_forests(model: FoldModel, fit: FitResult, part: Part, seed: int, trees: int = TREES,
+                  names: Collection[str] = (*FORESTS, *TREES_ALONE)) -> dict[str, Forest]:
     """Grow trees on training links: on the standardised residual (`FORESTS`), and on the levels.
 
     A blank counts as the named effects' mean below the limit. They are not told which receiver it
     is: its effects have names, and a map has none.
+
+    Args:
+        model: n links, of which some are learnt from.
+        fit: to these.
+        part: the links as trees are told of them.
+        seed: of the trees.
+        trees: number of them.
+        names: those that are asked for.
     """
     rows = np.flatnonzero(model.train)
     z = standardised_residual(model, fit)
     mean_db, scale_db, _ = model.predict_parts(fit)
     level_db = mean_db[rows] + z * scale_db[rows]
     return {name: grow_trees(kind, part.common[rows], target, seed, trees)
-            for names, target in ((FORESTS, z), (TREES_ALONE, level_db))
-            for name, kind in zip(names, (EXTRA_TREES, BOOSTING), strict=True)}
+            for both, target in ((FORESTS, z), (TREES_ALONE, level_db))
+            for name, kind in zip(both, (EXTRA_TREES, BOOSTING), strict=True) if name in names}
 
 
 def physics_db(model: FoldModel, fit: FitResult, rest: CorrelatedShadowing | None, part: Part,

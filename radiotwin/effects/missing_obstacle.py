@@ -97,8 +97,8 @@ class MissingObstacle(GainEffect):
         Of shapes, turns and places that the cell does not tell: a box that is too large hides links
         that are not obstructed, and a search that starts there ends where it started.
         """
-        links = view.links
-        around = Box(*centre_m.tolist(), 2 * REACH_M, 2 * REACH_M, max(HEIGHTS_M), 0.0)
+        links, (x_m, y_m) = view.links, centre_m.tolist()
+        around = Box(x_m, y_m, 2 * REACH_M, 2 * REACH_M, max(HEIGHTS_M), 0.0)
         near = near_box(around, *ends_above_ground(links, los), 0.0)
         rows = subsample(los[near], MAX_LINKS)
         mine = links.select(rows)
@@ -107,11 +107,15 @@ class MissingObstacle(GainEffect):
             changed_db = self.term(mine, self.Params(box=box), view.level_at).offset_db
             return float(view.gain_nats(rows, changed_db).sum())
 
-        boxes = (Box(centre_m[0] + east_m, centre_m[1] + north_m, *sides_m, top_m, turn_deg)
-                 for east_m, north_m, (sides_m, turns_deg), top_m
-                 in product(SHIFTS_M, SHIFTS_M, SHAPES, HEIGHTS_M[max(height - 1, 0):height + 2])
-                 for turn_deg in turns_deg)
-        return self.Params(box=max(boxes, key=gain_nats))
+        tops_m = HEIGHTS_M[max(height - 1, 0):height + 2]
+        shapes = [(sides_m, turn_deg) for sides_m, turns_deg in SHAPES for turn_deg in turns_deg]
+        best = max((Box(x_m, y_m, *sides_m, top_m, turn_deg)
+                    for (sides_m, turn_deg), top_m in product(shapes, tops_m)), key=gain_nats)
+        best = max((best._replace(x_m=x_m + east_m, y_m=y_m + north_m, height_m=top_m)
+                    for east_m, north_m, top_m in product(SHIFTS_M, SHIFTS_M, tops_m)),
+                   key=gain_nats)
+        return self.Params(box=max((Box(best.x_m, best.y_m, *sides_m, best.height_m, turn_deg)
+                                    for sides_m, turn_deg in shapes), key=gain_nats))
 
     @override
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:

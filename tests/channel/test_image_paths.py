@@ -1,6 +1,7 @@
 """The channel that follows paths, fitted to links that say little."""
 
 import numpy as np
+import pytest
 import trimesh
 
 from radiotwin.channel.image_paths import DIFFUSE_DEFAULT, ImagePaths
@@ -19,3 +20,20 @@ def test_where_all_links_without_line_of_sight_are_blank_the_diffuse_power_is_as
     links = LinkGeometry(device_m, receiver_m, los, np.zeros(40, int), city, 2.4e9)
     fitted = ImagePaths(diffuse=(-80.0, 2.0)).fit_diffuse(links, np.full(40, np.nan), -100.0)
     assert fitted.diffuse == DIFFUSE_DEFAULT
+
+
+@pytest.mark.parametrize("frequency_hz", [0.9e9, 28e9])
+def test_diffuse_power_stays_below_that_of_free_space(frequency_hz):
+    """Levels behind a wall fall with distance only: how deep a receiver is in its shadow does not matter."""
+    wall = trimesh.creation.box(bounds=[[45, -400, 0], [55, 400, 60]])
+    city = CityMap(wall.vertices, wall.faces)
+    rng = np.random.default_rng(0)
+    receiver_m = np.column_stack([rng.uniform(80, 200, 200), rng.uniform(-80, 80, 200), rng.uniform(2, 150, 200)])
+    device_m = np.tile([0.0, 0, 10], (200, 1))
+    links = LinkGeometry(device_m, receiver_m, city.line_of_sight(device_m, receiver_m), np.zeros(200, int), city,
+                         frequency_hz)
+    distance_m = np.linalg.norm(receiver_m - device_m, axis=1)
+    level_db = -40.0 - 22 * np.log10(distance_m) + rng.normal(0, 1, 200)  # the transmitted power is not known
+    gain_db, _ = ImagePaths().fit_diffuse(links, level_db, -200.0).diffuse
+    wavelength_m = 299_792_458 / frequency_hz
+    assert gain_db <= 20 * np.log10(wavelength_m / (4 * np.pi * 100)) - 6 + 0.01

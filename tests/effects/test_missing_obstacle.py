@@ -1,5 +1,7 @@
 """Where a building that the map does not show is proposed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import trimesh
@@ -26,3 +28,26 @@ def test_a_map_with_a_box_in_it_keeps_its_woods():
     corrected = MissingObstacle().corrected_map(city, params)
     assert corrected.height_at(100.0, 150.0) == pytest.approx(30.0)
     assert corrected.vegetation.height_m.tolist() == [15.0]
+
+
+@pytest.mark.parametrize(("sides_m", "turn_deg"), [((36.0, 8.0), 30.0), ((36.0, 8.0), 120.0), ((10.0, 10.0), 45.0)])
+def test_a_narrow_building_is_proposed_with_its_shape_and_turn(make_links, view, sides_m, turn_deg):
+    """16 dB are lost on the ways through a rectangle 16 m high; what is proposed explains half of the residual."""
+    centre_m = np.array([70.0, 20.0])
+    receiver_m = np.array([(x_m, y_m, 5.0) for x_m in range(90, 260, 6) for y_m in range(-120, 180, 6)])
+    links = make_links([[0.0, 0, 2.0], [0.0, 90, 2.0], [60.0, -80, 2.0]], receiver_m.astype(float))
+    share = np.linspace(0, 1, 400)[:, None, None]
+    on_way_m = (links.device_m[links.device] + share * (links.receiver_m - links.device_m[links.device]))[..., :2] - centre_m
+    along = np.array([np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))])
+    across = np.array([-along[1], along[0]])
+    inside = (np.abs(on_way_m @ along) < sides_m[0] / 2) & (np.abs(on_way_m @ across) < sides_m[1] / 2)
+    lost_db = np.where(inside.any(axis=0), 16.0, 0.0)
+    assert 40 < (lost_db > 0).sum() < len(links) / 3
+    noise_db = np.random.default_rng(0).normal(0, 1.5, len(links))
+    residual = view(replace(links, level_db=noise_db - lost_db), np.zeros(len(links)), 1.5,
+                    level_at=lambda links, exact=False: np.zeros(len(links)))
+
+    every = np.arange(len(links))
+    gains = [residual.gain_nats(every, MissingObstacle().term(residual.links, params, residual.level_at).offset_db).sum()
+             for params in MissingObstacle().propose(residual)]
+    assert max(gains) > 0.5 * residual.gain_nats(every, -lost_db).sum()
