@@ -30,6 +30,7 @@ from studies.closeloop_real import (
     DATA,
     azimuth_errors_deg,
     explained,
+    one_in_each_cell,
     permuted,
     turned_rmse_db,
 )
@@ -146,10 +147,7 @@ def _controlled(measured: Measurements, control: str | None, seed: int) -> Measu
     if control == "one-phone":
         return replace(measured, table=table[table["receiver"] == PHONE].reset_index(drop=True))
     if control == "thinned":
-        cell = np.floor(table[["receiver_x_m", "receiver_y_m"]] / CELL_M)
-        kept = ~cell.assign(device=table["device"]).sample(
-            frac=1.0, random_state=seed).duplicated().sort_index()
-        return replace(measured, table=table[kept].reset_index(drop=True))
+        return replace(measured, table=one_in_each_cell(table, CELL_M, ("device",), seed))
     if control == "shifted":
         return measured.moved(lambda position_m: position_m + [SHIFT_M, 0.0, 0.0], measured.origin)
     if control == "mirrored":

@@ -35,13 +35,31 @@ def real_cases(seed: int) -> dict[str, dict]:
             for name, hold_out in (("duke_cbrs", "block"), ("powder_frs", "flight"))}
 
 
-def find_in_real(seed: int, settings: dict) -> dict:
-    """Close the loop on the real `set`, with links held out by `hold_out`."""
-    folder = DATA / settings["set"]
+def real_campaign(name: str) -> Measurements:
+    """Return the measurements of a folder of real ones.
+
+    Raises:
+        BadInput: it is not there.
+    """
+    folder = DATA / name
     if not folder.is_dir():
         raise BadInput(f"{folder} is not there: docs/real-data.md says where to get it; name its "
                        "folder in RADIOTWIN_DATA")
-    measurements = read_measurements(folder / "measurements.csv.gz")
+    return read_measurements(folder / "measurements.csv.gz")
+
+
+def one_in_each_cell(table: pd.DataFrame, cell_m: float, labels: tuple[str, ...],
+                     seed: int) -> pd.DataFrame:
+    """Return one row, drawn at random, of each square on the ground and each of some labels."""
+    cell = np.floor(table[["receiver_x_m", "receiver_y_m"]] / cell_m)
+    cell = cell.assign(**{label: table[label] for label in labels})
+    kept = ~cell.sample(frac=1.0, random_state=seed).duplicated().sort_index()
+    return table[kept].reset_index(drop=True)
+
+
+def find_in_real(seed: int, settings: dict) -> dict:
+    """Close the loop on the real `set`, with links held out by `hold_out`."""
+    measurements = real_campaign(settings["set"])
     if settings["shuffled"]:
         measurements = permuted(measurements, seed)
     with warnings.catch_warnings():
@@ -62,7 +80,7 @@ def find_in_real(seed: int, settings: dict) -> dict:
                    "azimuth_error_deg": azimuth_errors_deg(report),
                    "named_turned_by_180_db": turned_rmse_db(loop)}
     elif not settings["shuffled"]:
-        off_db = floor_errors_db(report, folder)
+        off_db = floor_errors_db(report, DATA / settings["set"])
         result |= {"by_day_db": {day: {when: scores[when]["rmse_db"] for when in WHEN}
                                  for day, scores in error["by_flight"].items()},
                    "floors": len(off_db), "floors_compared": int(np.isfinite(off_db).sum()),

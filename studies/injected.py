@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from radiotwin import BadInput, Measurements, close_loop, make_report, read_measurements
-from studies.closeloop_real import DATA
+from radiotwin import Measurements, close_loop, make_report
+from studies.closeloop_real import one_in_each_cell, real_campaign
 from studies.runner import Study
 from studies.tables import markdown, number
 
@@ -154,19 +154,13 @@ def campaign(name: str, seed: int) -> Measurements:
     Raises:
         BadInput: it is not there.
     """
-    folder = DATA / name
-    if not folder.is_dir():
-        raise BadInput(f"{folder} is not there: docs/real-data.md says where to get it; name its "
-                       "folder in RADIOTWIN_DATA")
-    measured = read_measurements(folder / "measurements.csv.gz")
+    measured = real_campaign(name)
     table = measured.table
     if name == "powder_frs":
         kept = table["device"].isin(sorted(table["device"].unique())[::EVERY])
+        table = table[kept].reset_index(drop=True)
     else:
-        cell = np.floor(table[["receiver_x_m", "receiver_y_m"]] / CELL_M)
-        cell = cell.assign(device=table["device"], receiver=table["receiver"])
-        kept = ~cell.sample(frac=1.0, random_state=seed).duplicated().sort_index()
-    table = table[kept].reset_index(drop=True)
+        table = one_in_each_cell(table, CELL_M, ("device", "receiver"), seed)
     devices = measured.devices[measured.devices["device"].isin(table["device"])]
     return Measurements(table, devices.reset_index(drop=True))
 
