@@ -102,7 +102,8 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
     if whole is None:
         return replace(refused, reason="nothing in the residual looks like it")
     coefficients = whole[1].coefficients[whole[0].coefficient_slices[-1]]
-    why = effect.implausible(whole[0].effects[-1].params, coefficients)
+    params = whole[0].effects[-1].params
+    why = effect.implausible(params, coefficients) or effect.contradicted(params, model.links)
     if why:
         return replace(refused, reason=why)
     gain = model.fits[0].objective - whole[1].objective

@@ -191,6 +191,10 @@ class Effect(ABC):
         """
         return None
 
+    def contradicted(self, params: Any, links: LinkData) -> str | None:
+        """Return what in the map of n links speaks against fitted parameters; None for nothing."""
+        return None
+
     def parameters(self, links: LinkData, params: Any, estimate: Estimate) -> dict[str, Parameter]:
         """Return what was found, by name; by default every parameter made with `quantity`."""
         return {name: Parameter.normal(getattr(params, name), sd, each["unit"],

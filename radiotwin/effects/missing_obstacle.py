@@ -6,6 +6,7 @@ ITU-R P.526), and what reaches any shadow by reflections (the channel's own leve
 sight, plus a fitted offset). Exactly: the channel's level over the map with the box in it.
 """
 
+from collections.abc import Iterable
 from functools import lru_cache
 from itertools import product
 
@@ -47,6 +48,9 @@ SHIFTS_M = (-8.0, 0.0, 8.0)  # from a cell's centre, to the east and to the nort
 SHAPES = (*(((side_m, side_m), (0.0, 45.0)) for side_m in (6.0, 12.0, 24.0)),
           *((sides_m, (0.0, 45.0, 90.0, 135.0)) for sides_m in ((20.0, 8.0), (36.0, 12.0),
                                                                 (40.0, 24.0))))
+MAX_BUILT = 0.2  # of its ground and so far around it that is built in the map
+AROUND_M = 3.0  # outlines are off by metres: a box along a wall is a wall that is off
+GRID, MIN_BUILT_M = 9, 2.0  # points along each side that are looked at, and what is built there
 REACH_M, MAX_LINKS = 30.0, 3000  # links so near to a centre, and how many, that shapes are tried on
 NEAR_M = 25.0  # links whose ground tracks stay farther away keep their level, also exactly
 LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)  # of an obstructed link, equally likely
@@ -86,16 +90,18 @@ class MissingObstacle(GainEffect):
         nats = obstruction_nats(view.residual_db[rows], view.scale_db[rows],
                                 LOSSES_DB) / view.design_effect
         centres_m, total = back_project(*ends_above_ground(links, rows), nats)
-        return [self._best_shape(view, rows, centre_m, height)
-                for centre_m, height, gain in best_cells(centres_m, total, MAX_PROPOSALS)
-                if gain > MIN_NATS]
+        boxes = [self._best_shape(view, rows, centre_m, height)
+                 for centre_m, height, gain in best_cells(centres_m, total, MAX_PROPOSALS)
+                 if gain > MIN_NATS]
+        return [self.Params(box=box) for box in boxes if box is not None]
 
     def _best_shape(self, view: ResidualView, los: np.ndarray, centre_m: np.ndarray,
-                    height: int) -> Params:
+                    height: int) -> Box | None:
         """Return the box near a cell's centre with which links (r,) with line of sight gain most.
 
         Of shapes, turns and places that the cell does not tell: a box that is too large hides links
-        that are not obstructed, and a search that starts there ends where it started.
+        that are not obstructed, and a search that starts there ends where it started. None where
+        all stand in buildings of the map.
         """
         links, (x_m, y_m) = view.links, centre_m.tolist()
         around = Box(x_m, y_m, 2 * REACH_M, 2 * REACH_M, max(HEIGHTS_M), 0.0)
@@ -103,19 +109,24 @@ class MissingObstacle(GainEffect):
         rows = subsample(los[near], MAX_LINKS)
         mine = links.select(rows)
 
-        def gain_nats(box: Box) -> float:
-            changed_db = self.term(mine, self.Params(box=box), view.level_at).offset_db
-            return float(view.gain_nats(rows, changed_db).sum())
+        gains: dict[Box, float] = {}
+
+        def best(boxes: Iterable[Box]) -> Box:
+            for box in boxes:
+                changed_db = self.term(mine, self.Params(box=box), view.level_at).offset_db
+                gains[box] = float(view.gain_nats(rows, changed_db).sum())
+            return max(gains, key=gains.__getitem__)
 
         tops_m = HEIGHTS_M[max(height - 1, 0):height + 2]
         shapes = [(sides_m, turn_deg) for sides_m, turns_deg in SHAPES for turn_deg in turns_deg]
-        best = max((Box(x_m, y_m, *sides_m, top_m, turn_deg)
-                    for (sides_m, turn_deg), top_m in product(shapes, tops_m)), key=gain_nats)
-        best = max((best._replace(x_m=x_m + east_m, y_m=y_m + north_m, height_m=top_m)
-                    for east_m, north_m, top_m in product(SHIFTS_M, SHIFTS_M, tops_m)),
-                   key=gain_nats)
-        return self.Params(box=max((Box(best.x_m, best.y_m, *sides_m, best.height_m, turn_deg)
-                                    for sides_m, turn_deg in shapes), key=gain_nats))
+        box = best(Box(x_m, y_m, *sides_m, top_m, turn_deg)
+                   for (sides_m, turn_deg), top_m in product(shapes, tops_m))
+        box = best(box._replace(x_m=x_m + east_m, y_m=y_m + north_m, height_m=top_m)
+                   for east_m, north_m, top_m in product(SHIFTS_M, SHIFTS_M, tops_m))
+        best(Box(box.x_m, box.y_m, *sides_m, box.height_m, turn_deg)
+             for sides_m, turn_deg in shapes)
+        return next((box for box in sorted(gains, key=gains.__getitem__, reverse=True)
+                     if built_share(links, box) <= MAX_BUILT), None)
 
     @override
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
@@ -169,6 +180,14 @@ class MissingObstacle(GainEffect):
         return 0.5 * (params.box.height_m / HEIGHT_SCALE_M) ** 2
 
     @override
+    def contradicted(self, params: Params, links: LinkData) -> str | None:
+        share = built_share(links, params.box)
+        if share <= MAX_BUILT:
+            return None
+        return (f"{share:.0%} of it and of what is around it would be buildings of the map: their "
+                "walls or roofs are off, then, and none is missing")
+
+    @override
     def corrected_map(self, city: CityMap, params: Params) -> CityMap:
         return _with_box(city, params.box)
 
@@ -203,6 +222,22 @@ def _gain_db(crossing: Crossing, scattered: np.ndarray | float,
     below_roof = np.maximum(crossing.enter_over_m, crossing.leave_over_m) > 0
     power = np.where(below_roof, power, 0.0) + 10 ** (-over_db / 10)
     return np.maximum(10 * np.log10(np.minimum(power, 1.0)), -MAX_LOSS_DB)
+
+
+def built_share(links: LinkData, box: Box) -> float:
+    """Return the share of the ground of a box, and just around it, that is built in links' map.
+
+    0 without a map.
+    """
+    if links.city is None:
+        return 0.0
+    turn, share = np.radians(box.turn_deg), (np.arange(GRID) + 0.5) / GRID - 0.5
+    along_m, across_m = np.meshgrid(share * (box.length_m + 2 * AROUND_M),
+                                     share * (box.width_m + 2 * AROUND_M))
+    x_m = box.x_m + along_m * np.cos(turn) - across_m * np.sin(turn)
+    y_m = box.y_m + along_m * np.sin(turn) + across_m * np.cos(turn)
+    above_m = links.city.height_at(x_m, y_m) - links.city.ground_height_m(x_m, y_m)
+    return float((above_m > MIN_BUILT_M).mean())
 
 
 @lru_cache(maxsize=32)
