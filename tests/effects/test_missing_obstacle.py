@@ -51,3 +51,22 @@ def test_a_narrow_building_is_proposed_with_its_shape_and_turn(make_links, view,
     gains = [residual.gain_nats(every, MissingObstacle().term(residual.links, params, residual.level_at).offset_db).sum()
              for params in MissingObstacle().propose(residual)]
     assert max(gains) > 0.5 * residual.gain_nats(every, -lost_db).sum()
+
+
+@pytest.mark.parametrize(("box", "refused"), [
+    (Box(215.0, 15.0, 20.0, 20.0, 25.0, 0.0), True),  # within a house of 30 by 30 m, and higher
+    (Box(215.0, 33.0, 28.0, 6.0, 12.0, 0.0), True),  # along its northern wall
+    (Box(215.0, 75.0, 28.0, 6.0, 12.0, 0.0), False),
+    (Box(215.0, 40.0, 14.0, 12.0, 12.0, 0.0), False)])  # a neighbour, 4 m from it
+def test_a_box_in_a_building_of_the_map_or_along_its_wall_is_no_missing_building(make_links, box, refused):
+    house = trimesh.creation.box(bounds=[[200, 0, 0], [230, 30, 12]])
+    links = make_links([[0.0, 0, 2.0]], [[100.0, 0, 20.0]], city=CityMap(house.vertices, house.faces))
+    why = MissingObstacle().contradicted(MissingObstacle.Params(box=box), links)
+    assert bool(why) == refused
+    if refused:
+        assert "walls or roofs are off" in why
+
+
+def test_without_a_map_no_building_is_in_the_way_of_a_missing_one(make_links):
+    links = make_links([[0.0, 0, 2.0]], [[100.0, 0, 20.0]])
+    assert MissingObstacle().contradicted(MissingObstacle.Params(box=Box(50.0, 0.0, 9.0, 9.0, 9.0, 0.0)), links) is None
