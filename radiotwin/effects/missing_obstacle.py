@@ -48,7 +48,7 @@ SHIFTS_M = (-8.0, 0.0, 8.0)  # from a cell's centre, to the east and to the nort
 SHAPES = (*(((side_m, side_m), (0.0, 45.0)) for side_m in (6.0, 12.0, 24.0)),
           *((sides_m, (0.0, 45.0, 90.0, 135.0)) for sides_m in ((20.0, 8.0), (36.0, 12.0),
                                                                 (40.0, 24.0))))
-MAX_BUILT = 0.2  # of its ground and so far around it that is built in the map
+MAX_BUILT = 0.15  # of its ground and so far around it that is built in the map
 AROUND_M = 3.0  # outlines are off by metres: a box along a wall is a wall that is off
 GRID, MIN_BUILT_M = 9, 2.0  # points along each side that are looked at, and what is built there
 REACH_M, MAX_LINKS = 30.0, 3000  # links so near to a centre, and how many, that shapes are tried on
