@@ -78,8 +78,11 @@ class _GainDrift(GainEffect):
     end: ClassVar[str]
 
     def __init__(self, between_flights: bool = False) -> None:
-        self._forms = ("step",) if between_flights else self.forms
         self._between_flights = between_flights
+
+    @property
+    def _forms(self) -> tuple[str, ...]:
+        return ("step",) if self._between_flights else self.forms
 
     def index(self, links: LinkData) -> np.ndarray:
         """Return the index (n,) of the receiver or device of each link."""

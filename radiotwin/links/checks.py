@@ -227,9 +227,8 @@ def find_fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
     if len(values) < 3:
         return None, 0.0
     steps = np.diff(values)
-    heap = counts[0] >= MIN_HEAP and counts[0] > HEAP_RATIO * counts[1:6].max()
     gap = counts[0] >= 3 and steps[0] > 10 * np.median(steps[:20]) and steps[0] > 3.0
-    return (float(values[0]), counts[0] / len(seen)) if heap or gap else (None, 0.0)
+    return (float(values[0]), counts[0] / len(seen)) if gap or _is_heap(counts) else (None, 0.0)
 
 
 def ceiling_notes(receiver: np.ndarray, names: Sequence[str], level_db: np.ndarray) -> list[str]:
@@ -243,14 +242,18 @@ def ceiling_notes(receiver: np.ndarray, names: Sequence[str], level_db: np.ndarr
     found = []
     for number, levels in pd.Series(level_db).dropna().groupby(receiver[np.isfinite(level_db)]):
         values, counts = np.unique(levels, return_counts=True)
-        if (len(levels) >= MIN_LINKS and len(values) > HEAP_RATIO and counts[-1] >= MIN_HEAP
-                and counts[-1] > HEAP_RATIO * counts[-6:-1].max()):
+        if len(levels) >= MIN_LINKS and len(values) > HEAP_RATIO and _is_heap(counts[::-1]):
             found.append(f"{names[number]} ({counts[-1] / len(levels):.0%} at {values[-1]:g})")
     if not found:
         return []
     which = _shortened(found)
     return [f"readings are heaped at the highest value of receiver {which}: it reads no "
             "more, and what was stronger is taken for just that"]
+
+
+def _is_heap(counts: np.ndarray) -> bool:
+    """Return whether the first of counts (m,) of neighbouring values is more than a tail has."""
+    return bool(counts[0] >= MIN_HEAP and counts[0] > HEAP_RATIO * counts[1:6].max())
 
 
 def _shortened(names: Iterable[object]) -> str:
