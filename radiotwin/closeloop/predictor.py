@@ -44,7 +44,7 @@ from radiotwin.inference.student import mean_if_detected
 from radiotwin.links import LinkData
 
 HALF_M = 50.0  # distance to the nearest measurement at which near and far count the same
-PULL = 0.1  # towards equal weights of the good members, see `convex_weights`
+PULL = 0.01  # towards the best single member, see `convex_weights`: 2 % of the RMSE
 INNER_FOLDS = 2  # that are held out within the links outside a fold
 MAX_INNER_LINKS = 12_000  # that they are a sample of
 INNER_TREES = 20

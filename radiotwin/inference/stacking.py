@@ -10,18 +10,15 @@ from __future__ import annotations
 import numpy as np
 from scipy.optimize import nnls
 
-ALIKE = 1.1  # ratio of RMSE to the best one's, up to which predictions are good
 TOGETHER = 1e4  # weight of the condition that weights sum to one, relative to the errors
 
 
 def convex_weights(error: np.ndarray, share: np.ndarray, pull: float) -> np.ndarray:
-    """Return the weights with the least squares, pulled towards equal ones of good predictions.
+    """Return the weights with the least squares, pulled towards the best single prediction.
 
-    Minimises sum((error @ w)^2) / m + pull * |w - equal|^2 summed over both sets, with the mean
-    square m of the best single prediction's error. Equal are those of all whose RMSE is less than
-    `ALIKE` times the best one's, and zero the others': which of these is the best elsewhere a few
-    held-out folds do not tell, and their mean is rarely worse (Bates and Granger 1969, 'The
-    combination of forecasts').
+    Minimises sum((error @ w)^2) / m + pull * |w - best|^2 summed over both sets, with the mean
+    square m of the best single prediction's error: another single one must have a mean square
+    lower by 4 `pull` to be taken instead, if the share is the same for all.
 
     Args:
         error: (n, k) measured minus predicted, of k predictions.
@@ -33,12 +30,11 @@ def convex_weights(error: np.ndarray, share: np.ndarray, pull: float) -> np.ndar
     """
     n, k = error.shape
     square = np.square(error).mean(axis=0)
-    best = max(float(square.min()), 1e-12)
-    good = square <= ALIKE**2 * best
+    best = int(square.argmin())
     columns = np.hstack([error * (1 - share)[:, None], error * share[:, None]])
-    columns /= np.sqrt(n * best)
+    columns /= np.sqrt(n * max(float(square[best]), 1e-12))
     upper = np.linalg.qr(columns, mode="r")
-    wanted = np.tile(good / max(good.sum(), 1), 2)
+    wanted = np.tile(np.arange(k) == best, 2).astype(float)
     sums = TOGETHER * np.kron(np.eye(2), np.ones(k))
     weights, _ = nnls(np.vstack([upper, np.sqrt(pull) * np.eye(2 * k), sums]),
                       np.concatenate([np.zeros(len(upper)), np.sqrt(pull) * wanted,
