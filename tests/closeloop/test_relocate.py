@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from radiotwin.closeloop.bases import make_bases
-from radiotwin.closeloop.relocate import relocate_devices
+from radiotwin.closeloop.relocate import is_better, relocate_devices
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.gain_offsets import ReceiverGainOffset
 from tests.closeloop.drives import MASTS_M, drive, fitted
@@ -40,3 +41,12 @@ def test_a_device_moves_to_where_it_is_in_every_fold():
 def test_known_devices_stay():
     model = fitted(drive(3), ReceiverGainOffset())
     assert relocate_devices(model, model.links, make_bases(None, 0)["twin"]) is model
+
+
+@pytest.mark.parametrize(("change_nats", "lost", "kept"), [
+    (-0.02, 0, True), (0.005, 0, False), (0.005, 40, True), (0.05, 40, False)])
+def test_a_device_that_is_found_counts_for_more_than_chance_on_the_links_of_others(change_nats, lost, kept):
+    """200 links of which some could not be predicted; the others change by so much each."""
+    before_nll = np.where(np.arange(200) < lost, np.nan, 2.0)
+    after_nll = np.where(np.isnan(before_nll), 2.0, 2.0 + change_nats)
+    assert is_better(before_nll, after_nll) == kept
