@@ -75,9 +75,10 @@ class ImagePaths(ChannelModel):
             self.diffuse = DIFFUSE_DEFAULT
             return self
         power = path_gains(nlos)
+        near_m = min(float(np.quantile(links.distance_m, NEAR_QUANTILE)), 100.0)
 
         def loss(numbers: np.ndarray) -> float:
-            inside = _within_bounds(numbers, links)
+            inside = _within_bounds(numbers, near_m, links.frequency_hz)
             error_db = level_db - with_diffuse_db(power, nlos.distance_m, *inside)
             error_db = error_db - np.median(error_db[known & ~blank])
             error_db = np.where(blank, np.minimum(error_db, 0.0), error_db)[known]
@@ -87,7 +88,7 @@ class ImagePaths(ChannelModel):
         starts = [np.array([start_db, DIFFUSE_DEFAULT[1]]) for start_db in DIFFUSE_STARTS_DB]
         found = minimize(loss, min(starts, key=loss), method="Nelder-Mead",
                          options={"xatol": 0.1, "fatol": 0.5}).x
-        gain_db, exponent = _within_bounds(found, links)
+        gain_db, exponent = _within_bounds(found, near_m, links.frequency_hz)
         self.diffuse = float(gain_db), float(exponent)
         return self
 
@@ -149,16 +150,20 @@ def stored_diffuse(value: Any) -> tuple[float, float]:
     return require_number(named, "gain", -300.0, 100.0), require_number(named, "exponent", 0, 20)
 
 
-def _within_bounds(numbers: np.ndarray, links: LinkGeometry) -> np.ndarray:
+def _within_bounds(numbers: np.ndarray, near_m: float, frequency_hz: float) -> np.ndarray:
     """Return the diffuse power (2,) that is nearest and weaker than a way in free space.
 
     A level of links without line of sight is fitted beside it. Where paths bring nothing that
     readings show, diffuse power above that of free space would take their place, and then that of
     the links with line of sight.
+
+    Args:
+        numbers: (2,) gain at 100 m [dB] and exponent.
+        near_m: distance from which on it is to be weaker [m], 100 m or less.
+        frequency_hz: of the radio [Hz].
     """
     gain_db, exponent = np.clip(numbers, *DIFFUSE_BOUNDS)
-    near_m = min(float(np.quantile(links.distance_m, NEAR_QUANTILE)), 100.0)
-    most_db = -free_space_db(np.array(100.0), links.frequency_hz) - MIN_LOSS_DB \
+    most_db = -free_space_db(np.array(100.0), frequency_hz) - MIN_LOSS_DB \
         + 10 * (exponent - 2.0) * np.log10(near_m / 100.0)
     return np.array([np.clip(gain_db, None, most_db), exponent])
 

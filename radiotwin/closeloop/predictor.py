@@ -128,7 +128,7 @@ class _Learnt:
                 np.concatenate(tested))
 
     def members_db(self, test: np.ndarray, seed: int) -> np.ndarray:
-        """Return what members (m, k) predict of rows (m,), by few trees and known correlations."""
+        """Return predictions (m, k) of rows (m,), by few trees and known correlations [dB]."""
         physics = physics_db(self.model, self.fit, self.rest, self.part, test, seed, INNER_TREES)
         laws = [law_db(kind, self.part.links, self.model.train, test, self.kriging)
                 for kind in LAWS if kind.name in self.names]
@@ -228,13 +228,13 @@ def grown_forests(model: FoldModel, fit: FitResult, part: Part, seed: int, trees
                   names: Collection[str] = (*FORESTS, *TREES_ALONE)) -> dict[str, Forest]:
     """Grow trees on training links: on the standardised residual (`FORESTS`), and on the levels.
 
-    A blank counts as the named effects' mean below the limit. They are not told which receiver it
-    is: its effects have names, and a map has none.
+    A blank counts as the named effects' mean below the limit. The receiver is no feature of
+    theirs: its effects have names, and a map has none.
 
     Args:
         model: n links, of which some are learnt from.
         fit: to these.
-        part: the links as trees are told of them.
+        part: the links, with the features of trees.
         seed: of the trees.
         trees: number of them.
         names: those that are asked for.
@@ -250,13 +250,13 @@ def grown_forests(model: FoldModel, fit: FitResult, part: Part, seed: int, trees
 
 def physics_db(model: FoldModel, fit: FitResult, rest: CorrelatedShadowing | None, part: Part,
                test: np.ndarray, seed: int, trees: int = TREES) -> np.ndarray:
-    """Return what named effects and trees predict, alone and together, and with the rest [dB].
+    """Return levels by named effects and trees, alone and together, and with the rest [dB].
 
     Args:
         model: n links, of which some are learnt from.
         fit: to these.
         rest: interpolated, of these; None: not asked for.
-        part: the links as trees are told of them.
+        part: the links, with the features of trees.
         test: (m,) rows.
         seed: of the trees.
         trees: number of them.

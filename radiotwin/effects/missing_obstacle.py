@@ -45,9 +45,9 @@ from radiotwin.scene.citymap import CONCRETE, CityMap
 MIN_NATS = 6.0  # that a cell must gain to be proposed
 MAX_PROPOSALS = 4
 SHIFTS_M = (-8.0, 0.0, 8.0)  # from a cell's centre, to the east and to the north
-SHAPES = (*(((side_m, side_m), (0.0, 45.0)) for side_m in (6.0, 12.0, 24.0)),
-          *((sides_m, (0.0, 45.0, 90.0, 135.0)) for sides_m in ((20.0, 8.0), (36.0, 12.0),
-                                                                (40.0, 24.0))))
+SQUARES_M, RECTANGLES_M = (6.0, 12.0, 24.0), ((20.0, 8.0), (36.0, 12.0), (40.0, 24.0))  # tried
+SHAPES = (*product(((side_m, side_m) for side_m in SQUARES_M), (0.0, 45.0)),
+          *product(RECTANGLES_M, (0.0, 45.0, 90.0, 135.0)))  # sides [m] and turn [deg]
 MAX_BUILT = 0.15  # of its ground and so far around it that is built in the map
 AROUND_M = 3.0  # outlines are off by metres: a box along a wall is a wall that is off
 GRID, MIN_BUILT_M = 9, 2.0  # points along each side that are looked at, and what is built there
@@ -118,13 +118,12 @@ class MissingObstacle(GainEffect):
             return max(gains, key=gains.__getitem__)
 
         tops_m = HEIGHTS_M[max(height - 1, 0):height + 2]
-        shapes = [(sides_m, turn_deg) for sides_m, turns_deg in SHAPES for turn_deg in turns_deg]
         box = best(Box(x_m, y_m, *sides_m, top_m, turn_deg)
-                   for (sides_m, turn_deg), top_m in product(shapes, tops_m))
+                   for (sides_m, turn_deg), top_m in product(SHAPES, tops_m))
         box = best(box._replace(x_m=x_m + east_m, y_m=y_m + north_m, height_m=top_m)
                    for east_m, north_m, top_m in product(SHIFTS_M, SHIFTS_M, tops_m))
         best(Box(box.x_m, box.y_m, *sides_m, box.height_m, turn_deg)
-             for sides_m, turn_deg in shapes)
+             for sides_m, turn_deg in SHAPES)
         return next((box for box in sorted(gains, key=gains.__getitem__, reverse=True)
                      if built_share(links, box) <= MAX_BUILT), None)
 

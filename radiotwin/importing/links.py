@@ -80,7 +80,7 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
 
 def _shared(source: Source, columns: dict[str, str], settings: Settings,
             problems: Problems) -> pd.DataFrame:
-    """Return what all levels of a row have in common: times, positions, names."""
+    """Return the columns that all levels of a row share: times, positions, names."""
     shared = pd.DataFrame(index=source.table.index)
     present = {name for name, spec in columns.items()
                if spec in (BY_DAY, BY_POSITION)
