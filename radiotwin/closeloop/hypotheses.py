@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from math import comb, log
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -34,6 +35,7 @@ KNOTS = 8  # of a curve over a variable
 TIME_KNOTS = 24  # of one over time
 CURVE_SD_DB = 4.0  # prior standard deviation of a curve
 MAX_COLUMNS = 250  # of one hypothesis
+MAX_FEW = 6  # ends of which each number is tried, before all of them
 STEP_SHARE = 0.3  # of a number's typical uncertainty, for what it changes
 
 
@@ -138,9 +140,25 @@ class Hypotheses:
         shown_db += levels @ (fit.coefficients[:p] - self.coefficients[:p])
         z += shown_db / self.scale_db
         columns = Columns(term.columns / self.scale_db[:, None], term.prior_sd_db)
+        if applied.effect.sparse:
+            return self._of_few(z, columns, fit.coefficients[own])
         slopes = _slopes(model, fit)
         return self.gain_nats(z, columns.beside(
             Columns(slopes.values / self.scale_db[:, None], slopes.prior_sd)))
+
+    def _of_few(self, z: np.ndarray, columns: Columns, coefficients: np.ndarray) -> float:
+        """Return the evidence for the likeliest few of columns, largest coefficients (q,) first.
+
+        Any number of them is as probable as any other, and any set of that number (Scott and Berger
+        2010, 'Bayes and empirical-Bayes multiplicity adjustment in the variable-selection problem',
+        Ann. Stat. 38): one end that is off does not pay for all that are not.
+        """
+        order, q = np.argsort(-np.abs(coefficients - np.median(coefficients))), len(coefficients)
+        found = []
+        for count in sorted({*range(1, min(q, MAX_FEW) + 1), q}):
+            few = Columns(columns.values[:, order[:count]], columns.prior_sd[order[:count]])
+            found.append(self.gain_nats(z, few) - log(comb(q, count)) - log(q))
+        return max(found)
 
     @cached_property
     def unnamed_nats(self) -> dict[str, float]:

@@ -96,6 +96,7 @@ class Effect(ABC):
         nlos_only: acts on links without line of sight only, so those with it need not support it.
         confused_with: names of effects that may look alike.
         repeatable: whether there may be several, each found in a step of its own.
+        sparse: whether each of its coefficients belongs to one end, and any few may be there.
         of_device: whether it is a device's own level or antenna, which another need not have.
         of_receiver: whether it belongs to a receiver, so that it is no part of a map.
         is_cause: whether it is a physical cause, not merely a description of what is left.
@@ -115,6 +116,7 @@ class Effect(ABC):
     nlos_only: ClassVar[bool] = False
     confused_with: ClassVar[tuple[str, ...]] = ()
     repeatable: ClassVar[bool] = False
+    sparse: ClassVar[bool] = False
     of_device: ClassVar[bool] = False
     of_receiver: ClassVar[bool] = False
     is_cause: ClassVar[bool] = True

@@ -34,6 +34,7 @@ class _GainOffset(GainEffect):
     """An offset for each member of a kind of end."""
 
     figure = "intervals"
+    sparse = True
     end: ClassVar[str]  # "device" or "receiver"
 
     class Params(EffectParams):

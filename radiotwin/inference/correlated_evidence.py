@@ -27,7 +27,7 @@ MIN_POINTS = 3  # of a part that says anything
 # Of correlation [m]: shadowing decorrelates within 10 to 50 m (3GPP TR 38.901, Table 7.5-6). Longer
 # ones would explain whatever an antenna or a wrong position does to a device's levels.
 LENGTHS_M = (5.0, 12.0, 30.0)
-EVALUATIONS = 20  # of the likelihood, for the two variances
+EVALUATIONS = 100  # of the likelihood at most, for the two variances; 40 are common
 START = np.array([0.0, -1.0])  # logarithms: noise variance, field over noise
 BOUNDS = np.array([[-6.0, -7.0], [6.0, 7.0]])
 
@@ -131,7 +131,7 @@ class CorrelatedEvidence:
             return outside - self.at(z, columns, prior_sd, inside)
 
         simplex = np.vstack([start, start + [0.5, 0.0], start + [0.0, 1.0]])
-        options = {"initial_simplex": simplex, "maxfev": EVALUATIONS, "xatol": 0.03, "fatol": 0.05}
+        options = {"initial_simplex": simplex, "maxfev": EVALUATIONS, "xatol": 0.01, "fatol": 0.02}
         found = minimize(negative, start, method="Nelder-Mead", options=options)
         return -float(found.fun), np.clip(found.x, *BOUNDS)
 

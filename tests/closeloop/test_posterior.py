@@ -1,5 +1,7 @@
 """Probabilities of causes, and what would have been seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import logsumexp
@@ -14,7 +16,7 @@ from radiotwin.closeloop.scoring import CandidateScore
 from radiotwin.closeloop.sensitivity import detectable, needed_nats
 from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.fitting import add_effect
-from radiotwin.effects.gain_offsets import ReceiverGainOffset
+from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
 from radiotwin.effects.position_errors import DevicePositionError
 from radiotwin.inference.correlated_evidence import Columns
 from radiotwin.links import prepare_links
@@ -40,6 +42,28 @@ def test_evidence_for_an_offset_that_is_there_and_none_for_one_that_is_not(open_
         model, hypotheses = looked_at(open_ground, 2, change)
         found = add_effect(model.whole, ReceiverGainOffset(), model.fits[0])
         assert low < hypotheses.of_named(*found) < high
+
+
+def test_an_end_that_is_off_does_not_pay_for_those_that_are_not(open_ground, monkeypatch):
+    def weaker(world):
+        world.gain_db[world.device == 1] -= 5.0
+
+    model, hypotheses = looked_at(open_ground, 2, weaker)
+    found = add_effect(model.whole, DeviceGainOffset(), model.fits[0])
+    few_nats = hypotheses.of_named(*found)
+    monkeypatch.setattr(DeviceGainOffset, "sparse", False)
+    assert few_nats > hypotheses.of_named(*found) + 2.0
+    monkeypatch.undo()
+    model, hypotheses = looked_at(open_ground, 2)
+    assert hypotheses.of_named(*add_effect(model.whole, DeviceGainOffset(), model.fits[0])) < 0
+
+
+def test_no_further_cause_is_no_evidence_wherever_the_variances_are(open_ground):
+    model, hypotheses = looked_at(open_ground, 2)
+    nothing = Columns(np.zeros((len(hypotheses.links), 0)), np.zeros(0))
+    for scale in (0.1, 1.0, 30.0):  # the search of the variances starts near 1
+        scaled = replace(hypotheses, base_z=scale * hypotheses.base_z)
+        assert abs(scaled.gain_nats(scaled.base_z, nothing)) < 0.2
 
 
 def late(world):
