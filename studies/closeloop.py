@@ -18,8 +18,11 @@ import trimesh
 from radiotwin import Measurements, Scene, close_loop, make_report
 from radiotwin.closeloop.bases import make_bases
 from radiotwin.closeloop.cross_validation import cross_validate, training_parts
+from radiotwin.closeloop.declared import take_declared
 from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.registry import catalogue
 from radiotwin.links import prepare_links
 from radiotwin.scene.citymap import CityMap
 from studies.runner import Study
@@ -51,7 +54,7 @@ def find_hidden(seed: int, settings: dict) -> dict:
         report = make_report(close_loop(hidden.measurements, hidden.scene, settings["base"], 0,
                                         hold_out=hold_out))
         oracle_rmse_db = _oracle_rmse_db(hidden, report["base"], hold_out)
-    effects, error, truth = report["effects"], report["error"], hidden.answer["effects"]
+    effects, error, truth = causes_of(report), report["error"], hidden.answer["effects"]
     columns = ("rmse_db", "bias_db", "std_db", "correlation", "nll")
     return {
         "hidden": truth, "base": report["base"], **summary(report),
@@ -65,9 +68,14 @@ def find_hidden(seed: int, settings: dict) -> dict:
         "oracle_rmse_db": oracle_rmse_db}
 
 
+def causes_of(report: dict) -> list[dict]:
+    """Return the effects of a `closeloop.json` that were looked for, and found."""
+    return [effect for effect in report["effects"] if not effect["is_declared"]]
+
+
 def summary(report: dict) -> dict:
     """Return verdict, names and remaining drivers of a `closeloop.json`."""
-    return {"verdict": report["verdict"], "named": [effect["name"] for effect in report["effects"]],
+    return {"verdict": report["verdict"], "named": [each["name"] for each in causes_of(report)],
             "drivers": [driver["variable"] for driver in report["remaining"]["drivers"]]}
 
 
@@ -84,10 +92,17 @@ def _oracle_rmse_db(hidden: Case, base: str, hold_out: str) -> float:
             where = world_of(hidden.family, hidden.seed)
             points_m = np.repeat(where.points_m, len(where.names), axis=0)
             table[[f"receiver_{axis}_m" for axis in "xyz"]] = points_m
-    links = prepare_links(Measurements(table, measurements.devices), scene)
+    return base_rmse_db(Measurements(table, measurements.devices), scene, base, hold_out)
+
+
+def base_rmse_db(measurements: Measurements, scene: Scene, base: str, hold_out: str) -> float:
+    """Return the held-out error of a base with what belongs to it [dB]."""
+    links = prepare_links(measurements, scene)
     folds = make_folds(links, 0, hold_out)
-    parts = training_parts(links, folds)
-    return cross_validate(links, make_bases(scene, 0)[base], folds, parts).rmse_db()
+    model = cross_validate(links, make_bases(scene, 0)[base], folds, training_parts(links, folds))
+    selection = SelectionResult(model)
+    take_declared(selection, [effect() for effect in catalogue()], 0, lambda _: None)
+    return selection.model.rmse_db()
 
 
 def with_true_city(scene: Scene, effect: dict) -> Scene:

@@ -14,10 +14,7 @@ from typing import Any
 import numpy as np
 
 from radiotwin import close_loop, make_report
-from radiotwin.closeloop.bases import make_bases
-from radiotwin.closeloop.cross_validation import cross_validate, training_parts
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.links import prepare_links
+from studies.closeloop import base_rmse_db, causes_of
 from studies.foreign_figures import foreign_figures
 from studies.foreign_roc import COLUMNS, LIMITS_DIFFER_DB, by_mistake_of_the_map
 from studies.foreign_table import PHYSICS, UNNAMED, foreign_table
@@ -43,7 +40,7 @@ def close_foreign(seed: int, settings: dict) -> dict:
         report = make_report(close_loop(hidden.measurements, hidden.scene, settings["base"], seed,
                                         hold_out=hold_out))
         oracle_rmse_db = _oracle_rmse_db(settings["case"], report["base"], hold_out)
-    effects, error = report["effects"], report["error"]
+    effects, error = causes_of(report), report["error"]
     right = {each["name"] for each in hidden.answer["effects"]}
     mistaken = {each["name"] for each in effects
                 if _by_mistake_of_the_map(each, hidden) or _is_a_shower(each, hidden)}
@@ -78,10 +75,7 @@ def _plain(nuisance: dict) -> dict:
 def _oracle_rmse_db(name: str, base: str, hold_out: str) -> float:
     """Return the held-out error of the base where nothing is hidden from it [dB]."""
     without = foreign_case(name, hidden=False)
-    links = prepare_links(without.measurements, without.scene)
-    folds = make_folds(links, 0, hold_out)
-    parts = training_parts(links, folds)
-    return cross_validate(links, make_bases(without.scene, 0)[base], folds, parts).rmse_db()
+    return base_rmse_db(without.measurements, without.scene, base, hold_out)
 
 
 def _first_posterior(report: dict[str, Any]) -> Iterator[tuple[str, float]]:

@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin import Measurements, close_loop, make_report
+from studies.closeloop import causes_of
 from studies.closeloop_real import one_in_each_cell, real_campaign
 from studies.runner import Study
 from studies.tables import markdown, number
@@ -176,7 +177,7 @@ def find_injected(seed: int, settings: dict) -> dict[str, Any]:
                                         "log-distance", seed))
     error = report["error"]
     return {"links": len(table), "verdict": report["verdict"],
-            "named": [each["name"] for each in report["effects"]],
+            "named": [each["name"] for each in causes_of(report)],
             "probabilities": [each.get("probability") for each in report["effects"]],
             "parameters": [each["parameters"] for each in report["effects"]],
             **{f"{when}_db": error[when]["rmse_db"] for when in ("before", "after", "combined")},

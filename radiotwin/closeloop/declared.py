@@ -1,4 +1,4 @@
-"""Effects that the input tables declare: added to the base before the search for causes."""
+"""What tables declare, and what every map has: added to the base before the search for causes."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ def take_declared(result: SelectionResult, effects: list[Effect], seed: int,
 
     That it is there needs no evidence, only that the declaration is right: links that take no part
     in the fit of its numbers have to agree. A contradicted declaration is left out, with a note.
+    What is no cause claims nothing, so that it only has to make these links likelier.
 
     Args:
         result: of a base alone; is extended.
@@ -45,8 +46,8 @@ def _take_best(result: SelectionResult, forms: list[Effect], block: np.ndarray, 
     tried, passed = [], []
     for effect in forms:
         on_progress(effect.variant)
-        score, extended = fit_and_score(before, effect, block, len(forms), step, seed,
-                                        result.criteria)
+        criteria = result.criteria if effect.is_cause else result.criteria.of_no_claim
+        score, extended = fit_and_score(before, effect, block, len(forms), step, seed, criteria)
         tried.append(score)
         if extended is not None:
             passed.append((effect, score, extended))
@@ -58,7 +59,8 @@ def _take_best(result: SelectionResult, forms: list[Effect], block: np.ndarray, 
                           for each in tried if each is not best]
         notes.append(f"{effect.variant} are part of the base: the RMSE on held-out links is "
                      f"{best.rmse_db:.2f} dB, and {before.rmse_db():.2f} dB without them")
-    elif tried:
-        result.scores += tried
+        return
+    result.scores += tried
+    if tried and forms[0].is_cause:
         notes.append(f"{forms[0].variant} do not agree with the readings and are left out: "
                      f"{tried[0].reason}")

@@ -47,7 +47,7 @@ def relocate_devices(model: CrossValidatedModel, links: LinkData, base: Base
         all devices are known, or where paths are followed and the map is as it was.
     """
     unknown = [device for device in range(len(links.device_names)) if device not in links.anchors]
-    if not unknown or not model.whole.effects:
+    if not unknown or not any(each.effect.is_cause for each in model.whole.effects):
         return model
     twin = model.twin
     if not model.whole.channel.follows_paths:

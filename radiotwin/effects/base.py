@@ -102,8 +102,9 @@ class Effect(ABC):
         is_cause: whether it is a physical cause, not merely a description of what is left.
         within_flights: whether it acts at certain times only, so that other flights do not show it:
             it is scored on devices, or blocks of ground, that are held out in all flights.
-        is_declared: whether the tables declare it, so that only its numbers are open: it is no
-            candidate cause but a part of the base, where held-out links gain by it.
+        is_declared: whether the tables declare it, or every map has it, so that only its numbers
+            are open: it is no candidate cause but a part of the base, where held-out links gain by
+            it.
         always_exact: whether `exact` may be asked of every candidate, not only of what is kept.
         uses: columns of the measurements that it reads and that no map has, such as `quality`.
     """

@@ -28,6 +28,7 @@ from radiotwin.effects.receiver_saturation import ReceiverSaturation
 from radiotwin.effects.removed_obstacle import RemovedObstacle
 from radiotwin.effects.sector_antenna import SectorAntenna
 from radiotwin.effects.tilted_dipole import TiltedDipole
+from radiotwin.effects.uncertain_sight import UncertainSight
 from radiotwin.errors import BadInput
 from radiotwin.plugins import load_plugins
 
@@ -38,7 +39,7 @@ BUILT_IN: tuple[type[Effect], ...] = (
     TiltedDipole, BodyShadowing, ExcessAttenuation, DevicePositionError, ReceiverPositionError,
     ReceiverClockOffset, MissingObstacle, RemovedObstacle, BuildingEntry, Foliage,
     MappedVegetation, WallReflection, Diffraction, GroundReflection, Interference, LockLoss,
-    FaultyFlight, Episode)
+    FaultyFlight, Episode, UncertainSight)
 
 _registered: list[type[Effect]] = []
 

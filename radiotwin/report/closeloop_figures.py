@@ -69,7 +69,7 @@ def waterfall_figure(report: dict) -> Figure:
     kept = [(candidate["name"], candidate["heldout_rmse_db"]) for candidate in report["candidates"]
             if candidate["kept"] and candidate["heldout_rmse_db"] is not None]
     declared = sum(effect.get("is_declared", False) for effect in report["effects"])
-    kept = kept[declared:]  # what is declared comes first, and is part of the base
+    kept = kept[declared:]  # what is declared comes first: it is part of the base
     levels = [before, *(rmse_db for _, rmse_db in kept)]
     steps = [(name_label(name), name in INTERPOLATIONS) for name, _ in kept]
     if kept and abs(levels[-1] - after) > MIN_STEP_DB:
@@ -83,7 +83,7 @@ def waterfall_figure(report: dict) -> Figure:
         change = f"{low - high:+.2f}".replace("-", "−")
         _draw_bar(ax, position, high, low, colour, change, alpha=0.55)
         _connect(ax, position, high)
-    base = "with what is declared" if declared else "alone"
+    base = "with its own effects" if declared else "alone"
     names = [f"before: {name_label(report['base'])} {base}", *(name for name, _ in steps)]
     if kept:
         _connect(ax, len(names), after)

@@ -128,7 +128,7 @@ def _effects(report: dict, folder: Path) -> dict[str, list[dict]]:
     for effect in report["effects"][:MAX_EFFECTS]:
         name, label = effect["name"], name_label(effect["name"])
         heading = ("Interpolated, not explained" if name in INTERPOLATIONS else
-                   "Declared, and part of the base" if effect.get("is_declared") else
+                   "Part of the base" if effect.get("is_declared") else
                    "Effects found")
         rows = [[parameter_label(key), _value(p), _interval(p), p["unit"]]
                 for key, p in effect["parameters"].items()]

@@ -71,7 +71,7 @@ def taken(measurements):
     base = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
     result = SelectionResult(base)
     others = take_declared(result, [effect() for effect in BUILT_IN], 0, lambda _: None)
-    assert len(others) == len(BUILT_IN) - 2
+    assert len(others) == sum(not effect.is_declared for effect in BUILT_IN)
     whole, parameters = result.model.whole, {}
     for each, estimate in zip(whole.effects, estimates(whole, result.model.fits[0]), strict=True):
         parameters |= each.effect.parameters(links, each.params, estimate)
@@ -120,7 +120,7 @@ def test_the_loop_begins_with_what_is_declared_and_calls_it_no_cause():
     assert not any("azimuth_deg" in name for name in effect["parameters"])  # declared, not found
     assert report["error"]["before"]["rmse_db"] < 4.5  # part of the base
     labels = [label.get_text().replace("\n", " ") for label in waterfall_figure(report).axes[0].get_xticklabels()]
-    assert labels == ["before: log-distance with what is declared"]
+    assert labels == ["before: log-distance with its own effects"]
 
 
 def test_a_sector_that_is_only_planned_is_predicted_by_the_stored_twin(tmp_path):
