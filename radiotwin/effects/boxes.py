@@ -5,7 +5,9 @@ from typing import Annotated, NamedTuple
 import numpy as np
 from pydantic import Field
 
+from radiotwin.effects.arrays import ends_above
 from radiotwin.effects.params import Length, Metres
+from radiotwin.links import LinkData
 
 SAMPLE_M = 5.0  # between points on a link, while it is back-projected
 CELL_M = 12.5  # side of a cell of the back-projection
@@ -14,6 +16,9 @@ MIN_APART_M = 25.0  # between the best cells
 CHUNK, MAX_POINTS = 2000, 4_000_000  # links, and points on them, at a time: bounds memory
 P_MISS = 0.4  # probability that a link through a cell misses the box there, which is smaller
 DOF = 4.0  # degrees of freedom of the errors
+MIN_KNOWN = 0.1  # of the links through a box: from devices whose positions are declared
+PASSED_BY_UNKNOWN = ("only links of devices whose positions are estimated pass it: they may be "
+                     "elsewhere")
 
 
 class Box(NamedTuple):
@@ -119,6 +124,16 @@ def _share_below(start_z_m: np.ndarray, rise_m: np.ndarray, enter: np.ndarray, l
     below = (np.where(rise_m > 0, np.minimum(leave, roof), leave)
              - np.where(rise_m < 0, np.maximum(enter, roof), enter))
     return np.where(level & (start_z_m >= height_m), 0.0, below)
+
+
+def known_share(box: Box, links: LinkData) -> float:
+    """Return the share of the links through a box whose devices' positions are declared.
+
+    1 where no link passes it.
+    """
+    inside = cross(box, *ends_above(links, box[:2])).inside_m > 0
+    known = np.isin(links.device[inside], sorted(links.anchors))
+    return float(known.mean()) if len(known) else 1.0
 
 
 def near_box(box: Box, a_m: np.ndarray, b_m: np.ndarray, within_m: float) -> np.ndarray:

@@ -17,10 +17,13 @@ from radiotwin.effects.base import GainEffect
 from radiotwin.effects.boxes import (
     CELL_M,
     HEIGHTS_M,
+    MIN_KNOWN,
+    PASSED_BY_UNKNOWN,
     Box,
     back_project,
     best_cells,
     cross,
+    known_share,
     obstruction_nats,
 )
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, Variation
@@ -100,6 +103,10 @@ class Foliage(GainEffect):
             lambda numbers: params.model_copy(update={
                 "box": Box(*numbers[:6].tolist()),
                 "law": VegetationLoss(*np.exp(numbers[6:]).tolist())}))
+
+    @override
+    def contradicted(self, params: Params, links: LinkData) -> str | None:
+        return PASSED_BY_UNKNOWN if known_share(params.box, links) < MIN_KNOWN else None
 
     @override
     def parameters(self, links: LinkData, params: Params,

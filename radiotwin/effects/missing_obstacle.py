@@ -19,12 +19,15 @@ from radiotwin.effects.arrays import city_of, ends_above, ends_above_ground, sub
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.boxes import (
     HEIGHTS_M,
+    MIN_KNOWN,
+    PASSED_BY_UNKNOWN,
     Box,
     Crossing,
     back_project,
     best_cells,
     cross,
     knife_edge_db,
+    known_share,
     near_box,
     obstruction_nats,
     two_edges_db,
@@ -180,6 +183,8 @@ class MissingObstacle(GainEffect):
 
     @override
     def contradicted(self, params: Params, links: LinkData) -> str | None:
+        if known_share(params.box, links) < MIN_KNOWN:
+            return PASSED_BY_UNKNOWN
         share = built_share(links, params.box)
         if share <= MAX_BUILT:
             return None

@@ -117,6 +117,21 @@ def test_a_building_that_is_gone_is_named(small_scene):
     assert (parameters["x_m"]["value"], parameters["y_m"]["value"]) == pytest.approx(tuple(centres_m[gone, :2]))
 
 
+def test_walls_that_are_off_are_no_cause_but_part_of_the_base(small_scene, tmp_path):
+    moved = small_scene.city.with_vertices(small_scene.city.vertices + [1.5, -1.0, 0.0])
+    measured = survey(small_scene, 0, lambda a, b: ~moved.line_of_sight(a, b))
+    loop = close_loop(measured, small_scene, "twin")
+    assert [each.effect.name for each in loop.before.whole.effects] == ["uncertain_sight"]
+    report = make_report(loop)
+    assert report["verdict"] != "effect" and report["effects"][0]["is_declared"]
+    corrected_twin(loop, small_scene).save(tmp_path / "twin")
+    twin = Twin.load(tmp_path / "twin")
+    plain = Twin(twin.channel, twin.devices, twin.level, twin.limit_db)
+    blocked = lambda a, b: ~moved.line_of_sight(a, b)  # noqa: E731
+    before = error_db(plain.radio_map(small_scene), small_scene, blocked)
+    assert error_db(twin.radio_map(small_scene), small_scene, blocked) < 0.98 * before
+
+
 def samples(scene):
     rng = np.random.default_rng(0)
     x_min, x_max, y_min, y_max = scene.config.extent.bounds

@@ -7,6 +7,7 @@ import pytest
 import trimesh
 
 from radiotwin.effects.boxes import Box
+from radiotwin.effects.foliage import Foliage
 from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
@@ -65,6 +66,16 @@ def test_a_box_in_a_building_of_the_map_or_along_its_wall_is_no_missing_building
     assert bool(why) == refused
     if refused:
         assert "walls or roofs are off" in why
+
+
+@pytest.mark.parametrize("effect", [MissingObstacle(), Foliage()])
+def test_what_hides_devices_that_may_be_elsewhere_alone_is_refused(make_links, effect):
+    receiver_m = np.column_stack([np.linspace(90, 110, 20), np.zeros(20), np.full(20, 20.0)])
+    links = make_links([[0.0, 0, 2.0], [0.0, 80.0, 2.0]], receiver_m)
+    params = effect.Params(box=Box(20.0, 0.0, 10.0, 10.0, 10.0, 0.0))  # before device 0 only
+    assert effect.contradicted(params, replace(links, anchors=frozenset({0, 1}))) is None
+    assert "may be elsewhere" in effect.contradicted(params, replace(links, anchors=frozenset({1})))
+    assert effect.contradicted(params, replace(links, anchors=frozenset({0}))) is None
 
 
 def test_without_a_map_no_building_is_in_the_way_of_a_missing_one(make_links):
