@@ -16,9 +16,10 @@ MIN_APART_M = 25.0  # between the best cells
 CHUNK, MAX_POINTS = 2000, 4_000_000  # links, and points on them, at a time: bounds memory
 P_MISS = 0.4  # probability that a link through a cell misses the box there, which is smaller
 DOF = 4.0  # degrees of freedom of the errors
-MIN_KNOWN = 0.1  # of the links through a box: from devices whose positions are declared
-PASSED_BY_UNKNOWN = ("only links of devices whose positions are estimated pass it: they may be "
-                     "elsewhere")
+MIN_SHARE = 0.1  # of the links through a box, to be more than a few
+SAME_PLACE_M = 10.0  # devices of one mast
+BESIDE_UNKNOWN = ("only links of devices whose positions are estimated pass it: they may be "
+                  "elsewhere")
 
 
 class Box(NamedTuple):
@@ -126,14 +127,26 @@ def _share_below(start_z_m: np.ndarray, rise_m: np.ndarray, enter: np.ndarray, l
     return np.where(level & (start_z_m >= height_m), 0.0, below)
 
 
-def known_share(box: Box, links: LinkData) -> float:
-    """Return the share of the links through a box whose devices' positions are declared.
-
-    1 where no link passes it.
-    """
+def devices_through(box: Box, links: LinkData) -> np.ndarray:
+    """Return how many of the links of each device (k,) pass a box."""
     inside = cross(box, *ends_above(links, box[:2])).inside_m > 0
-    known = np.isin(links.device[inside], sorted(links.anchors))
-    return float(known.mean()) if len(known) else 1.0
+    return np.bincount(links.device[inside], minlength=len(links.device_m))
+
+
+def is_beside_unknown(box: Box, links: LinkData) -> bool:
+    """Return whether nearly all links through a box are of devices of estimated positions."""
+    through = devices_through(box, links)
+    return bool(through[sorted(links.anchors)].sum() < MIN_SHARE * through.sum())
+
+
+def is_seen_from_one_place(box: Box, links: LinkData) -> bool:
+    """Return whether nearly all links through a box are of devices that stand together.
+
+    Along their lines a large box far away hides what a small one nearby does.
+    """
+    through = devices_through(box, links)
+    away_m = np.linalg.norm((links.device_m - links.device_m[through.argmax()])[:, :2], axis=1)
+    return bool(through[away_m > SAME_PLACE_M].sum() < MIN_SHARE * through.sum())
 
 
 def near_box(box: Box, a_m: np.ndarray, b_m: np.ndarray, within_m: float) -> np.ndarray:

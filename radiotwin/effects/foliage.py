@@ -15,15 +15,14 @@ from typing_extensions import override
 from radiotwin.effects.arrays import ends_above, ends_above_ground
 from radiotwin.effects.base import GainEffect
 from radiotwin.effects.boxes import (
+    BESIDE_UNKNOWN,
     CELL_M,
     HEIGHTS_M,
-    MIN_KNOWN,
-    PASSED_BY_UNKNOWN,
     Box,
     back_project,
     best_cells,
     cross,
-    known_share,
+    is_beside_unknown,
     obstruction_nats,
 )
 from radiotwin.effects.params import Allowed, EffectParams, Estimate, Parameter, Variation
@@ -106,7 +105,7 @@ class Foliage(GainEffect):
 
     @override
     def contradicted(self, params: Params, links: LinkData) -> str | None:
-        return PASSED_BY_UNKNOWN if known_share(params.box, links) < MIN_KNOWN else None
+        return BESIDE_UNKNOWN if is_beside_unknown(params.box, links) else None
 
     @override
     def parameters(self, links: LinkData, params: Params,

@@ -18,16 +18,16 @@ from typing_extensions import override
 from radiotwin.effects.arrays import city_of, ends_above, ends_above_ground, subsample
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.boxes import (
+    BESIDE_UNKNOWN,
     HEIGHTS_M,
-    MIN_KNOWN,
-    PASSED_BY_UNKNOWN,
     Box,
     Crossing,
     back_project,
     best_cells,
     cross,
+    is_beside_unknown,
+    is_seen_from_one_place,
     knife_edge_db,
-    known_share,
     near_box,
     obstruction_nats,
     two_edges_db,
@@ -183,8 +183,11 @@ class MissingObstacle(GainEffect):
 
     @override
     def contradicted(self, params: Params, links: LinkData) -> str | None:
-        if known_share(params.box, links) < MIN_KNOWN:
-            return PASSED_BY_UNKNOWN
+        if is_beside_unknown(params.box, links):
+            return BESIDE_UNKNOWN
+        if is_seen_from_one_place(params.box, links):
+            return ("it is seen from one place only: how far away it is, and how large, nothing "
+                    "tells")
         share = built_share(links, params.box)
         if share <= MAX_BUILT:
             return None

@@ -71,11 +71,20 @@ def test_a_box_in_a_building_of_the_map_or_along_its_wall_is_no_missing_building
 @pytest.mark.parametrize("effect", [MissingObstacle(), Foliage()])
 def test_what_hides_devices_that_may_be_elsewhere_alone_is_refused(make_links, effect):
     receiver_m = np.column_stack([np.linspace(90, 110, 20), np.zeros(20), np.full(20, 20.0)])
-    links = make_links([[0.0, 0, 2.0], [0.0, 80.0, 2.0]], receiver_m)
-    params = effect.Params(box=Box(20.0, 0.0, 10.0, 10.0, 10.0, 0.0))  # before device 0 only
-    assert effect.contradicted(params, replace(links, anchors=frozenset({0, 1}))) is None
-    assert "may be elsewhere" in effect.contradicted(params, replace(links, anchors=frozenset({1})))
-    assert effect.contradicted(params, replace(links, anchors=frozenset({0}))) is None
+    links = make_links([[0.0, 0, 2.0], [5.0, -15.0, 2.0], [0.0, 80.0, 2.0]], receiver_m)
+    params = effect.Params(box=Box(20.0, -5.0, 10.0, 20.0, 10.0, 0.0))  # before devices 0 and 1
+    for known, refused in (({0, 1, 2}, False), ({2}, True), ({0}, False)):
+        why = effect.contradicted(params, replace(links, anchors=frozenset(known)))
+        assert ("may be elsewhere" in (why or "")) == refused and bool(why) == refused
+
+
+@pytest.mark.parametrize("other_m, refused", [([5.0, -15.0, 2.0], False), ([0.0, 1.0, 12.0], True), ([0.0, 90.0, 2.0], True)])
+def test_a_box_that_is_seen_from_one_place_is_no_building(make_links, other_m, refused):
+    """The other device stands elsewhere, on the same mast, or has nothing to do with the box."""
+    receiver_m = np.column_stack([np.linspace(90, 110, 20), np.zeros(20), np.full(20, 20.0)])
+    links = make_links([[0.0, 0, 2.0], other_m], receiver_m)
+    params = MissingObstacle.Params(box=Box(20.0, -5.0, 10.0, 20.0, 16.0, 0.0))
+    assert bool(MissingObstacle().contradicted(params, links)) == refused
 
 
 def test_without_a_map_no_building_is_in_the_way_of_a_missing_one(make_links):
