@@ -162,7 +162,7 @@ class LoopData:
         before_db: (n,) held-out prediction of the base alone [dB]; NaN: none.
         after_db: (n,) the same with all effects [dB].
         changed: whether anything was added to the base.
-        kept: names of the candidates that were kept, in order.
+        kept: names of the candidates that were kept, in order, without what belongs to the base.
         drivers: variables that the residual depends on, those before the effects first.
         effects: the effects that were found.
         interpolated_db: (n,) held-out contribution of correlated shadowing [dB], where it is kept.
@@ -189,12 +189,14 @@ def collect(loop: Loop) -> LoopData:
     links = _links(model.links, loop.before.held_out_mean_db)
     before = loop.dependences_before
     dependences = [*significant(before, loop.criteria), *loop.remaining]
+    in_base = sum(each.effect.is_declared for each in model.whole.effects)  # they come first
     interpolated_db = None
     if model.shadowing:
         interpolated_db = model.held_out_shadowing[0] * model.held_out_scales[0]
     return LoopData(
         links, loop.base, loop.before.held_out_mean_db, model.held_out_mean_db,
-        model is not loop.before, [score.name for score in loop.selection.scores if score.kept],
+        model is not loop.before,
+        [score.name for score in loop.selection.scores if score.kept][in_base:],
         [each.variable for each in dependences or before[:3]], _effects(loop, links),
         interpolated_db)
 

@@ -8,6 +8,7 @@ from radiotwin.closeloop.corrected_twin import corrected_twin
 from radiotwin.closeloop.result_file import make_report
 from radiotwin.closeloop.run import close_loop
 from radiotwin.measurements import Measurements
+from radiotwin.report.closeloop_data import collect
 from radiotwin.twin import Twin
 
 LAWS = {True: (-30.0, -2.5, 1.4), False: (-35.0, -3.04, 2.2)}  # with line of sight, and without: level, slope, noise
@@ -124,6 +125,7 @@ def test_walls_that_are_off_are_no_cause_but_part_of_the_base(small_scene, tmp_p
     assert [each.effect.name for each in loop.before.whole.effects] == ["uncertain_sight"]
     report = make_report(loop)
     assert report["verdict"] != "effect" and report["effects"][0]["is_declared"]
+    assert "uncertain_sight" not in collect(loop).kept
     corrected_twin(loop, small_scene).save(tmp_path / "twin")
     twin = Twin.load(tmp_path / "twin")
     plain = Twin(twin.channel, twin.devices, twin.level, twin.limit_db)
