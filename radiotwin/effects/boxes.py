@@ -133,18 +133,22 @@ def devices_through(box: Box, links: LinkData) -> np.ndarray:
     return np.bincount(links.device[inside], minlength=len(links.device_m))
 
 
-def is_beside_unknown(box: Box, links: LinkData) -> bool:
-    """Return whether nearly all links through a box are of devices of estimated positions."""
-    through = devices_through(box, links)
+def is_beside_unknown(through: np.ndarray, links: LinkData) -> bool:
+    """Return whether nearly all links through a box are of devices of estimated positions.
+
+    Args:
+        through: (k,) how many of each device's links pass it, see `devices_through`.
+        links: all of them.
+    """
     return bool(through[sorted(links.anchors)].sum() < MIN_SHARE * through.sum())
 
 
-def is_seen_from_one_place(box: Box, links: LinkData) -> bool:
+def is_seen_from_one_place(through: np.ndarray, links: LinkData) -> bool:
     """Return whether nearly all links through a box are of devices that stand together.
 
-    Along their lines a large box far away hides what a small one nearby does.
+    Along their lines a large box far away hides what a small one nearby does. Arguments as of
+    `is_beside_unknown`.
     """
-    through = devices_through(box, links)
     away_m = np.linalg.norm((links.device_m - links.device_m[through.argmax()])[:, :2], axis=1)
     return bool(through[away_m > SAME_PLACE_M].sum() < MIN_SHARE * through.sum())
 

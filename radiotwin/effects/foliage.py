@@ -22,6 +22,7 @@ from radiotwin.effects.boxes import (
     back_project,
     best_cells,
     cross,
+    devices_through,
     is_beside_unknown,
     obstruction_nats,
 )
@@ -105,7 +106,8 @@ class Foliage(GainEffect):
 
     @override
     def contradicted(self, params: Params, links: LinkData) -> str | None:
-        return BESIDE_UNKNOWN if is_beside_unknown(params.box, links) else None
+        through = devices_through(params.box, links)
+        return BESIDE_UNKNOWN if is_beside_unknown(through, links) else None
 
     @override
     def parameters(self, links: LinkData, params: Params,

@@ -25,6 +25,7 @@ from radiotwin.effects.boxes import (
     back_project,
     best_cells,
     cross,
+    devices_through,
     is_beside_unknown,
     is_seen_from_one_place,
     knife_edge_db,
@@ -183,9 +184,10 @@ class MissingObstacle(GainEffect):
 
     @override
     def contradicted(self, params: Params, links: LinkData) -> str | None:
-        if is_beside_unknown(params.box, links):
+        through = devices_through(params.box, links)
+        if is_beside_unknown(through, links):
             return BESIDE_UNKNOWN
-        if is_seen_from_one_place(params.box, links):
+        if is_seen_from_one_place(through, links):
             return ("it is seen from one place only: how far away it is, and how large, nothing "
                     "tells")
         share = built_share(links, params.box)

@@ -120,7 +120,11 @@ def test_a_building_that_is_gone_is_named(small_scene):
 
 def test_walls_that_are_off_are_no_cause_but_part_of_the_base(small_scene, tmp_path):
     moved = small_scene.city.with_vertices(small_scene.city.vertices + [1.5, -1.0, 0.0])
-    measured = survey(small_scene, 0, lambda a, b: ~moved.line_of_sight(a, b))
+
+    def blocked(a, b):
+        return ~moved.line_of_sight(a, b)
+
+    measured = survey(small_scene, 0, blocked)
     loop = close_loop(measured, small_scene, "twin")
     assert [each.effect.name for each in loop.before.whole.effects] == ["uncertain_sight"]
     report = make_report(loop)
@@ -129,7 +133,6 @@ def test_walls_that_are_off_are_no_cause_but_part_of_the_base(small_scene, tmp_p
     corrected_twin(loop, small_scene).save(tmp_path / "twin")
     twin = Twin.load(tmp_path / "twin")
     plain = Twin(twin.channel, twin.devices, twin.level, twin.limit_db)
-    blocked = lambda a, b: ~moved.line_of_sight(a, b)  # noqa: E731
     before = error_db(plain.radio_map(small_scene), small_scene, blocked)
     assert error_db(twin.radio_map(small_scene), small_scene, blocked) < 0.98 * before
 
