@@ -94,7 +94,7 @@ class ImagePaths(ChannelModel):
 
     @override
     def predict(self, links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
-        return self.level_db(path_gains(links), links), self.law.predict(links)[1]
+        return self.level_db(_seen_gains(links), links), self.law.predict(links)[1]
 
     def level_db(self, power: np.ndarray, links: LinkGeometry) -> np.ndarray:
         """Return the mean level (n,) [dB] of links whose paths carry these powers (n,)."""
@@ -136,6 +136,20 @@ class ImagePaths(ChannelModel):
             raise ValueError(f"law is not {SegmentedLogDistance.name!r}")
         return cls(SegmentedLogDistance.from_state(arrays, settings["law_settings"]),
                    stored_diffuse(settings["diffuse"]))
+
+
+def _seen_gains(links: LinkGeometry) -> np.ndarray:
+    """Return the power (n,) of the paths over a map, with lines of sight as the links have them.
+
+    They may have others than the map: something is in the way, or gone; or paths are those from
+    beside an estimated position. The direct path is lost, then, or is there as in free space, and
+    all other paths stay.
+    """
+    power, direct = path_gains(links), path_gains(links, ("direct",))
+    other = (direct > 0) != links.los
+    straight = 10 ** (-free_space_db(links.distance_m[other], links.frequency_hz) / 10)
+    power[other] += np.where(links.los[other], straight, -direct[other])
+    return power
 
 
 def stored_diffuse(value: Any) -> tuple[float, float]:

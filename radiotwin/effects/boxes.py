@@ -17,6 +17,7 @@ CHUNK, MAX_POINTS = 2000, 4_000_000  # links, and points on them, at a time: bou
 P_MISS = 0.4  # probability that a link through a cell misses the box there, which is smaller
 DOF = 4.0  # degrees of freedom of the errors
 MIN_SHARE = 0.1  # of the links through a box, to be more than a few
+GRAZING_DB = 6.0  # loss of a way that touches an edge
 SAME_PLACE_M = 10.0  # devices of one mast
 BESIDE_UNKNOWN = ("only links of devices whose positions are estimated pass it: they may be "
                   "elsewhere")
@@ -276,15 +277,17 @@ def two_edges_db(first_over_m: np.ndarray, second_over_m: np.ndarray,
     leads = first > second
     main_over_m = np.where(leads, first_over_m, second_over_m)
     main_near = np.where(leads, a, a + b)
-    # The other edge, above the line from the main one to the end behind it.
+    # The other edge, above the line from the main one to the end behind it; where the main one is
+    # below the straight line, that line is the way.
     own, beyond = np.where(leads, second_over_m, first_over_m), np.where(leads, c, a)
-    other_over_m = own - main_over_m * beyond / (b + beyond)
+    other_over_m = own - np.maximum(main_over_m, 0.0) * beyond / (b + beyond)
     loss_db = knife_edge_db(main_over_m, main_near, whole - main_near, wavelength_m)
     other_db = knife_edge_db(other_over_m, b, beyond, wavelength_m)
     p, q = np.maximum(first, second), np.minimum(first, second)
     alpha = np.arctan(np.sqrt(b * whole / (a * c)))
     with np.errstate(divide="ignore", invalid="ignore"):
-        correction_db = ((12 - 20 * np.log10(2 / (1 - alpha / np.pi)))
-                         * np.maximum(q / p, 0.0) ** (2 * p))
-    correction_db = np.where((p > 0) & (q > 0), correction_db, 0.0)
+        share = np.where(q > 0, np.maximum(q / p, 0.0) ** (2 * p), 0.0)
+    # Edges close together are one, also where the way passes just above both.
+    share = np.where(p > 0, share, np.minimum(loss_db, other_db) / GRAZING_DB)
+    correction_db = (12 - 20 * np.log10(2 / (1 - alpha / np.pi))) * share
     return loss_db + np.maximum(other_db - correction_db, 0.0)

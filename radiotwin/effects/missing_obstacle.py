@@ -15,7 +15,7 @@ from pydantic import Field
 from scipy.constants import speed_of_light
 from typing_extensions import override
 
-from radiotwin.effects.arrays import city_of, ends_above, ends_above_ground, subsample
+from radiotwin.effects.arrays import LinkCache, city_of, ends_above, ends_above_ground, subsample
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.boxes import (
     BESIDE_UNKNOWN,
@@ -78,6 +78,9 @@ class MissingObstacle(GainEffect):
         scattered_db: Decibels = Field(
             0.0, description="Power in the shadow, relative to the channel without line of sight.")
         exact: bool = Field(False, description="Whether paths are followed over a map with it.")
+
+    def __init__(self) -> None:
+        self._shadows = LinkCache()
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
@@ -147,14 +150,20 @@ class MissingObstacle(GainEffect):
         crosses = np.isfinite(crossing.left_m)
         if crosses.any():
             rows = rows[crosses]
-            mine = links.select(rows)
             scattered: np.ndarray | float = 0.0
-            shadow_db = level_at(mine.with_los(np.zeros(len(rows), bool))) - level_at(mine)
             if links.city is not None:
+                shadow_db = self._shadow_db(links, level_at)[rows]
                 scattered = 10 ** (np.minimum(shadow_db + params.scattered_db, 0) / 10)
             offset_db[rows] = _gain_db(Crossing(*(value[crosses] for value in crossing)), scattered,
                                        speed_of_light / links.frequency_hz)
         return Term.of_offset(offset_db)
+
+    def _shadow_db(self, links: LinkData, level_at: LevelAt) -> np.ndarray:
+        """Return what links (n,) lose if something hides the other end, and all else stays [dB]."""
+        def derive() -> np.ndarray:
+            hidden = links.with_los(np.zeros(len(links), bool))
+            return level_at(hidden, True) - level_at(links, True)
+        return self._shadows.get(links, (level_at,), derive)
 
     @override
     def exact(self, params: Params) -> Params:

@@ -11,6 +11,7 @@ from tests.scene.test_citymap import clip_interval
 BOXES = ((-10.0, -10.0, 10.0, 10.0, 20.0), (60.0, -10.0, 80.0, 10.0, 20.0))  # x, y, x, y, height [m]
 DEVICES_M = np.array([[-15.0, 0.0, 1.5], [85.0, 3.0, 1.5]])
 LOSS_DB = 20.0
+MIN_NATS = 6.0  # for a building to be suspected
 
 
 def city_of(boxes):
@@ -33,8 +34,11 @@ def suspected(make_links, view, true_boxes, seed=0):
     def level_at(of, exact=False):
         return np.where(of.los, 0.0, -LOSS_DB)
 
-    found = RemovedObstacle().propose(view(measured, level_at(measured), 3.0, level_at))
-    return found[0].building if found else None
+    effect, residual, every = RemovedObstacle(), view(measured, level_at(measured), 3.0, level_at), np.arange(len(links))
+    gains = {params.building: residual.gain_nats(every, effect.term(measured, params, level_at).offset_db).sum()
+             for params in effect.propose(residual)}
+    best = max(gains, key=gains.get, default=None)
+    return best if gains and gains[best] > MIN_NATS else None
 
 
 @pytest.mark.parametrize("seed", range(4))
