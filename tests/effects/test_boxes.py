@@ -79,6 +79,21 @@ def test_two_edges_lose_what_one_does_where_the_other_is_out_of_the_way_and_more
     assert turned_db[0] == pytest.approx(two_db[2])
 
 
+@pytest.mark.parametrize("between_m", [0.1, 1.0, 20.0])
+def test_two_edges_below_the_way_lose_no_more_than_each_by_itself(between_m):
+    """Metres below it they lose nothing, and where the way touches both, those close together are one edge."""
+    def two_db(over_m):
+        return two_edges_db(np.array([over_m]), np.array([over_m]), 50.0, between_m, 80.0, 0.1)[0]
+
+    assert two_db(-6.0) == pytest.approx(0.0, abs=0.01)
+    losses_db = [two_db(over_m) for over_m in np.linspace(-6, 6, 601)]
+    assert (np.diff(losses_db) >= -0.01).all() and np.diff(losses_db).max() < 0.3  # no step at 0
+    one_db = knife_edge_db(np.zeros(1), 50.0, 80.0, 0.1)[0]
+    assert one_db <= two_db(0.0) < 2 * one_db
+    if between_m <= 1:
+        assert two_db(0.0) == pytest.approx(one_db, abs=0.7)
+
+
 def test_long_links_are_projected_few_at_a_time_to_the_same_sums(monkeypatch):
     rng = np.random.default_rng(1)
     a_m = np.column_stack([rng.uniform(0, 200, (1000, 2)), np.full(1000, 1.5)])

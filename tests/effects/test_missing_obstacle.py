@@ -54,6 +54,22 @@ def test_a_narrow_building_is_proposed_with_its_shape_and_turn(make_links, view,
     assert max(gains) > 0.5 * residual.gain_nats(every, -lost_db).sum()
 
 
+def test_in_a_shadow_is_what_reaches_it_on_other_ways(make_links):
+    """The same high box hides two receivers; one of them has a strong reflection, as strong as half the direct path."""
+    house = trimesh.creation.box(bounds=[[400, 400, 0], [410, 410, 10]])
+    receiver_m = np.array([[60.0, 0, 5], [0.0, 60, 5]])
+    links = make_links([[0.0, 0, 5]], receiver_m, city=CityMap(house.vertices, house.faces))
+
+    def level_at(of, exact=False):
+        left_db = np.where(of.receiver_m[:, 0] > 30, -3.0, -40.0)
+        return np.where(of.los, 0.0, left_db)
+
+    around = [Box(30.0, 0.0, 10.0, 60.0, 200.0, 0.0), Box(0.0, 30.0, 60.0, 10.0, 200.0, 0.0)]
+    lost_db = [MissingObstacle().term(links, MissingObstacle.Params(box=box), level_at).offset_db for box in around]
+    assert lost_db[0][0] == pytest.approx(-3.0, abs=0.3) and lost_db[0][1] == 0
+    assert lost_db[1][1] < -20 and lost_db[1][0] == 0
+
+
 @pytest.mark.parametrize(("box", "refused"), [
     (Box(215.0, 15.0, 20.0, 20.0, 25.0, 0.0), True),  # within a house of 30 by 30 m, and higher
     (Box(215.0, 33.0, 28.0, 6.0, 12.0, 0.0), True),  # along its northern wall
