@@ -6,7 +6,7 @@ their way.)
 
 The buildings that most links behind them have lost less to than the model says are tried. Maps give
 many a roof too high, and links that pass just below its edge gain from that building's removal as
-well: some have to be so deep behind it that a lower one would block them, too.
+well: it has to explain them much better than a lower building does.
 """
 
 from functools import lru_cache
@@ -27,10 +27,13 @@ from radiotwin.links import LinkData
 from radiotwin.scene.citymap import CityMap
 
 MAX_PROPOSALS = 4  # of buildings whose removal is tried exactly
-MIN_LINKS = 8  # that a building hides, also if its roof is lower
+MIN_LINKS = 8  # that a building hides
 RISES_DB = (-4.0, -8.0, -12.0, -16.0, -20.0)  # losses that a link behind it would not have
 WELD_M = 0.05  # vertices closer together belong to one building
-LOWER_M = 5.0  # more than the height of a mapped building is usually off
+LOWER_M = (2.5, 5.0)  # by which the height of a mapped building may be off
+FLAT_M = 0.5  # least height of a building that is lower
+# Very strong evidence (Kass and Raftery 1995, 'Bayes factors', J. Am. Stat. Assoc. 90, Sec. 3.2).
+MIN_LEAD_NATS = 5.0
 NEAR_M = 25.0  # links whose ground tracks stay farther away keep their level, also exactly
 
 
@@ -62,25 +65,30 @@ class RemovedObstacle(GainEffect):
         rows = np.flatnonzero(~links.los)
         a_m, b_m = links.device_m[links.device[rows]], links.receiver_m[rows]
         nats = obstruction_nats(view.residual_db[rows], view.scale_db[rows], RISES_DB)
-        lowered, (label, centres_m) = _lowered(links.city), buildings(links.city)
+        label, centres_m = buildings(links.city)
         total = np.full(len(centres_m), -np.inf)
         for building in range(len(centres_m)):
-            others = label != building
-            behind = ~links.city.without(others).line_of_sight(a_m, b_m)
-            deep = ~lowered.without(others).line_of_sight(a_m[behind], b_m[behind])
-            if deep.sum() >= MIN_LINKS:
+            behind = ~links.city.without(label != building).line_of_sight(a_m, b_m)
+            if behind.sum() >= MIN_LINKS:
                 total[building] = nats[behind].sum()
-        best = np.argsort(-total)[:MAX_PROPOSALS]
-        return [self.Params(building=int(building), centre_m=tuple(centres_m[building].tolist()),
-                            exact=True) for building in best if np.isfinite(total[building])]
+        likely = [int(building) for building in np.argsort(-total)[:MAX_PROPOSALS]
+                  if np.isfinite(total[building])]
+        gains = {building: _gain_nats(view, building, _without(links.city, building)[0])
+                 for building in likely}
+        for building in sorted(gains, key=gains.__getitem__, reverse=True):
+            least = gains[building] - MIN_LEAD_NATS
+            if least > 0 and all(_gain_nats(view, building, _lower(links.city, building, lower_m))
+                                 < least for lower_m in LOWER_M):
+                return [self.Params(building=building, centre_m=tuple(centres_m[building].tolist()),
+                                    exact=True)]
+        return []
 
     @override
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
         offset_db, with_it = np.zeros(len(links)), city_of(links, self.name)
         if params.exact:
             city, box = _without(with_it, params.building)
-            rows = np.flatnonzero(near_box(box, links.device_m[links.device], links.receiver_m,
-                                           NEAR_M))
+            rows = _near(links, box)
             mine = links.select(rows)
             offset_db[rows] = level_at(mine.with_city(city), True) - level_at(mine, True)
             return Term.of_offset(offset_db)
@@ -102,6 +110,20 @@ class RemovedObstacle(GainEffect):
                    estimate: Estimate) -> dict[str, Parameter]:
         return {name: Parameter(value, value, value, "m")
                 for name, value in zip(("x_m", "y_m", "height_m"), params.centre_m, strict=True)}
+
+
+def _gain_nats(view: ResidualView, building: int, other: CityMap) -> float:
+    """Return how much likelier links are over another map, which differs in one building."""
+    assert view.links.city is not None
+    rows = _near(view.links, _without(view.links.city, building)[1])
+    mine = view.links.select(rows)
+    change_db = view.level_at(mine.with_city(other), True) - view.level_at(mine, True)
+    return float(view.gain_nats(rows, change_db).sum())
+
+
+def _near(links: LinkData, box: Box) -> np.ndarray:
+    """Return the rows of links that pass near a box."""
+    return np.flatnonzero(near_box(box, links.device_m[links.device], links.receiver_m, NEAR_M))
 
 
 def _rise_db(links: LinkData, level_at: LevelAt) -> np.ndarray:
@@ -156,19 +178,14 @@ def buildings(city: CityMap) -> tuple[np.ndarray, np.ndarray]:
     return label, centre_m
 
 
-@lru_cache(maxsize=4)
-def _lowered(city: CityMap) -> CityMap:
-    """Return a map of which every building is lower by `LOWER_M`, or as flat as the ground."""
-    label = buildings(city)[0]
-    base_m = np.full(label.max() + 1, np.inf)
-    np.minimum.at(base_m, label, city.vertices[city.faces][:, :, 2].min(axis=1))
-    lowest_m = np.full(len(city.vertices), -np.inf)
-    lowest_m[city.faces] = base_m[label][:, None]
-    if city.terrain is not None:
-        lowest_m[city.faces[city.terrain]] = np.inf
-    height_m = city.vertices[:, 2]
-    lower_m = np.minimum(height_m, np.maximum(height_m - LOWER_M, lowest_m))
-    return city.with_vertices(np.column_stack([city.vertices[:, :2], lower_m]))
+@lru_cache(maxsize=32)
+def _lower(city: CityMap, building: int, by_m: float) -> CityMap:
+    """Return a map in which a building is lower, or nearly as flat as the ground."""
+    mine = np.unique(city.faces[buildings(city)[0] == building])
+    vertices = city.vertices.copy()
+    height_m = vertices[mine, 2]
+    vertices[mine, 2] = np.maximum(height_m - by_m, np.minimum(height_m, height_m.min() + FLAT_M))
+    return city.with_vertices(vertices)
 
 
 @lru_cache(maxsize=32)
