@@ -130,6 +130,10 @@ class Effect(ABC):
         """Return why the data do not allow this effect to be looked for; None where they do."""
         return None
 
+    def kind(self, params: Any) -> Any:
+        """Return of which kind parameters are: a search begins at the best of each kind."""
+        return None
+
     def propose(self, view: ResidualView) -> list[Any]:
         """Return parameters worth trying, best first; empty where the residual does not fit.
 

@@ -127,35 +127,51 @@ def _best_addition(model: FoldModel, effect: Effect, result: FitResult,
                    like: Any) -> tuple[FoldModel, FitResult] | None:
     view = model.view(result)
     proposals = effect.propose(view) if like is None else effect.propose_like(view, like)
-    applied = [model.apply(effect, params) for params in proposals]
+    kinds: dict[Any, list[Any]] = {}
+    for params in proposals:
+        kinds.setdefault(effect.kind(params), []).append(params)
+    # Of a fold also where quick levels were better on all links.
+    exactly = effect.always_exact and (like is None or like == effect.exact(like))
+    found = [_best_of_a_kind(model, effect, result, each, like is not None, exactly)
+             for each in kinds.values()]
+    if not found:
+        return None
+    best = min(found, key=lambda each: each[1].objective)
+    if not exactly or result.objective - best[1].objective < MIN_GAIN_NATS:
+        return best
+    if like is not None:
+        near = _near(model, effect, result, like)
+        return near if near[1].objective < best[1].objective else best
+    if not _is_exact(best[0]) and model.channel.follows_paths:
+        best = _exactly_beside(*best)
+    before = result.objective
+    for _ in range(MAX_EXACT_DESCENTS):
+        if not _is_exact(best[0]) or before - best[1].objective < MIN_EXACT_GAIN_NATS:
+            break
+        before = best[1].objective
+        best = _refine(*best, evaluations=EXACT_EVALUATIONS, descents=1, max_links=MAX_EXACT_LINKS)
+    return best
+
+
+def _best_of_a_kind(model: FoldModel, effect: Effect, result: FitResult, proposals: list[Any],
+                    is_fold: bool, exactly: bool) -> tuple[FoldModel, FitResult]:
+    """Return the best of some proposals, refined where it gains; with exact levels if better."""
+    view, applied = model.view(result), [model.apply(effect, params) for params in proposals]
     if effect.stage == "gain" and len(applied) > MAX_PROPOSALS:  # only gains have a score
         applied.sort(key=lambda each: -view.score(each.term.select(model.train)))
         applied = applied[:MAX_PROPOSALS]
-    best = None
-    for each in applied:
-        tried = model.with_effects([*model.effects, each])
-        fitted = tried.fit(result)
-        if best is None or fitted.objective < best[1].objective:
-            best = tried, fitted
-    if best is None or result.objective - best[1].objective < MIN_GAIN_NATS:
+    tried = [model.with_effects([*model.effects, each]) for each in applied]
+    best = min(((each, each.fit(result)) for each in tried), key=lambda each: each[1].objective)
+    if result.objective - best[1].objective < MIN_GAIN_NATS:
         return best
-    refined = _refine(*best, descents=DESCENTS if like is None else 1)
-    if not effect.always_exact or (like is not None and like != effect.exact(like)):
-        return refined  # of a fold also where quick levels were better on all links
-    exact = with_exact_levels(*refined)
-    if like is not None:
-        near = _near(model, effect, result, like)
-        return near if near[1].objective < exact[1].objective else exact
-    if exact[1] is refined[1] and model.channel.follows_paths:
-        exact = _exactly_beside(*refined)
-    before = result.objective
-    for _ in range(MAX_EXACT_DESCENTS):
-        if exact[1] is refined[1] or before - exact[1].objective < MIN_EXACT_GAIN_NATS:
-            break
-        before = exact[1].objective
-        exact = _refine(*exact, evaluations=EXACT_EVALUATIONS, descents=1,
-                        max_links=MAX_EXACT_LINKS)
-    return exact
+    best = _refine(*best, descents=1 if is_fold else DESCENTS)
+    return with_exact_levels(*best) if exactly else best
+
+
+def _is_exact(model: FoldModel) -> bool:
+    """Return whether the last effect has exact levels."""
+    last = model.effects[-1]
+    return bool(last.params == last.effect.exact(last.params))
 
 
 def _exactly_beside(model: FoldModel, result: FitResult) -> tuple[FoldModel, FitResult]:

@@ -2,8 +2,10 @@
 
 It is located by back-projecting the loss along the links; then a box is fitted. Behind the box
 these powers add: what passes over the two edges of its roof and around both sides (knife edges of
-ITU-R P.526), and what reaches any shadow by reflections (the channel's own level without line of
-sight, plus a fitted offset). Exactly: the channel's level over the map with the box in it.
+ITU-R P.526), and what reaches any shadow by reflections: what is left on the other paths of the
+link or, where that explains more, the class's level without line of sight (a small box hides the
+straight line only, a large one most paths), plus a fitted offset. Exactly: the channel's level over
+the map with the box in it.
 """
 
 from collections.abc import Iterable
@@ -78,6 +80,9 @@ class MissingObstacle(GainEffect):
         scattered_db: Decibels = Field(
             0.0, description="Power in the shadow, relative to the channel without line of sight.")
         exact: bool = Field(False, description="Whether paths are followed over a map with it.")
+        by_class: bool = Field(False, description=(
+            "Whether the shadow has the level of the class without line of sight, not what is "
+            "left on the other paths."))
 
     def __init__(self) -> None:
         self._shadows = LinkCache()
@@ -97,13 +102,17 @@ class MissingObstacle(GainEffect):
         nats = obstruction_nats(view.residual_db[rows], view.scale_db[rows],
                                 LOSSES_DB) / view.design_effect
         centres_m, total = back_project(*ends_above_ground(links, rows), nats)
-        boxes = [self._best_shape(view, rows, centre_m, height)
+        found = [self._best_shape(view, rows, centre_m, height, by_class)
                  for centre_m, height, gain in best_cells(centres_m, total, MAX_PROPOSALS)
-                 if gain > MIN_NATS]
-        return [self.Params(box=box) for box in boxes if box is not None]
+                 if gain > MIN_NATS for by_class in (False, True)]
+        return [each for each in found if each is not None]
+
+    @override
+    def kind(self, params: Params) -> bool:
+        return params.by_class
 
     def _best_shape(self, view: ResidualView, los: np.ndarray, centre_m: np.ndarray,
-                    height: int) -> Box | None:
+                    height: int, by_class: bool) -> Params | None:
         """Return the box near a cell's centre with which links (r,) with line of sight gain most.
 
         Of shapes, turns and places that the cell does not tell: a box that is too large hides links
@@ -120,7 +129,8 @@ class MissingObstacle(GainEffect):
 
         def best(boxes: Iterable[Box]) -> Box:
             for box in boxes:
-                changed_db = self.term(mine, self.Params(box=box), view.level_at).offset_db
+                changed_db = self.term(mine, self.Params(box=box, by_class=by_class),
+                                       view.level_at).offset_db
                 gains[box] = float(view.gain_nats(rows, changed_db).sum())
             return max(gains, key=gains.__getitem__)
 
@@ -131,7 +141,8 @@ class MissingObstacle(GainEffect):
                    for east_m, north_m, top_m in product(SHIFTS_M, SHIFTS_M, tops_m))
         best(Box(box.x_m, box.y_m, *sides_m, box.height_m, turn_deg)
              for sides_m, turn_deg in SHAPES)
-        return next((box for box in sorted(gains, key=gains.__getitem__, reverse=True)
+        return next((self.Params(box=box, by_class=by_class)
+                     for box in sorted(gains, key=gains.__getitem__, reverse=True)
                      if built_share(links, box) <= MAX_BUILT), None)
 
     @override
@@ -152,22 +163,22 @@ class MissingObstacle(GainEffect):
             rows = rows[crosses]
             scattered: np.ndarray | float = 0.0
             if links.city is not None:
-                shadow_db = self._shadow_db(links, level_at)[rows]
+                shadow_db = self._shadow_db(links, level_at, params.by_class)[rows]
                 scattered = 10 ** (np.minimum(shadow_db + params.scattered_db, 0) / 10)
             offset_db[rows] = _gain_db(Crossing(*(value[crosses] for value in crossing)), scattered,
                                        speed_of_light / links.frequency_hz)
         return Term.of_offset(offset_db)
 
-    def _shadow_db(self, links: LinkData, level_at: LevelAt) -> np.ndarray:
-        """Return what links (n,) lose if something hides the other end, and all else stays [dB]."""
+    def _shadow_db(self, links: LinkData, level_at: LevelAt, by_class: bool) -> np.ndarray:
+        """Return what links (n,) lose if something hides the other end [dB]; see `Params`."""
         def derive() -> np.ndarray:
             hidden = links.with_los(np.zeros(len(links), bool))
-            return level_at(hidden, True) - level_at(links, True)
-        return self._shadows.get(links, (level_at,), derive)
+            return level_at(hidden, not by_class) - level_at(links, not by_class)
+        return self._shadows.get(links, (level_at, by_class), derive)
 
     @override
     def exact(self, params: Params) -> Params:
-        return params.model_copy(update={"exact": True})
+        return params.model_copy(update={"exact": True, "by_class": False})
 
     @override
     def variation(self, params: Params) -> Variation:

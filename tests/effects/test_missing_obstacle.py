@@ -70,6 +70,30 @@ def test_in_a_shadow_is_what_reaches_it_on_other_ways(make_links):
     assert lost_db[1][1] < -20 and lost_db[1][0] == 0
 
 
+def test_a_search_begins_at_the_best_of_both_models_of_a_shadow(make_links, view):
+    """The class without line of sight says 25 dB, the other paths 6 dB: both are proposed, and are two kinds."""
+    receiver_m = np.array([(x_m, y_m, 5.0) for x_m in range(90, 200, 6) for y_m in range(-60, 60, 6)], float)
+    house = trimesh.creation.box(bounds=[[400, 400, 0], [410, 410, 10]])
+    links = make_links([[0.0, 0, 5.0], [0.0, 90, 5.0]], receiver_m, city=CityMap(house.vertices, house.faces))
+
+    def level_at(of, exact=False):
+        return np.where(of.los, 0.0, -6.0 if exact else -25.0)
+
+    hidden = Box(60.0, 10.0, 24.0, 24.0, 30.0, 0.0)
+    effect = MissingObstacle()
+    lost_db = effect.term(links, effect.Params(box=hidden, by_class=True), level_at).offset_db
+    assert lost_db.min() < -15 and (lost_db < -5).sum() > 30
+    noise_db = np.random.default_rng(0).normal(0, 1.5, len(links))
+    residual = view(replace(links, level_db=noise_db + lost_db), np.zeros(len(links)), 1.5, level_at)
+    proposed = effect.propose(residual)
+    assert {effect.kind(params) for params in proposed} == {False, True}
+    every = np.arange(len(links))
+    gains = {kind: max(residual.gain_nats(every, effect.term(residual.links, params, level_at).offset_db).sum()
+                       for params in proposed if effect.kind(params) == kind) for kind in (False, True)}
+    assert gains[True] > 1.5 * gains[False] > 0
+    assert not effect.exact(effect.Params(box=hidden, by_class=True)).by_class
+
+
 @pytest.mark.parametrize(("box", "refused"), [
     (Box(215.0, 15.0, 20.0, 20.0, 25.0, 0.0), True),  # within a house of 30 by 30 m, and higher
     (Box(215.0, 33.0, 28.0, 6.0, 12.0, 0.0), True),  # along its northern wall
