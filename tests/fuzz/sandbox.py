@@ -195,7 +195,10 @@ class _Watch:
         return f"{event}: {arguments[0] if event != 'socket.connect' else arguments[1]!r}"
 
     def _library(self, event: str, arguments: tuple) -> str | None:
-        path = os.path.realpath(os.fsdecode(arguments[0])) if isinstance(arguments[0], str | bytes) else ""
+        name = os.fsdecode(arguments[0]) if isinstance(arguments[0], str | bytes) else ""
+        if os.sep not in name:  # looked for where the system's libraries are, not in the working folder
+            return None
+        path = os.path.realpath(name)
         return f"{event}: {path}" if path.startswith(self.inside[:3]) else None
 
 
