@@ -76,14 +76,14 @@ def rays_of(links: LinkData, end: str) -> np.ndarray:
     return rays
 
 
-def free_space(links: LinkData) -> np.ndarray:
+def free_space(geometry: LinkGeometry) -> np.ndarray:
     """Return the power gain (n,) along the straight line if nothing were in the way (ITU-R P.525).
 
     0 without a map, where the straight line is all that is known.
     """
-    if links.city is None:
-        return np.zeros(len(links))
-    return (speed_of_light / links.frequency_hz / (4 * np.pi * links.distance_m)) ** 2
+    if geometry.city is None:
+        return np.zeros(len(geometry))
+    return (speed_of_light / geometry.frequency_hz / (4 * np.pi * geometry.distance_m)) ** 2
 
 
 def through_antenna_db(power: np.ndarray, gain: np.ndarray, scattered: np.ndarray,

@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from typing_extensions import override
 
 from radiotwin.channel.base import ANY_LEVEL_SD_DB, ChannelModel
-from radiotwin.channel.followed_paths import path_gains
+from radiotwin.channel.followed_paths import free_space, interaction_gains, path_gains
 from radiotwin.channel.published import free_space_db
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.channel.stored import require_names, require_number
@@ -145,11 +145,10 @@ def _seen_gains(links: LinkGeometry) -> np.ndarray:
     beside an estimated position. The direct path is lost, then, or is there as in free space, and
     all other paths stay.
     """
-    power, direct = path_gains(links), path_gains(links, ("direct",))
-    other = (direct > 0) != links.los
-    straight = 10 ** (-free_space_db(links.distance_m[other], links.frequency_hz) / 10)
-    power[other] += np.where(links.los[other], straight, -direct[other])
-    return power
+    gains = interaction_gains(links)
+    other = (gains[:, 0] > 0) != links.los
+    gains[other, 0] = np.where(links.los[other], free_space(links)[other], 0.0)
+    return gains.sum(axis=1)
 
 
 def stored_diffuse(value: Any) -> tuple[float, float]:

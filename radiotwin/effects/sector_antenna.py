@@ -195,7 +195,7 @@ class Rays(NamedTuple):
         power = np.linalg.norm(ray, axis=2)
         sine = ray[..., 2] / np.maximum(power, 1e-30)
         return cls(power, np.degrees(np.arctan2(ray[..., 0], ray[..., 1])),
-                   np.degrees(np.arcsin(np.clip(sine, -1, 1))), free_space(links))
+                   np.degrees(np.arcsin(np.clip(sine, -1, 1))), free_space(links.geometry))
 
     def offset_db(self, pattern: SectorPattern) -> np.ndarray:
         """Return (n,) what a pattern adds to each link [dB]."""

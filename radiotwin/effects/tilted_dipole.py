@@ -172,11 +172,11 @@ class _Arrivals(NamedTuple):
         links = links.select(rows)
         if links.city is None:
             return cls(-_unit(links.offset_m)[:, None], np.ones((len(links), 1)),
-                       links.receiver_axes, free_space(links))
+                       links.receiver_axes, free_space(links.geometry))
         ray = rays_of(links, "arrivals")
         power = np.linalg.norm(ray, axis=2)
         return cls(ray / np.maximum(power, 1e-30)[..., None], power, links.receiver_axes,
-                   free_space(links))
+                   free_space(links.geometry))
 
     def offset_db(self, dipole: DipoleParams) -> np.ndarray:
         """Return (n,) what the dipole adds to each link [dB]."""
