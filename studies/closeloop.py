@@ -184,7 +184,7 @@ def hidden_table(rows: pd.DataFrame) -> str:
     of_twin = markdown(["city", "held out by", "named", "before", "after", ""], lines,
                        "Nothing is hidden, base `twin`",
                        ": RMSE of links without line of sight [dB]")
-    return "\n\n".join([found, one_by_one, of_twin])
+    return "\n\n".join([found, one_by_one, *([of_twin] if lines else [])])
 
 
 def _family_line(family: str, cases: pd.DataFrame) -> list[str]:

@@ -253,7 +253,7 @@ def maps_table(rows: pd.DataFrame) -> str:
     lines = [(title, rows[line == name]) for name, title in TITLES.items() if (line == name).any()]
     errors = markdown(
         ["map", "worlds", "RMSE of paths [dB]", "network", "kriging", "all combined",
-         "worlds where that is at most the best", "its bias, LoS / NLoS [dB]",
+         "worlds where that is no worse than the best", "its bias, LoS / NLoS [dB]",
          "within 90 %, LoS / NLoS", "its RMSE on anchors' links [dB]", "walls seem off by [m]",
          "heights [m]", "shift [m]", "reflections [dB]", "worlds with a warning of the map"],
         [[title, str(len(part)), *(number(_rmse(part, model), 2) for model in (*SIMPLE, COMBINED)),
