@@ -72,7 +72,9 @@ def find_in_real(seed: int, settings: dict) -> dict:
         "named_db": explained(loop).rmse_db(), "after_db": error["after"]["rmse_db"],
         "combined_db": error["combined"]["rmse_db"],
         "baselines_db": {name: scores["rmse_db"] for name, scores in report["baselines"].items()},
+        "posterior": report["posterior"],
         "effects": [{"name": effect["name"], "parameters": effect["parameters"],
+                     "probability": effect["probability"],
                      "heldout_nll_gain": effect["evidence"]["heldout_nll_gain"]}
                     for effect in report["effects"]]}
     if settings["set"] == "duke_cbrs" and not settings["shuffled"]:
