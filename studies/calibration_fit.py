@@ -83,7 +83,7 @@ def logistic(values: np.ndarray, right: np.ndarray, mean: np.ndarray, sd: np.nda
 def cross_validated(rows: list[dict]) -> pd.DataFrame:
     """Return `usable` with the `probability` by a regression on cases of other cities."""
     table = usable(rows)
-    places = sorted({_place(row["name"]) for row in rows})
+    places = _places(rows)
     fold = dict(zip(np.random.default_rng(0).permutation(places),
                     np.arange(len(places)) % FOLDS, strict=True))
     probability = np.full(len(table), np.nan)
@@ -94,6 +94,10 @@ def cross_validated(rows: list[dict]) -> pd.DataFrame:
                 log_odds = weights["intercept"] + weights["names"].get(name, 0.0)
                 probability[i] = expit(log_odds + np.dot(weights["weights"], values))
     return table.assign(probability=probability)
+
+
+def _places(rows: list[dict]) -> list[str]:
+    return sorted({_place(row["name"]) for row in rows})
 
 
 def _place(case: str) -> str:
@@ -108,8 +112,14 @@ def _rows(rows: pd.DataFrame) -> list[dict]:
 
 
 def calibration_table(rows: pd.DataFrame) -> str:
-    """Return what passes thresholds of probability, and how often candidates are right by name."""
-    table = cross_validated(_rows(rows))
+    """Return what passes thresholds of probability, and how often candidates are right by name.
+
+    Of fewer than `FOLDS` cities only a sentence that says so.
+    """
+    cases = _rows(rows)
+    if len(_places(cases)) < FOLDS:
+        return f"Too few cities for a regression: {len(_places(cases))}, of at least {FOLDS}."
+    table = cross_validated(cases)
     right = table["right"].to_numpy(dtype=bool)
     thresholds = []
     for least in THRESHOLDS:
@@ -127,7 +137,10 @@ def calibration_table(rows: pd.DataFrame) -> str:
 
 def calibration_figures(rows: pd.DataFrame) -> dict[str, Figure]:
     """Draw how often candidates of a probability are right."""
-    table = cross_validated(_rows(rows))
+    cases = _rows(rows)
+    if len(_places(cases)) < FOLDS:
+        return {}
+    table = cross_validated(cases)
     figure, (axes,) = make_panels(1, 1, 4.2)
     axes.plot([0, 1], [0, 1], color="black", linewidth=0.8)
     bins = np.digitize(table["probability"], BINS[1:-1])

@@ -45,6 +45,12 @@ def test_probabilities_of_other_cities_are_as_often_right_as_they_say():
         assert each["right"].mean() == pytest.approx(each["probability"].mean(), abs=spread)
 
 
+def test_few_cities_give_a_sentence_and_no_figure():
+    few = pd.DataFrame([{"name": each["name"], **each["results"]} for each in rows(4, 5)])
+    assert "1, of at least 10" in calibration_fit.calibration_table(few)
+    assert calibration_fit.calibration_figures(few) == {}
+
+
 def test_what_is_open_and_what_held_out_links_do_not_support_is_left_out():
     (one,) = rows(3, 1)
     one["results"]["open"] = ["foliage"]
