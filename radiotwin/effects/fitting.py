@@ -25,6 +25,7 @@ EVALUATIONS = 25  # of the objective for each number, in one descent
 DESCENTS = 2  # a simplex that has collapsed too early starts anew; one for a fold, which is near
 MAX_LINKS, MAX_LINKS_OF_MEMBER = 5000, 1500  # that numbers are refined on
 EXACT_EVALUATIONS, MAX_EXACT_LINKS = 8, 1500  # the same where each follows paths, which is slow
+MAX_FOLLOWED_LINKS = 5000  # that an effect changes: to follow paths of more takes many minutes
 MIN_EXACT_GAIN_NATS = 10.0  # that exact levels must gain to be refined on, and each descent
 MAX_EXACT_NUMBERS = 3  # of an effect whose exact levels are looked for where quick ones fit better
 MAX_EXACT_DESCENTS = 3  # the objective is rough, as paths open and close: a simplex stops early
@@ -139,6 +140,8 @@ def _best_addition(model: FoldModel, effect: Effect, result: FitResult,
     best = min(found, key=lambda each: each[1].objective)
     if not exactly or result.objective - best[1].objective < MIN_GAIN_NATS:
         return best
+    if like is None and not _changes_few(best[0]):
+        return best
     if like is not None:
         near = _near(model, effect, result, like)
         return near if near[1].objective < best[1].objective else best
@@ -165,7 +168,12 @@ def _best_of_a_kind(model: FoldModel, effect: Effect, result: FitResult, proposa
     if result.objective - best[1].objective < MIN_GAIN_NATS:
         return best
     best = _refine(*best, descents=1 if is_fold else DESCENTS)
-    return with_exact_levels(*best) if exactly else best
+    return with_exact_levels(*best) if exactly and (is_fold or _changes_few(best[0])) else best
+
+
+def _changes_few(model: FoldModel) -> bool:
+    """Return whether the last effect changes so few links that their paths can be followed."""
+    return int(np.count_nonzero(model.effects[-1].term.offset_db)) <= MAX_FOLLOWED_LINKS
 
 
 def _is_exact(model: FoldModel) -> bool:

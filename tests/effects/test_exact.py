@@ -5,6 +5,7 @@ import pytest
 import trimesh
 
 from radiotwin.channel.log_distance import LogDistance
+from radiotwin.effects import fitting
 from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.fitting import add_effect
 from radiotwin.effects.fold_model import FoldModel
@@ -109,17 +110,32 @@ class TwoAnswers(LogDistance):
 DECLARED_M, MOVE_M = np.array([[0.0, 0.0, 10.0], [300.0, 200.0, 10.0]]), (14.0, -18.0)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_a_position_whose_exact_optimum_lies_beside_the_quick_one_is_found(make_links, seed):
-    """At the quick optimum the exact levels fit worse, so they were not looked at there."""
+def two_answers_model(make_links, seed):
+    """A moved anchor and one that is not, 700 receivers, and the channel that answers quickly beside the truth."""
     rng = np.random.default_rng(seed)
     receiver_m = np.column_stack([rng.uniform(-150, 400, 700), rng.uniform(-150, 350, 700), rng.uniform(20, 60, 700)])
     true_m = DECLARED_M + np.array([[*MOVE_M, 0.0], [0.0, 0.0, 0.0]])
     distance_m = np.linalg.norm(receiver_m[:, None] - true_m, axis=2).ravel()
     links = make_links(DECLARED_M, receiver_m, level_db=-40 - 22 * np.log10(distance_m) + rng.normal(0, 0.5, 1400))
-    model = FoldModel.build(links, TwoAnswers(LogDistanceLine(-40.0, -2.2, 0.5)), 5.0)
-    fit = model.fit()
-    found, _ = add_effect(model, DevicePositionError(), fit)
+    return FoldModel.build(links, TwoAnswers(LogDistanceLine(-40.0, -2.2, 0.5)), 5.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_position_whose_exact_optimum_lies_beside_the_quick_one_is_found(make_links, seed):
+    """At the quick optimum the exact levels fit worse, so they were not looked at there."""
+    model = two_answers_model(make_links, seed)
+    found, _ = add_effect(model, DevicePositionError(), model.fit())
     params = found.effects[-1].params
     assert params.exact and params.device == 0
     assert params.move_m == pytest.approx(MOVE_M, abs=2.0)
+
+
+def test_paths_of_more_links_than_can_be_followed_are_not(make_links, monkeypatch):
+    """The anchor has 700 links: with fewer allowed its position is that of the quick levels, and nothing is followed."""
+    monkeypatch.setattr(fitting, "MAX_FOLLOWED_LINKS", 699)
+    model = two_answers_model(make_links, 0)
+    found, _ = add_effect(model, DevicePositionError(), model.fit())
+    params = found.effects[-1].params
+    assert not params.exact and params.device == 0
+    monkeypatch.setattr(fitting, "MAX_FOLLOWED_LINKS", 700)
+    assert add_effect(model, DevicePositionError(), model.fit())[0].effects[-1].params.exact
