@@ -140,11 +140,11 @@ def _best_addition(model: FoldModel, effect: Effect, result: FitResult,
     best = min(found, key=lambda each: each[1].objective)
     if not exactly or result.objective - best[1].objective < MIN_GAIN_NATS:
         return best
-    if like is None and not _changes_few(best[0]):
-        return best
     if like is not None:
         near = _near(model, effect, result, like)
         return near if near[1].objective < best[1].objective else best
+    if not _changes_few(best[0]):
+        return best
     if not _is_exact(best[0]) and model.channel.follows_paths:
         best = _exactly_beside(*best)
     before = result.objective

@@ -23,7 +23,7 @@ from radiotwin.tables import Origin
 TAGS = {("natural", "wood"): "wood", ("landuse", "forest"): "wood", ("leisure", "park"): "park",
         ("natural", "tree_row"): "tree_row"}
 """Tag -> kind of vegetation."""
-HEIGHT_M = {"wood": 16.0, "park": 10.0, "tree_row": 10.0}  # of tree tops, where no tag tells
+HEIGHT_M = {"wood": 16.0, "park": 10.0, "tree_row": 10.0}  # of tree tops, where no tag has it
 MAX_HEIGHT_M = 120.0  # the tallest tree has 116 m
 ROW_WIDTH_M = 6.0  # of the crowns along a row
 SIMPLIFIED_M, MIN_AREA_M2 = 1.0, 50.0  # what outlines may be off; less is a garden

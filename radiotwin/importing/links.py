@@ -69,7 +69,7 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
     parts = []
     for level in levels:
         if any(name not in source.table for name in columns_of(level.spec, source.table)):
-            continue  # which is told already
+            continue  # which is reported already
         with problems.noted():
             parts.append(_links_of(source, level, shared, settings, tally))
     if problems:
@@ -96,7 +96,7 @@ def _shared(source: Source, columns: dict[str, str], settings: Settings,
             continue
         is_length = _is_length(name, settings)
         if is_length and settings.length_unit is None and without_unit:
-            continue  # it is told once
+            continue  # it is reported once
         without_unit = without_unit or is_length
         with problems.noted():
             column = f"{name}_deg" if name in ANGLES else name

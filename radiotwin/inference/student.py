@@ -120,7 +120,7 @@ def derivatives(level_db: np.ndarray, limit_db: np.ndarray, mean_db: np.ndarray,
 
 def expected_drop_db(level_db: np.ndarray, mean_db: np.ndarray, scale_db: np.ndarray, dof: float,
                      losses: Losses) -> np.ndarray:
-    """Return by how much each level has dropped, as far as it tells (n,) [dB]; 0 of a blank."""
+    """Return by how much each level has dropped, as far as it shows (n,) [dB]; 0 of a blank."""
     if not np.any(losses.drop):
         return np.zeros(len(level_db))
     _, of_states = _of_states(level_db, mean_db, scale_db, dof, losses)

@@ -25,7 +25,7 @@ def feature_count(devices: int, declared: bool) -> int:
 def link_features(links: LinkData, receivers: bool = True) -> np.ndarray:
     """Return position, geometry and angles, and which device and receiver it is, as numbers.
 
-    Neither time nor what the receiver reports beside the level: a map has none.
+    Neither time nor columns that the receiver reports beside the level: a map has none.
 
     Args:
         links: n links.

@@ -133,7 +133,7 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
         declared_db: as a scene declares it [dB]; None: nobody does.
 
     Returns:
-        (n,) below which a link is blank [dB]; -inf where the readings do not tell, and none is
+        (n,) below which a link is blank [dB]; -inf where the readings do not show it, and none is
         declared that they allow. And notes on what is odd, a sentence each.
     """
     declared = -np.inf if declared_db is None else declared_db
@@ -156,7 +156,7 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
         elif len(read_db) == len(level_db):
             own_db[receiver] = declared if trusted and usual_db == declared else -np.inf
         elif usual_db is not None and not _below(read_db, usual_db - RISE_DB):
-            own_db[receiver] = usual_db  # its own blanks do not tell
+            own_db[receiver] = usual_db  # its own blanks do not show it
         else:
             lost.append(receiver)
     notes = _notes(links, rows, own_db, found, declared, lost)
@@ -183,7 +183,7 @@ def _says_nothing(links: LinkData, declared_db: float) -> list[str]:
 
 def _usual_db(links: LinkData, rows: list[np.ndarray], found: list[LimitEstimate | None],
               together: LimitEstimate | None, declared_db: float) -> float | None:
-    """Return the limit of receivers whose own links do not tell [dB]; None: nothing is known.
+    """Return the limit of receivers whose own links do not show it [dB]; None: nothing is known.
 
     The declared one, unless most other receivers overrule it, or all links together. Where none is
     declared, that of the others, or of all links together, or the lowest reading of few links.

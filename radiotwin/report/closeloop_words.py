@@ -60,7 +60,7 @@ def cause_names(report: dict) -> list[str]:
 def is_sure(report: dict) -> bool:
     """Return whether each cause that was found has a probability of at least `SURE`.
 
-    Steps between flights have none; a report of version 0.1 tells none at all.
+    Steps between flights have none; a report of version 0.1 has none at all.
     """
     return not report["posterior"] or all(
         (each.get("probability") or 0.0) >= SURE for each in _causes(report))

@@ -131,7 +131,7 @@ def test_a_position_whose_exact_optimum_lies_beside_the_quick_one_is_found(make_
 
 
 def test_paths_of_more_links_than_can_be_followed_are_not(make_links, monkeypatch):
-    """The anchor has 700 links: with fewer allowed its position is that of the quick levels, and nothing is followed."""
+    """The anchor has 700 links: with fewer allowed its position is that of the quick levels."""
     monkeypatch.setattr(fitting, "MAX_FOLLOWED_LINKS", 699)
     model = two_answers_model(make_links, 0)
     found, _ = add_effect(model, DevicePositionError(), model.fit())
