@@ -22,6 +22,7 @@ from studies.runner import Study
 from tests.undeclared.foreign.cases import ForeignCase, families, foreign_case, names, split_of
 
 NONE, OTHER = "none", "not in the catalogue"
+FULL_WIDTH = 2 * np.sqrt(2 * np.log(2))  # at half, by the standard deviation of a normal curve
 
 
 def foreign_cases(seed: int) -> dict[str, dict]:
@@ -171,7 +172,8 @@ def _true_parameters(truth: dict, hidden: ForeignCase) -> dict[str, Any]:
             {"tilt_deg": truth["tilt_deg"], "lean_azimuth_deg": truth["tilt_towards_deg"]}),
         "body_shadowing": lambda: {
             "body_depth_db": truth["depth_db"], "body_azimuth_deg": truth["direction_deg"],
-            "body_elevation_deg": -truth["below_deg"]},
+            "body_elevation_deg": -truth["below_deg"],
+            "body_width_deg": FULL_WIDTH * truth["width_deg"]},
         "foliage": lambda: {"x_m": truth["centre_m"][0], "y_m": truth["centre_m"][1]},
         "excess_attenuation": lambda: {"specific_attenuation_db_km": truth["per_km_db"]},
         "missing_obstacle": lambda: {"x_m": truth["centre_m"][0], "y_m": truth["centre_m"][1],

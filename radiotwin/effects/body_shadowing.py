@@ -1,10 +1,10 @@
 """The receiver's body is in the way: loss depends on the direction of arrival in the body frame.
 
 The loss is greatest where the body is, nothing on the opposite side, and in between
-depth (1 + cos angle) / 2, with the angle between the arrival and the body, in azimuth and elevation
-together: the first harmonic that is never a gain. Airframe shadowing is described by Khawaja et
-al., 'A survey of air-to-ground propagation channel modeling for unmanned aerial vehicles', IEEE
-COMST 21(3), 2019.
+depth ((1 + cos angle) / 2)^k, with the angle between the arrival and the body, in azimuth and
+elevation together. Its width is where half of the depth is left: k = 1, the first harmonic, is 180°
+wide, and a large k is a normal curve. Airframe shadowing is described by Khawaja et al., 'A survey
+of air-to-ground propagation channel modeling for unmanned aerial vehicles', IEEE COMST 21(3), 2019.
 """
 
 import numpy as np
@@ -12,7 +12,7 @@ from pydantic import Field
 from typing_extensions import override
 
 from radiotwin.effects.antenna_params import allowed_of, vary_patterns
-from radiotwin.effects.arrays import frequent_labels
+from radiotwin.effects.arrays import frequent_labels, subsample
 from radiotwin.effects.base import GainEffect
 from radiotwin.effects.params import (
     EffectParams,
@@ -29,7 +29,9 @@ from radiotwin.links import LinkData
 
 MIN_LINKS = 100  # of a receiver, detected and with a heading
 MIN_NATS = 4.0  # that a body must gain to be proposed
-AMPLITUDE_SD_DB = 8.0  # prior of half the depth along each axis, which steadies the proposal
+DEPTH_SD_DB = 16.0  # prior of the depth, which steadies the proposal
+SEARCH_STEP_DEG, SEARCHED_WIDTHS_DEG = 15.0, (60.0, 120.0, 180.0)
+MAX_LINKS = 5000  # that the search looks at
 
 
 class Body(EffectParams):
@@ -41,13 +43,13 @@ class Body(EffectParams):
                                   description="Direction of its middle, clockwise from the nose.")
     elevation_deg: float = quantity(0.0, unit="deg", low=-90.0, high=90.0, step=15.0,
                                     description="Direction of its middle, up from the deck.")
+    width_deg: float = quantity(180.0, unit="deg", low=40.0, high=240.0, step=30.0,
+                                description="Angle across, within which half of it is lost.")
 
     def loss_db(self, arrival: np.ndarray) -> np.ndarray:
         """Return the loss (n,) [dB], of arrivals (n, 3) as unit vectors right, nose, top."""
-        azimuth, elevation = np.radians(self.azimuth_deg), np.radians(self.elevation_deg)
-        middle = np.array([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation),
-                           np.sin(elevation)])
-        return self.depth_db * (1 + arrival @ middle) / 2
+        middle = _directions(np.array(self.azimuth_deg), np.array(self.elevation_deg))
+        return self.depth_db * _share(arrival @ middle, self.width_deg)
 
 
 class BodyShadowing(GainEffect):
@@ -117,19 +119,40 @@ def _arrivals(links: LinkData) -> np.ndarray:
     return np.einsum("nij,nj->ni", links.receiver_axes, -links.offset_m / length_m[:, None])
 
 
+def _directions(azimuth_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray:
+    """Return unit vectors (..., 3) along right, nose and top."""
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    return np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation),
+                     np.sin(elevation)], axis=-1)
+
+
+def _share(cosine: np.ndarray, width_deg: float) -> np.ndarray:
+    """Return the share of the depth that is lost, by the cosine of the angle to the middle."""
+    exponent = np.log(0.5) / (2 * np.log(np.cos(np.radians(width_deg / 4))))
+    return np.clip((1 + cosine) / 2, 0.0, 1.0) ** exponent
+
+
 def _best_body(view: ResidualView, rows: np.ndarray) -> Body | None:
     """Return the body that fits links best, a level beside it; None if it gains little."""
-    arrival, weight = _arrivals(view.links.select(rows)), view.weight[rows]
-    columns = np.column_stack([np.ones(len(rows)), arrival])
-    moments = columns.T @ (weight * view.residual_db[rows])
-    precision = (columns.T * weight) @ columns
-    steady = np.diag([0.0, *[AMPLITUDE_SD_DB**-2] * 3])
-    level_and_amplitude_db = np.linalg.solve(precision + steady, moments)
-    gain_nats = 0.5 * (moments @ level_and_amplitude_db - moments[0] ** 2 / precision[0, 0])
-    right_db, nose_db, top_db = -level_and_amplitude_db[1:]
-    size_db = float(np.linalg.norm([right_db, nose_db, top_db]))
-    if gain_nats <= MIN_NATS or size_db == 0.0:
-        return None
-    return Body(depth_db=min(2 * size_db, 40.0),
-                azimuth_deg=float(np.degrees(np.arctan2(right_db, nose_db)) % 360),
-                elevation_deg=float(np.degrees(np.arcsin(top_db / size_db))))
+    few = subsample(rows, MAX_LINKS)
+    weight = view.weight[few] * (len(rows) / len(few))
+    residual_db, total = view.residual_db[few], weight.sum()
+    residual_db = residual_db - weight @ residual_db / total
+    azimuth_deg, elevation_deg = (each.ravel() for each in np.meshgrid(
+        np.arange(0.0, 360.0, SEARCH_STEP_DEG),
+        np.arange(-90.0 + SEARCH_STEP_DEG, 90.0, SEARCH_STEP_DEG)))
+    cosine = _arrivals(view.links.select(few)) @ _directions(azimuth_deg, elevation_deg).T
+    best, most_nats = None, MIN_NATS
+    for width_deg in SEARCHED_WIDTHS_DEG:
+        share = _share(cosine, width_deg)
+        share -= weight @ share / total
+        moment = np.maximum(-(weight * residual_db) @ share, 0.0)
+        precision = weight @ share**2 + DEPTH_SD_DB**-2
+        nats = 0.5 * moment**2 / precision
+        number = int(nats.argmax())
+        if nats[number] > most_nats:
+            most_nats = float(nats[number])
+            best = Body(depth_db=min(float(moment[number] / precision[number]), 40.0),
+                        azimuth_deg=float(azimuth_deg[number]),
+                        elevation_deg=float(elevation_deg[number]), width_deg=width_deg)
+    return best

@@ -43,16 +43,26 @@ def test_no_direction_gains():
     assert 0 <= loss_db.min() < 0.01 and 11.99 < loss_db.max() <= 12
 
 
-def test_it_is_proposed_where_it_is(links, view):
-    """A pod below the deck to the right of one receiver; the other has none."""
+@pytest.mark.parametrize("width_deg", [60.0, 120.0, 240.0])
+def test_half_is_lost_at_half_its_width(width_deg):
+    """The nose is its middle; arrivals in the plane of the deck."""
+    off = np.radians([0.0, width_deg / 2, -width_deg / 2, 180.0])
+    loss_db = Body(depth_db=10.0, width_deg=width_deg).loss_db(np.column_stack([np.sin(off), np.cos(off), 0 * off]))
+    np.testing.assert_allclose(loss_db, [10, 5, 5, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("width_deg", [70.0, 180.0])
+def test_it_is_proposed_where_it_is(links, view, width_deg):
+    """A pod below the deck to the right of one receiver; the other has none. Normal curves."""
     off_deg = angle_deg(links, 60.0, -40.0)
     rng, mean_db = np.random.default_rng(2), np.full(len(links), -80.0)
-    loss_db = np.where(links.receiver == 1, 10 * (1 + np.cos(np.radians(off_deg))) / 2, 0.0)
+    loss_db = np.where(links.receiver == 1, 10 * 2.0 ** -(2 * off_deg / width_deg)**2, 0.0)
     links.level_db[:] = mean_db - loss_db + rng.normal(0, 2.0, len(links))
     (params,) = BodyShadowing().propose(view(links, mean_db, 2.0))
     body = params.receivers[1]
-    assert body.depth_db == pytest.approx(10, abs=2.5)  # less, by the prior: where the search begins
-    assert body.azimuth_deg == pytest.approx(60, abs=8) and body.elevation_deg == pytest.approx(-40, abs=12)
+    assert body.depth_db == pytest.approx(10, abs=4)  # where the search begins
+    assert body.azimuth_deg == pytest.approx(60, abs=15) and body.elevation_deg == pytest.approx(-40, abs=15)
+    assert body.width_deg == pytest.approx(width_deg, abs=61)
     assert 0 not in params.receivers or params.receivers[0].depth_db < 1
 
 
@@ -60,9 +70,10 @@ def test_what_was_found_is_reported_for_each_receiver(links):
     params = BodyShadowing.Params(receivers={1: Body(depth_db=8.0, azimuth_deg=420.0, elevation_deg=5.0)})
     variation = BodyShadowing().variation(params)
     assert variation.params(variation.values) == params and len(variation.members) == 1
-    found = BodyShadowing().parameters(links, params, Estimate(np.zeros(0), np.zeros((0, 0)), np.ones((2, 3))))
+    found = BodyShadowing().parameters(links, params, Estimate(np.zeros(0), np.zeros((0, 0)), np.ones((2, 4))))
     assert {name: parameter.value for name, parameter in found.items()} == {
-        "body_depth_db[r1]": 8, "body_azimuth_deg[r1]": 60, "body_elevation_deg[r1]": 5}
+        "body_depth_db[r1]": 8, "body_azimuth_deg[r1]": 60, "body_elevation_deg[r1]": 5,
+        "body_width_deg[r1]": 180}
 
 
 @pytest.mark.whole_loop
