@@ -54,10 +54,12 @@ def radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
     _, rows, columns = radio_map.lattice.shape
     radio_map = radio_map.thinned(max(-(-max(rows, columns) // MAX_CELLS), 1))
     gain_db = radio_map.dataset["gain_db"].variable[:len(names), 0].values
-    columns = min(len(names), MAX_COLUMNS)
+    rows = -(-len(names) // MAX_COLUMNS)
+    columns = -(-len(names) // rows)
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
-    figure, axes = panels(-(-len(names) // columns), columns, 2.6,
+    figure, axes = panels(rows, columns, 2.6,
                           0.6 + 2.3 * min((y_max - y_min) / (x_max - x_min), MAX_RATIO))
+    figure.set_layout_engine("compressed")  # panels keep their aspect
     colour_range = level_range_db(gain_db)
     heights = height_grid(scene, OUTLINE_CELLS)
     position_m = true_positions_m(scene)
@@ -75,7 +77,7 @@ def radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
     figure.colorbar(image, ax=axes, label="channel gain [dB]", shrink=0.7)
     source = plain(str(radio_map.dataset.attrs.get("source", "")))
     left_out = len(radio_map.devices) - len(names)
-    more = f"; {left_out} more devices" if left_out else ""
+    more = f"; {left_out} more not shown" if left_out else ""
     figure.suptitle(f"{source} at {_lowest(radio_map)} (triangle: device; white: not "
                     f"detected{more})")
     return figure
