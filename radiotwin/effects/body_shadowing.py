@@ -48,7 +48,7 @@ class Body(EffectParams):
 
     def loss_db(self, arrival: np.ndarray) -> np.ndarray:
         """Return the loss (n,) [dB], of arrivals (n, 3) as unit vectors right, nose, top."""
-        middle = _directions(np.array(self.azimuth_deg), np.array(self.elevation_deg))
+        middle = _directions(self.azimuth_deg, self.elevation_deg)
         return self.depth_db * _share(arrival @ middle, self.width_deg)
 
 
@@ -119,7 +119,7 @@ def _arrivals(links: LinkData) -> np.ndarray:
     return np.einsum("nij,nj->ni", links.receiver_axes, -links.offset_m / length_m[:, None])
 
 
-def _directions(azimuth_deg: np.ndarray, elevation_deg: np.ndarray) -> np.ndarray:
+def _directions(azimuth_deg: np.ndarray | float, elevation_deg: np.ndarray | float) -> np.ndarray:
     """Return unit vectors (..., 3) along right, nose and top."""
     azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
     return np.stack([np.sin(azimuth) * np.cos(elevation), np.cos(azimuth) * np.cos(elevation),

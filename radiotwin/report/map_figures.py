@@ -51,15 +51,13 @@ def radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
         scene: whose buildings are outlined.
     """
     names = radio_map.devices[:MAX_PANELS]
-    _, rows, columns = radio_map.lattice.shape
-    radio_map = radio_map.thinned(max(-(-max(rows, columns) // MAX_CELLS), 1))
+    radio_map = radio_map.thinned(max(-(-max(radio_map.lattice.shape[1:]) // MAX_CELLS), 1))
     gain_db = radio_map.dataset["gain_db"].variable[:len(names), 0].values
     rows = -(-len(names) // MAX_COLUMNS)
     columns = -(-len(names) // rows)
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     figure, axes = panels(rows, columns, 2.6,
                           0.6 + 2.3 * min((y_max - y_min) / (x_max - x_min), MAX_RATIO))
-    figure.set_layout_engine("compressed")  # panels keep their aspect
     colour_range = level_range_db(gain_db)
     heights = height_grid(scene, OUTLINE_CELLS)
     position_m = true_positions_m(scene)
@@ -124,6 +122,7 @@ def model_maps_figure(truth: RadioMap, models: dict[str, RadioMap], scene: Scene
 def panels(rows: int, columns: int, width_in: float, height_in: float) -> tuple[Figure, np.ndarray]:
     """Return a figure and its (rows, columns) axes, each of a size in inches."""
     figure = new_figure(width_in * columns + 1.2, height_in * rows)
+    figure.set_layout_engine("compressed")  # in all of them both axes have one scale
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
