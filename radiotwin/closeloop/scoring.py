@@ -16,7 +16,8 @@ from radiotwin.effects.params import EffectParams
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.evidence import cross_fit_p_value, sign_flip_p_value
 
-# Of the fold where a candidate moves likelihoods most, and of that where it gains or loses most.
+# Of the fold where a candidate moves likelihoods most (and of all folds, for links with line of
+# sight), and of the fold where it gains or loses most.
 MIN_MOVED, MIN_SHARE = 0.05, 0.1
 
 
@@ -186,8 +187,9 @@ def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score
     few_p = 0.0
     if block is not None:
         few_p = sign_flip_p_value(np.bincount(block[usable], weights=gain[usable]), seed)
-    los_p = 0.0
-    if los.any() and not los.all() and not nlos_only:
+    los_p, moved_los = 0.0, np.abs(gain[usable & los]).sum()
+    # What is weak, as an emitter's power is, leaves links with line of sight as they are.
+    if not los.all() and not nlos_only and moved_los > MIN_MOVED * moved.sum():
         los_p = cross_fit_p_value(by_fold(usable & los))
     reason = ""
     if total < criteria.min_gain_nats:

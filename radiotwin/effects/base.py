@@ -232,11 +232,11 @@ class GainEffect(Effect):
 
 
 class _ResponseEffect(Effect):
-    """An effect that maps one level to another, by inputs of each link."""
+    """An effect that maps one level to another; override `inputs`, or `term` that carries them."""
 
-    @abstractmethod
     def inputs(self, links: LinkData, params: Any) -> np.ndarray:
         """Return what `response` needs of each link (n, …)."""
+        raise NotImplementedError(f"{type(self).__name__} defines neither inputs nor term")
 
     @abstractmethod
     def response(self, level_db: np.ndarray, params: Any,

@@ -5,7 +5,7 @@ import pytest
 
 from radiotwin.effects.boxes import Box
 from radiotwin.effects.ground_reflection import bounces_on_terrain, two_ray_db
-from radiotwin.effects.interference import interference_db
+from radiotwin.effects.interference import Interference
 from radiotwin.effects.missing_obstacle import _with_box
 from radiotwin.effects.removed_obstacle import only_blocker
 from tests.terrains import incline, ridge, terrain_map
@@ -55,9 +55,15 @@ def test_terrain_is_not_a_building_to_remove(make_links):
     assert not links.los.any() and (only_blocker(links) == -1).all()
 
 
-def test_an_emitter_stands_on_the_ground():
-    """Free space from 1.5 m above a hill's top, 50 m up, over 100 m."""
-    city = terrain_map(ridge(40.0))
-    ground_m = float(city.ground_height_m(0.0, 0.0))
-    level_db = interference_db(np.array([[0.0, 0, 151.5], [0, 0, 251.5]]), (0.0, 0.0), -40.0, ground_m)
-    assert level_db[0] - level_db[1] == pytest.approx(20 * np.log10(2))
+def test_an_emitter_stands_on_the_ground(make_links):
+    """The channel is asked for a device 1.5 m above a hill's top."""
+    links, asked_m = make_links([-200, 0, 13], [[0.0, 0, 151.5]], city=terrain_map(ridge(40.0))), []
+
+    def level_at(moved):
+        asked_m.append(moved.device_m)
+        return np.zeros(len(moved))
+
+    emitter = Interference()
+    emitter.term(links, emitter.Params(place_m=(0.0, 0.0), level_db=0.0, within_m=(-9, -9, 9, 9), through_channel=True),
+                 level_at)
+    np.testing.assert_allclose(asked_m, [[[0.0, 0.0, float(links.city.ground_height_m(0.0, 0.0)) + 1.5]]])
