@@ -54,6 +54,7 @@ SHIFTS_M = (-8.0, 0.0, 8.0)  # from a cell's centre, to the east and to the nort
 SQUARES_M, RECTANGLES_M = (6.0, 12.0, 24.0), ((20.0, 8.0), (36.0, 12.0), (40.0, 24.0))  # tried
 SHAPES = (*product(((side_m, side_m) for side_m in SQUARES_M), (0.0, 45.0)),
           *product(RECTANGLES_M, (0.0, 45.0, 90.0, 135.0)))  # sides [m] and turn [deg]
+SCATTERED_DB = (0.0, -10.0)  # relative power in the shadow that shapes are tried with
 MAX_BUILT = 0.15  # of its ground and so far around it that is built in the map
 AROUND_M = 3.0  # outlines are off by metres: a box along a wall is a wall that is off
 GRID, MIN_BUILT_M = 9, 2.0  # points along each side that are looked at, and what is built there
@@ -125,14 +126,16 @@ class MissingObstacle(GainEffect):
         rows = subsample(los[near], MAX_LINKS)
         mine = links.select(rows)
 
-        gains: dict[Box, float] = {}
+        gains: dict[tuple[Box, float], float] = {}
+
+        def params(box: Box, scattered_db: float) -> MissingObstacle.Params:
+            return self.Params(box=box, scattered_db=scattered_db, by_class=by_class)
 
         def best(boxes: Iterable[Box]) -> Box:
-            for box in boxes:
-                changed_db = self.term(mine, self.Params(box=box, by_class=by_class),
-                                       view.level_at).offset_db
-                gains[box] = float(view.gain_nats(rows, changed_db).sum())
-            return max(gains, key=gains.__getitem__)
+            for tried in product(boxes, SCATTERED_DB):
+                changed_db = self.term(mine, params(*tried), view.level_at).offset_db
+                gains[tried] = float(view.gain_nats(rows, changed_db).sum())
+            return max(gains, key=gains.__getitem__)[0]
 
         tops_m = HEIGHTS_M[max(height - 1, 0):height + 2]
         box = best(Box(x_m, y_m, *sides_m, top_m, turn_deg)
@@ -141,9 +144,8 @@ class MissingObstacle(GainEffect):
                    for east_m, north_m, top_m in product(SHIFTS_M, SHIFTS_M, tops_m))
         best(Box(box.x_m, box.y_m, *sides_m, box.height_m, turn_deg)
              for sides_m, turn_deg in SHAPES)
-        return next((self.Params(box=box, by_class=by_class)
-                     for box in sorted(gains, key=gains.__getitem__, reverse=True)
-                     if built_share(links, box) <= MAX_BUILT), None)
+        return next((params(*tried) for tried in sorted(gains, key=gains.__getitem__, reverse=True)
+                     if built_share(links, tried[0]) <= MAX_BUILT), None)
 
     @override
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
