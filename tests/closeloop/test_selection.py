@@ -1,5 +1,7 @@
 """Candidates are scored on held-out links, and refused where those do not support them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -49,6 +51,24 @@ def test_folds_that_a_candidate_does_not_act_on_do_not_vote(open_ground, gains, 
     extended.held_out_nll = model.held_out_nll - per_link
     score = score_model(six, extended, CandidateScore("lock_loss"), None, 1, 0, SelectionCriteria())
     assert ("folds" in score.reason) == (not passes)
+
+
+@pytest.mark.parametrize(("in_sight", "passes"), [(0, True), (1, True), (-1, True), (40, True), (-20, False)])
+def test_links_with_line_of_sight_are_asked_if_it_moves_them(open_ground, in_sight, passes):
+    """What gains 240 nats without line of sight, and some with it."""
+    links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
+    los = np.arange(len(links)) // 6 % 2 == 0
+    folds = make_folds(links, 0)
+    model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
+    index, gains = np.arange(len(links)) % 6, np.where(los, in_sight, 40) + np.arange(6)[np.arange(len(links)) % 6] / 10
+    whole = replace(model.whole, links=links.with_los(los))
+    six = CrossValidatedModel(whole, model.folds[:1] * 6, model.fits[:1] * 7, index, model.twin)
+    per_link = gains / len(links) * 12 * model.whole.view(model.fits[0]).design_effect
+    six.held_out_nll = model.held_out_nll
+    extended = CrossValidatedModel(six.whole, six.folds, six.fits, index, six.twin)
+    extended.held_out_nll = model.held_out_nll - per_link
+    score = score_model(six, extended, CandidateScore("interference"), None, 1, 0, SelectionCriteria())
+    assert ("line of sight" in score.reason) == (not passes)
 
 
 def test_what_an_improbable_candidate_has_outdone_is_asked_as_well(open_ground, monkeypatch):
