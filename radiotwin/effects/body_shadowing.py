@@ -31,7 +31,7 @@ MIN_LINKS = 100  # of a receiver, detected and with a heading
 MIN_NATS = 4.0  # that a body must gain to be proposed
 DEPTH_SD_DB = 16.0  # prior of the depth, which steadies the proposal
 SEARCH_STEP_DEG, SEARCHED_WIDTHS_DEG = 15.0, (60.0, 120.0, 180.0)
-MAX_LINKS = 5000  # that the search looks at
+MAX_LINKS = 2000  # that the search looks at
 
 
 class Body(EffectParams):
