@@ -1,4 +1,4 @@
-"""The twin of a loop: fitted to all its links, with all effects that are causes."""
+"""The twin of a loop: fitted to all its links, with its base and all effects that are causes."""
 
 from __future__ import annotations
 

@@ -192,7 +192,9 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         models[name] = cross_validate(links, bases[name], folds, parts)
     best = min(models, key=lambda name: models[name].rmse_db())
     selection = SelectionResult(models[best], criteria, executor=executor)
-    effects = take_declared(selection, [effect() for effect in catalogue()], seed, on_progress)
+    candidates = [effect() for effect in catalogue()
+                  if not (effect.in_paths and models[best].whole.channel.follows_paths)]
+    effects = take_declared(selection, candidates, seed, on_progress)
     before = selection.model
     on_progress("looking at the residual")
     dependences_before = _dependences(before, seed)

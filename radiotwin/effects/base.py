@@ -105,6 +105,7 @@ class Effect(ABC):
         is_declared: whether the tables declare it, or every map has it, so that only its numbers
             are open: it is no candidate cause but a part of the base, where held-out links gain by
             it.
+        in_paths: whether a base that follows paths has it already, so that it is no candidate there.
         always_exact: whether `exact` may be asked of every candidate, not only of what is kept.
         uses: columns of the measurements that it reads and that no map has, such as `quality`.
     """
@@ -123,6 +124,7 @@ class Effect(ABC):
     is_cause: ClassVar[bool] = True
     within_flights: ClassVar[bool] = False
     is_declared: ClassVar[bool] = False
+    in_paths: ClassVar[bool] = False
     always_exact: ClassVar[bool] = False
     uses: ClassVar[tuple[str, ...]] = ()
 

@@ -109,10 +109,11 @@ class EffectModel:
         Args:
             model: channel and effects on the training links.
             result: fit of the model.
-            causes_only: whether to leave out what only describes the residual (`Effect.is_cause`).
+            causes_only: whether to leave out what only describes the residual: what is neither a
+                cause nor a part of the base (`Effect.is_cause`, `Effect.is_declared`).
         """
         effects = tuple(each for each in model.fitted_effects(result)
-                        if each.effect.is_cause or not causes_only)
+                        if each.effect.is_cause or each.effect.is_declared or not causes_only)
         sd_db = device_sd_db(model, result)
         return cls(model.channel, effects,
                    result.coefficients[:model.level_columns.shape[1]], result.scale_db, model.dof,

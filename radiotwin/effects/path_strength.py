@@ -30,6 +30,7 @@ class _Paths(PathEffect):
     """Power of some kinds of paths, with one common strength."""
 
     nlos_only = True  # with line of sight they add tenths of a decibel
+    in_paths = True
     kinds: ClassVar[tuple[str, ...]]
 
     class Params(EffectParams):

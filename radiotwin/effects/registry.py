@@ -26,6 +26,7 @@ from radiotwin.effects.path_strength import Diffraction, WallReflection
 from radiotwin.effects.position_errors import DevicePositionError, ReceiverPositionError
 from radiotwin.effects.receiver_saturation import ReceiverSaturation
 from radiotwin.effects.removed_obstacle import RemovedObstacle
+from radiotwin.effects.roof_heights import RoofHeights
 from radiotwin.effects.sector_antenna import SectorAntenna
 from radiotwin.effects.tilted_dipole import TiltedDipole
 from radiotwin.effects.uncertain_sight import UncertainSight
@@ -39,7 +40,7 @@ BUILT_IN: tuple[type[Effect], ...] = (
     TiltedDipole, BodyShadowing, ExcessAttenuation, DevicePositionError, ReceiverPositionError,
     ReceiverClockOffset, MissingObstacle, RemovedObstacle, BuildingEntry, Foliage,
     MappedVegetation, WallReflection, Diffraction, GroundReflection, Interference, LockLoss,
-    FaultyFlight, Episode, UncertainSight)
+    FaultyFlight, Episode, RoofHeights, UncertainSight)
 
 _registered: list[type[Effect]] = []
 

@@ -63,7 +63,7 @@ class ResidualView:
         """Return how much likelier links become if their mean changes (r,) [nats].
 
         With heavy tails before and after: `weight` knows the old outliers only, and a change makes
-        others. A blank is satisfied with any level that is low enough.
+        others. A blank is satisfied with any level that is below the limit of detection.
 
         Args:
             rows: (r,) links.
@@ -71,8 +71,14 @@ class ResidualView:
         """
         scale_db, blank = self.scale_db[rows], np.isnan(self.links.level_db[rows])
         before = (self.residual_db[rows] / scale_db) ** 2
-        rest_db = self.residual_db[rows] - change_db
-        after = (np.where(blank, np.minimum(rest_db, 0.0), rest_db) / scale_db) ** 2
+        # That of a blank is cut off at 0; how far it is below the limit decides how far it may rise.
+        spare_db = self.links.limit_db[rows] - self.mean_db[rows]
+        spare_db = np.where(np.isfinite(spare_db), spare_db, np.inf)
+        # It may be blank for another reason than its level, by as much as its residual is less.
+        share = np.where(spare_db < 0, self.residual_db[rows] / np.minimum(spare_db, -1e-9), 1.0)
+        rest_db = np.where(blank, share * np.minimum(spare_db - change_db, 0.0),
+                           self.residual_db[rows] - change_db)
+        after = (rest_db / scale_db) ** 2
         return 2.5 * (np.log1p(before / 4.0) - np.log1p(after / 4.0)) / self.design_effect
 
     def score(self, term: Term) -> float:

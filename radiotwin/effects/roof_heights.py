@@ -1,0 +1,211 @@
+"""Roofs of a map that are higher or lower than it says, where links pass their edges.
+
+Many heights are counted from storeys or guessed. A link that passes a roof's edge loses as behind
+two knife edges (ITU-R P.526), but no more than what is left on other paths: the law without line of
+sight. The height of each roof with such links is estimated beside all others, with a prior around
+the map's; a roof that few links tell of stays about where it is.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+from scipy.constants import speed_of_light
+from typing_extensions import override
+
+from radiotwin.effects.arrays import city_of, subsample
+from radiotwin.effects.base import GainEffect, Term
+from radiotwin.effects.params import QUANTILE_90, EffectParams, Estimate, Length, Metres, Parameter
+from radiotwin.effects.removed_obstacle import buildings
+from radiotwin.effects.residual_view import LevelAt, ResidualView
+from radiotwin.effects.roof_crossings import RoofCrossings, roof_crossings
+from radiotwin.errors import BadInput
+from radiotwin.links import LinkData
+
+PRIOR_SD_M = 3.0  # a storey
+WALL_SD_M = 1.0  # where an edge is not known better, neither is how high above it a link passes
+OFFSETS_M = np.arange(-8.0, 8.25, 0.5)  # that are tried
+LEAST_SHARE = 0.2  # of a roof's height that is left
+TELLING_DB = 1.0  # a link tells of a roof if these change it by more
+MIN_LINKS = 8  # that tell of a roof
+MIN_OFFSET_M = 0.25  # smaller ones are none
+SWEEPS = 3  # over all roofs, each beside the others as they are
+MAX_LINKS = 6000  # that are looked at
+LEAST_CONTRAST_DB = 3.0  # between links with line of sight and without; less: roofs hide nothing
+HIDDEN_DB = 200.0  # loss of a way that something other than a roof blocks
+
+
+class Roof(NamedTuple):
+    """A roof of the map, and how much higher it is than the map says.
+
+    Attributes:
+        building: index, as `buildings` numbers them.
+        x_m, y_m, height_m: centre and height on the map [m].
+        offset_m: true minus mapped height [m].
+        offset_sd_m: standard deviation of it [m].
+    """
+
+    building: int
+    x_m: Metres
+    y_m: Metres
+    height_m: Metres
+    offset_m: Metres
+    offset_sd_m: Length
+
+
+class RoofHeights(GainEffect):
+    """Roofs that are higher or lower than the map says."""
+
+    name = "roof_heights"
+    variant = "roofs that are off by metres"
+    figure = "histogram"
+    is_declared = True
+    is_cause = False
+
+    class Params(EffectParams):
+        """The roofs that links tell of."""
+
+        roofs: tuple[Roof, ...] = Field(description="Roofs, and how much higher they are.")
+
+    @override
+    def unavailable(self, links: LinkData) -> str | None:
+        if links.city is None:
+            return "there is no 3D map"
+        return None if np.isfinite(links.frequency_hz) else "the frequency is not known"
+
+    @override
+    def propose(self, view: ResidualView) -> list[Params]:
+        rows = subsample(np.arange(len(view.links)), MAX_LINKS)
+        contrast_db = _contrast_db(view.links.select(rows), view.level_at)
+        if np.median(contrast_db) < LEAST_CONTRAST_DB:
+            return []
+        roofs = _Search(view, rows, contrast_db).roofs()
+        return [self.Params(roofs=roofs)] if roofs else []
+
+    @override
+    def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
+        city, offset_db = city_of(links, self.name), np.zeros(len(links))
+        count = len(buildings(city)[1])
+        raised_m = np.zeros(count)
+        for roof in params.roofs:
+            if not 0 <= roof.building < count:
+                raise BadInput(f"the effect {self.name} has a roof of building {roof.building}, "
+                               f"but the map has {count}; give the scene that the twin was made "
+                               "with")
+            raised_m[roof.building] = roof.offset_m
+        which = np.flatnonzero(raised_m)
+        ends_m = links.device_m[links.device], links.receiver_m
+        ways = roof_crossings(city, *ends_m, which)
+        rows, link = np.unique(ways.link, return_inverse=True)
+        if not len(rows):
+            return Term.of_offset(offset_db)
+        others = city.without(np.isin(buildings(city)[0], which))
+        hidden = ~others.line_of_sight(ends_m[0][rows], ends_m[1][rows])
+        wavelength_m = speed_of_light / links.frequency_hz
+        before_db, after_db = (np.where(hidden, HIDDEN_DB, 0.0) for _ in range(2))
+        np.maximum.at(before_db, link, ways.loss_db(0.0, wavelength_m))
+        np.maximum.at(after_db, link, ways.loss_db(raised_m[ways.building], wavelength_m))
+        contrast_db = _contrast_db(links.select(rows), level_at)
+        offset_db[rows] = _level_db(after_db, contrast_db) - _level_db(before_db, contrast_db)
+        return Term.of_offset(offset_db)
+
+    @override
+    def parameters(self, links: LinkData, params: Params,
+                   estimate: Estimate) -> dict[str, Parameter]:
+        return {f"true_minus_mapped_height_{roof.building}_m":
+                Parameter.normal(roof.offset_m, roof.offset_sd_m, "m")
+                for roof in sorted(params.roofs, key=lambda each: -abs(each.offset_m))
+                if abs(roof.offset_m) > QUANTILE_90 * roof.offset_sd_m}
+
+
+class _Search:
+    """The likeliest height of each roof, all others as they are.
+
+    Args:
+        view: residuals of n links.
+        rows: (r,) of which these are looked at.
+        contrast_db: (r,) what each would lose without any line of sight [dB].
+    """
+
+    def __init__(self, view: ResidualView, rows: np.ndarray, contrast_db: np.ndarray):
+        links = view.links.select(rows)
+        assert links.city is not None
+        self._view, self._rows, self._contrast_db = view, rows, contrast_db
+        self._city, self._wavelength_m = links.city, speed_of_light / links.frequency_hz
+        self._ways = roof_crossings(links.city, links.device_m[links.device], links.receiver_m)
+        self._loss_db = self._ways.loss_db(0.0, self._wavelength_m)  # (m,) of each roof as it is
+        by_roofs = np.zeros(len(rows), dtype=bool)
+        over_m = np.maximum(self._ways.enter_over_m, self._ways.leave_over_m)
+        by_roofs[self._ways.link[over_m > 0]] = True
+        self._hidden_db = np.where(~links.los & ~by_roofs, HIDDEN_DB, 0.0)
+        self._before_db = _level_db(self._most_db(self._loss_db), contrast_db)
+        step_m = links.receiver_m - links.device_m[links.device]
+        self._slope = np.abs(step_m[:, 2]) / np.maximum(np.hypot(*step_m[:, :2].T), 1.0)
+
+    def _most_db(self, loss_db: np.ndarray) -> np.ndarray:
+        """Return the greatest of the losses (m,) over roofs of each link (r,) [dB]."""
+        most_db = self._hidden_db.copy()
+        if len(loss_db):
+            link = self._ways.link
+            first = np.flatnonzero(np.r_[True, np.diff(link) > 0])
+            most_db[link[first]] = np.maximum(most_db[link[first]],
+                                              np.maximum.reduceat(loss_db, first))
+        return most_db
+
+    def roofs(self) -> tuple[Roof, ...]:
+        """Return every roof that is off."""
+        centres_m = buildings(self._city)[1]
+        pairs = {int(building): np.flatnonzero(self._ways.building == building)
+                 for building in np.unique(self._ways.building)}
+        found: dict[int, Roof] = {}
+        for _ in range(SWEEPS):
+            for building, mine in pairs.items():
+                offset_m, sd_m = self._estimate(mine, float(centres_m[building, 2]))
+                self._loss_db[mine] = self._ways.loss_db(offset_m, self._wavelength_m, mine)
+                found[building] = Roof(building, *centres_m[building].tolist(), offset_m, sd_m)
+        return tuple(roof for roof in found.values() if abs(roof.offset_m) >= MIN_OFFSET_M)
+
+    def _estimate(self, mine: np.ndarray, height_m: float) -> tuple[float, float]:
+        """Return mean and sd of what a roof is off by, from its pairs (q,) [m]; 0 if not told."""
+        offsets_m = OFFSETS_M[OFFSETS_M > (LEAST_SHARE - 1) * height_m]
+        link = self._ways.link[mine]
+        without_db = self._loss_db.copy()
+        without_db[mine] = 0.0
+        others_db = self._most_db(without_db)[link]
+        after_db = np.array([_level_db(np.maximum(others_db, self._ways.loss_db(
+            offset_m, self._wavelength_m, mine)), self._contrast_db[link])
+            for offset_m in offsets_m])
+        telling = np.ptp(after_db, axis=0) > TELLING_DB
+        if telling.sum() < MIN_LINKS:
+            return 0.0, PRIOR_SD_M
+        change_db = (after_db - self._before_db[link])[:, telling]
+        rows = self._rows[link[telling]]
+        log = np.array([self._view.gain_nats(rows, each_db).sum() for each_db in change_db])
+        log -= 0.5 * (offsets_m / PRIOR_SD_M) ** 2
+        if log.argmax() == 0:  # it may not be there at all, which is not for this to say
+            return 0.0, PRIOR_SD_M
+        share = np.exp(log - log.max())
+        share /= share.sum()
+        mean_m = float(share @ offsets_m)
+        spread_m = np.sqrt(share @ (offsets_m - mean_m) ** 2 + np.diff(offsets_m)[0] ** 2 / 12)
+        slope = float(np.median(self._slope[link[telling]]))
+        return mean_m, float(np.hypot(spread_m, WALL_SD_M * slope))
+
+
+def _contrast_db(links: LinkData, level_at: LevelAt) -> np.ndarray:
+    """Return what each link (n,) has more with line of sight than without, by the law [dB]."""
+    with_it, without = (level_at(links.with_los(np.full(len(links), each)))
+                        for each in (True, False))
+    return np.maximum(with_it - without, 0.0)
+
+
+def _level_db(loss_db: np.ndarray, contrast_db: np.ndarray) -> np.ndarray:
+    """Return the level of a way over roofs beside what is left on others, over that without [dB].
+
+    Args:
+        loss_db: (n,) over roofs [dB].
+        contrast_db: (n,) how much less is on the others [dB].
+    """
+    return 10 * np.log10(10 ** (-loss_db / 10) + 10 ** (-contrast_db / 10))
