@@ -243,7 +243,8 @@ def _keep_best(result: SelectionResult, passed: list[Passed], block: np.ndarray,
     rivals = [each.score.name for each in passed
               if each.score.name != best.name and _alike(best, each.score, criteria)]
     for i, entry in enumerate(result.scores):
-        if entry.step == step and entry.reason == "":
+        # A step's number comes twice where a fault that was kept before it was taken back.
+        if entry.step == step and entry.reason == "" and not entry.kept:
             reason = "" if entry is best else f"{best.name} explains more"
             result.scores[i] = replace(entry, kept=entry is best, reason=reason)
     result.scores += [replace(score, kept=True) for score, _ in steps[1:]]
