@@ -229,7 +229,8 @@ def _keep_best(result: SelectionResult, passed: list[Passed], block: np.ndarray,
     criteria = result.criteria
     passed.sort(key=lambda each: -each.score.held_out_nats)
     # Of those that the data cannot tell apart the one with the least error.
-    close = [each for each in passed if _alike(passed[0].score, each.score, criteria)]
+    most_nats = passed[0].score.held_out_nats
+    close = [each for each in passed if _alike(most_nats, each.score, criteria)]
     passed.sort(key=lambda each: each.score.rmse_db if each in close else np.inf)
     first = passed[0]
     steps = [(first.score, first.model)]
@@ -239,9 +240,9 @@ def _keep_best(result: SelectionResult, passed: list[Passed], block: np.ndarray,
         on_progress(f"step {step + 1}: more of {rival.score.name}")
         least = first.score.held_out_nats
         steps = _several(rival, block, hypotheses, seed, least, most, criteria) or steps
-    best = steps[0][0]
+    best, nats = steps[0][0], sum(score.held_out_nats for score, _ in steps)
     rivals = [each.score.name for each in passed
-              if each.score.name != best.name and _alike(best, each.score, criteria)]
+              if each.score.name != best.name and _alike(nats, each.score, criteria)]
     for i, entry in enumerate(result.scores):
         # A step's number comes twice where a fault that was kept before it was taken back.
         if entry.step == step and entry.reason == "" and not entry.kept:
@@ -267,8 +268,9 @@ def _beyond(passed: Passed, candidate: Candidate, model: CrossValidatedModel,
     return clear and not more and (passed.effect.repeatable or not candidate.effect.repeatable)
 
 
-def _alike(best: CandidateScore, other: CandidateScore, criteria: SelectionCriteria) -> bool:
-    return best.held_out_nats - other.held_out_nats < criteria.indistinguishable_nats
+def _alike(nats: float, other: CandidateScore, criteria: SelectionCriteria) -> bool:
+    """Return whether an effect gains about as much on held-out links as others, `nats`."""
+    return nats - other.held_out_nats < criteria.indistinguishable_nats
 
 
 def _on_one_mast(model: CrossValidatedModel) -> int:

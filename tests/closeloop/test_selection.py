@@ -120,3 +120,13 @@ def test_what_was_kept_stays_kept_where_the_number_of_a_step_comes_twice(keep_be
     result = keep_best(SelectionResult(MODEL, scores=[fault, kept], rivals=[[]]), [passed("unexplained_trend", 30.0, 1)], 1)
     assert [(each.name, each.kept, each.reason) for each in result.scores] == [
         ("episode", False, fault.reason), ("foliage", True, ""), ("unexplained_trend", True, "")]
+
+
+@pytest.mark.parametrize(("second", "rivals"), [(None, ["missing_obstacle"]), (8.0, ["device_gain_offset"]), (60.0, [])])
+def test_several_of_a_kind_are_told_from_another_effect_by_what_they_gain_together(keep_best, second, rivals):
+    offset, tower = passed("device_gain_offset", 64.0), passed("missing_obstacle", 60.0, repeatable=True)
+    two = second and [(tower.score, MODEL), (passed("missing_obstacle", second, 1).score, MODEL)]
+    result = keep_best(SelectionResult(MODEL), [offset, tower], 0, two)
+    assert result.rivals == [rivals] + [[]] * bool(second)
+    assert [each.name for each in result.scores if each.kept] == (["missing_obstacle"] * 2 if second else
+                                                                 ["device_gain_offset"])
