@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from radiotwin.closeloop.bases import Base
 from radiotwin.closeloop.folds import Folds
@@ -134,14 +135,35 @@ class CrossValidatedModel:
 
 
 def same_effects(whole: FoldModel, fold: FoldModel) -> list[int | None]:
-    """Return the place in a fold of each effect of the whole; None for what it has not found."""
-    places: list[int | None] = []
-    place = 0
-    for each in whole.effects:
-        there = place < len(fold.effects) and fold.effects[place].effect is each.effect
-        places.append(place if there else None)
-        place += there
+    """Return the place in a fold of each effect of the whole; None for what it has not found.
+
+    Of several of a kind, of which a fold lacks some, those are the same that act on the same links:
+    one faulty flight is not another.
+    """
+    places: list[int | None] = [None] * len(whole.effects)
+    for effect in dict.fromkeys(each.effect for each in whole.effects):
+        of_whole, of_fold = ([place for place, each in enumerate(model.effects)
+                              if each.effect is effect] for model in (whole, fold))
+        pairs = list(zip(of_whole, of_fold, strict=False))
+        if len(of_whole) != len(of_fold):
+            pairs = _on_the_same_links(whole, fold, of_whole, of_fold)
+        for place, found in pairs:
+            places[place] = found
     return places
+
+
+def _on_the_same_links(whole: FoldModel, fold: FoldModel, of_whole: list[int],
+                       of_fold: list[int]) -> list[tuple[int, int]]:
+    """Return pairs of places of one kind of effect whose links overlap most, all in all."""
+    shared = np.zeros((len(of_whole), len(of_fold)))
+    for row, place in enumerate(of_whole):
+        acts = whole.effects[place].acts
+        for column, found in enumerate(of_fold):
+            others = fold.effects[found].acts
+            shared[row, column] = (acts & others).sum() / max((acts | others).sum(), 1)
+    return [(of_whole[row], of_fold[column])
+            for row, column in zip(*linear_sum_assignment(shared, maximize=True), strict=True)
+            if shared[row, column] > 0]
 
 
 def without_quality(model: CrossValidatedModel) -> CrossValidatedModel:

@@ -19,6 +19,7 @@ from radiotwin.closeloop.change_points import located_links, with_effect
 from radiotwin.closeloop.cross_validation import (
     CrossValidatedModel,
     cross_validate,
+    same_effects,
     training_parts,
 )
 from radiotwin.closeloop.folds import Folds, make_folds
@@ -31,7 +32,7 @@ from radiotwin.closeloop.scoring import (
 )
 from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.base import DetectionEffect, Effect
-from radiotwin.effects.fold_model import AppliedEffect, FoldModel
+from radiotwin.effects.fold_model import FoldModel
 from radiotwin.links import LinkData, evidence_blocks
 from radiotwin.links.correlation import devices_move
 
@@ -135,7 +136,7 @@ def drop_idle_faults(result: SelectionResult) -> None:
         gain = fit.objective - result.model.fits[0].objective
         if gain >= result.criteria.min_training_gain_nats:
             continue
-        folds = [_without(each, applied) for each in result.model.folds]
+        folds = [_without(each, same_effects(whole, each)[number]) for each in result.model.folds]
         fits = [fit, *(each.fit() for each in folds)]
         result.model = result.model.extended([alone, *folds], fits)
         kept = [i for i, score in enumerate(result.scores) if score.kept][number]
@@ -144,15 +145,10 @@ def drop_idle_faults(result: SelectionResult) -> None:
         del result.rivals[number]
 
 
-def _without(model: FoldModel, fault: AppliedEffect) -> FoldModel:
-    """Return a fold without a fault, of which it has times of its own, or none."""
-    def same(other: AppliedEffect) -> bool:
-        return other.effect is fault.effect and all(
-            getattr(other.params, end) == getattr(fault.params, end)
-            for end in ("receiver", "flight"))
-
-    drop = next((each for each in model.effects if same(each)), None)
-    return model.with_effects([each for each in model.effects if each is not drop])
+def _without(model: FoldModel, place: int | None) -> FoldModel:
+    """Return a fold without the effect at a place; None: it has none of it."""
+    return model.with_effects([each for number, each in enumerate(model.effects)
+                               if number != place])
 
 
 def _within_flights(result: SelectionResult, links: LinkData, base: Base,

@@ -16,6 +16,7 @@ from radiotwin.closeloop.posterior import Step
 from radiotwin.closeloop.result_schema import ReportRecord
 from radiotwin.closeloop.run import Loop
 from radiotwin.closeloop.scoring import CandidateScore
+from radiotwin.effects.correlated_shadowing import NAME as SHADOWING
 from radiotwin.effects.params import Parameter
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
@@ -34,7 +35,8 @@ def make_report(loop: Loop) -> dict[str, Any]:
     """Return the content of `closeloop.json`; numbers that are not known are null."""
     selection = loop.selection
     kept = [score for score in selection.scores if score.kept]
-    effects = [{"name": score.name, "variant": each.effect.variant, "rank": rank,
+    named = [score for score in kept if score.name != SHADOWING]
+    effects = [{"name": each.effect.name, "variant": each.effect.variant, "rank": rank,
                 "uses": list(each.effect.uses), "is_declared": each.effect.is_declared,
                 "params": each.params.model_dump(mode="json"),
                 "parameters": {name: parameter.record() for name, parameter in parameters.items()},
@@ -44,8 +46,8 @@ def make_report(loop: Loop) -> dict[str, Any]:
                 "evidence": {"heldout_nll_gain": score.nll_gain, "p_value": score.p_value,
                              "evidence_nats": score.evidence_nats}}
                for rank, (score, each, parameters, size, rivals) in enumerate(
-                   zip(kept, loop.after.whole.effects, loop.parameters, loop.sizes_db,
-                       selection.rivals, strict=False), start=1)]
+                   zip(named, loop.after.whole.effects, loop.parameters, loop.sizes_db,
+                       selection.rivals, strict=True), start=1)]
     if loop.after.shadowing:
         effects.append(_shadowing(kept[-1], loop.after, len(effects) + 1))
     candidates = [{"name": score.name, "step": score.step + 1, "heldout_rmse_db": score.rmse_db,

@@ -97,6 +97,8 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
         seed: of permutations.
         on_progress: called with what is being done.
     """
+    if not effects:  # nothing to ask, and so no step
+        return
     block = evidence_blocks(result.model.links)
     available = []
     for effect in effects:
@@ -229,7 +231,8 @@ def _keep_best(result: SelectionResult, passed: list[Passed], block: np.ndarray,
     criteria = result.criteria
     passed.sort(key=lambda each: -each.score.held_out_nats)
     # Of those that the data cannot tell apart the one with the least error.
-    close = [each for each in passed if _alike(passed[0].score, each.score, criteria)]
+    most_nats = passed[0].score.held_out_nats
+    close = [each for each in passed if _alike(most_nats, each.score, criteria)]
     passed.sort(key=lambda each: each.score.rmse_db if each in close else np.inf)
     first = passed[0]
     steps = [(first.score, first.model)]
@@ -239,11 +242,12 @@ def _keep_best(result: SelectionResult, passed: list[Passed], block: np.ndarray,
         on_progress(f"step {step + 1}: more of {rival.score.name}")
         least = first.score.held_out_nats
         steps = _several(rival, block, hypotheses, seed, least, most, criteria) or steps
-    best = steps[0][0]
+    best, nats = steps[0][0], sum(score.held_out_nats for score, _ in steps)
     rivals = [each.score.name for each in passed
-              if each.score.name != best.name and _alike(best, each.score, criteria)]
+              if each.score.name != best.name and _alike(nats, each.score, criteria)]
     for i, entry in enumerate(result.scores):
-        if entry.step == step and entry.reason == "":
+        # A step's number comes twice where a fault that was kept before it was taken back.
+        if entry.step == step and entry.reason == "" and not entry.kept:
             reason = "" if entry is best else f"{best.name} explains more"
             result.scores[i] = replace(entry, kept=entry is best, reason=reason)
     result.scores += [replace(score, kept=True) for score, _ in steps[1:]]
@@ -266,8 +270,9 @@ def _beyond(passed: Passed, candidate: Candidate, model: CrossValidatedModel,
     return clear and not more and (passed.effect.repeatable or not candidate.effect.repeatable)
 
 
-def _alike(best: CandidateScore, other: CandidateScore, criteria: SelectionCriteria) -> bool:
-    return best.held_out_nats - other.held_out_nats < criteria.indistinguishable_nats
+def _alike(nats: float, other: CandidateScore, criteria: SelectionCriteria) -> bool:
+    """Return whether an effect gains about as much on held-out links as others, `nats`."""
+    return nats - other.held_out_nats < criteria.indistinguishable_nats
 
 
 def _on_one_mast(model: CrossValidatedModel) -> int:

@@ -7,6 +7,12 @@ import pandas as pd
 import pytest
 
 import radiotwin as rt
+from radiotwin.closeloop.cross_validation import CrossValidatedModel, same_effects
+from radiotwin.closeloop.faults import _without
+from radiotwin.effects.base import Term
+from radiotwin.effects.episode import Episode
+from radiotwin.effects.faulty_flight import FaultyFlight
+from radiotwin.effects.fold_model import AppliedEffect
 from radiotwin.effects.gain_drift import Drift, ReceiverDrift
 from radiotwin.effects.params import Estimate
 from radiotwin.measurements import Measurements
@@ -79,3 +85,47 @@ def test_a_step_is_somewhere_between_two_readings():
     params = ReceiverDrift.Params(receivers={0: Drift("step", 50.0)})
     when = ReceiverDrift().parameters(links, params, Estimate(np.zeros(2), np.eye(2), np.zeros((2, 0))))["step_time_s[u0]"]
     assert (when.low, when.value, when.high) == (10.0, 50.0, 80.0)
+
+
+def on_links(effect, first, last):
+    """An effect that acts on the links of two numbers, of a hundred."""
+    number = np.arange(100)
+    return AppliedEffect(effect, None, Term.of_offset(-9.0 * ((number >= first) & (number < last))))
+
+
+def model_of(*effects):
+    return SimpleNamespace(effects=list(effects), with_effects=lambda left: model_of(*left))
+
+
+@pytest.mark.parametrize("effect", [FaultyFlight(), Episode()])
+def test_one_fault_is_not_another_where_a_fold_has_not_seen_the_first(effect):
+    trend = on_links(Episode(), 0, 100)
+    first, second = on_links(effect, 10, 30), on_links(effect, 60, 80)
+    as_its_fold_has_it = on_links(effect, 63, 80)
+    whole = model_of(first, trend, second)
+    assert same_effects(whole, model_of(first, trend, as_its_fold_has_it)) == [0, 1, 2]
+    assert same_effects(whole, model_of(trend, as_its_fold_has_it)) == [None, 0, 1]
+    assert same_effects(whole, model_of(first, trend)) == [0, 1, None]
+    assert same_effects(whole, model_of(on_links(effect, 40, 50))) == [None, None, None]
+    assert same_effects(whole, model_of()) == [None, None, None]
+
+
+def test_what_there_is_one_of_is_the_same_wherever_a_fold_finds_it():
+    effect = Episode()
+    assert same_effects(model_of(on_links(effect, 0, 10)), model_of(on_links(effect, 50, 60))) == [0]
+
+
+def test_only_the_fault_that_is_taken_back_leaves_a_fold():
+    effect = Episode()
+    first, second = on_links(effect, 10, 30), on_links(effect, 60, 80)
+    whole, fold = model_of(first, second), model_of(second)
+    assert _without(fold, same_effects(whole, fold)[0]).effects == [second]
+    assert _without(fold, same_effects(whole, fold)[1]).effects == []
+
+
+def test_of_two_faults_each_is_unforeseen_where_its_flight_was_held_out():
+    effect, index = FaultyFlight(), np.arange(100) // 50
+    first, second = on_links(effect, 10, 30), on_links(effect, 60, 80)
+    folds = [model_of(second), model_of(first)]  # each learnt from the other half
+    model = CrossValidatedModel(model_of(first, second), folds, [], index, None)
+    np.testing.assert_array_equal(model.unforeseen, first.acts | second.acts)

@@ -3,6 +3,7 @@
 import copy
 import functools
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from radiotwin.closeloop.result_file import (
     write_report,
 )
 from radiotwin.closeloop.run import close_loop
+from radiotwin.effects.gain_offsets import ReceiverGainOffset
 from radiotwin.errors import BadInput
 
 VERSION_1 = Path(__file__).parent / "version_1" / "closeloop.json"  # of radiotwin 0.1, see tests/twin/version_1
@@ -56,6 +58,18 @@ def test_a_report_of_version_0_1_is_read_with_new_names_and_the_bias_turned(old)
     for name in ("base", "verdict", "candidates", "heldout", "remaining", "radiotwin_version"):
         assert new[name] == old[name]
     assert upgrade_report(new) == new
+
+
+def test_each_effect_has_its_own_name_and_a_score_that_was_kept(open_ground, monkeypatch):
+    monkeypatch.setattr("radiotwin.closeloop.run.catalogue", lambda: (ReceiverGainOffset,))  # the others take long
+    world = open_ground.fly(21)
+    world.gain_db[world.receiver == 1] += 6.0
+    loop = close_loop(open_ground.measured(world).select(world.slot % 4 == 0), base="log-distance")
+    (only,) = make_report(loop)["effects"]
+    assert only["name"] == loop.after.whole.effects[0].effect.name == "receiver_gain_offset"
+    scores = [replace(each, kept=False) for each in loop.selection.scores]
+    with pytest.raises(ValueError, match="zip"):
+        make_report(replace(loop, selection=replace(loop.selection, scores=scores)))
 
 
 def test_it_has_what_a_new_report_has(old, open_ground, tmp_path):

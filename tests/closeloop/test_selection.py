@@ -1,17 +1,20 @@
 """Candidates are scored on held-out links, and refused where those do not support them."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from radiotwin.closeloop import posterior
+from radiotwin.closeloop import posterior, selection
 from radiotwin.closeloop.bases import LogDistanceBase
 from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import CrossValidatedModel, cross_validate, training_parts
 from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.pairs import Passed
 from radiotwin.closeloop.run import close_loop
 from radiotwin.closeloop.scoring import CandidateScore, score_model
+from radiotwin.closeloop.selection import SelectionResult, forward_selection
 from radiotwin.links import prepare_links
 
 
@@ -86,3 +89,52 @@ def test_what_an_improbable_candidate_has_outdone_is_asked_as_well(open_ground, 
     first = [score for score in again.selection.scores if score.step == 0 and score.name != "unexplained_trend"]
     assert outdone and outdone <= {score.name for score in first if score.gain_by_fold.size}
     assert len(first) == len([score for score in loop.selection.scores if score.step == 0])  # none twice
+
+
+MODEL = SimpleNamespace(whole=SimpleNamespace(effects=[]))
+
+
+def passed(name, nats, step=0, repeatable=False):
+    """A candidate that gains on held-out links, of a model that nothing is asked of."""
+    score = CandidateScore(name, step=step, passed=True, gain_by_fold=np.array([nats]), rmse_db=4.0)
+    return Passed(SimpleNamespace(name=name, repeatable=repeatable), score, MODEL)
+
+
+@pytest.fixture
+def keep_best(monkeypatch):
+    """Function that keeps the best of some candidates; `several` is what is found of one kind."""
+    def run(result, candidates, step, several=None):
+        for name, stand_in in (("_exactly", lambda model: model), ("with_moved_limits", lambda model: model),
+                               ("_on_one_mast", lambda _: 0), ("_several", lambda *_: several)):
+            monkeypatch.setattr(selection, name, stand_in)
+        result.scores += [each.score for each in candidates]
+        selection._keep_best(result, candidates, None, None, 0, step, lambda _: None)
+        return result
+    return run
+
+
+def test_what_was_kept_stays_kept_where_the_number_of_a_step_comes_twice(keep_best):
+    """A fault was taken back, so that the step of the effect after it is that of the next one, too."""
+    fault = CandidateScore("episode", reason="what was found later explains it")
+    kept = CandidateScore("foliage", kept=True, step=1, passed=True)
+    result = keep_best(SelectionResult(MODEL, scores=[fault, kept], rivals=[[]]), [passed("unexplained_trend", 30.0, 1)], 1)
+    assert [(each.name, each.kept, each.reason) for each in result.scores] == [
+        ("episode", False, fault.reason), ("foliage", True, ""), ("unexplained_trend", True, "")]
+
+
+@pytest.mark.parametrize(("second", "rivals"), [(None, ["missing_obstacle"]), (8.0, ["device_gain_offset"]), (60.0, [])])
+def test_several_of_a_kind_are_told_from_another_effect_by_what_they_gain_together(keep_best, second, rivals):
+    offset, tower = passed("device_gain_offset", 64.0), passed("missing_obstacle", 60.0, repeatable=True)
+    two = second and [(tower.score, MODEL), (passed("missing_obstacle", second, 1).score, MODEL)]
+    result = keep_best(SelectionResult(MODEL), [offset, tower], 0, two)
+    assert result.rivals == [rivals] + [[]] * bool(second)
+    assert [each.name for each in result.scores if each.kept] == (["missing_obstacle"] * 2 if second else
+                                                                 ["device_gain_offset"])
+
+
+def test_without_a_candidate_there_is_no_step():
+    """What is left may depend on variables that have no order, such as flights, of which no curve can be tried."""
+    result = SelectionResult(MODEL, scores=[CandidateScore("foliage", kept=True)], rivals=[["interference"]])
+    before = replace(result)
+    forward_selection(result, [], 0, lambda _: pytest.fail("something is being done"))
+    assert vars(result) == vars(before)
