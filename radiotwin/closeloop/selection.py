@@ -97,6 +97,8 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
         seed: of permutations.
         on_progress: called with what is being done.
     """
+    if not effects:  # nothing to ask, and so no step
+        return
     block = evidence_blocks(result.model.links)
     available = []
     for effect in effects:

@@ -130,3 +130,11 @@ def test_several_of_a_kind_are_told_from_another_effect_by_what_they_gain_togeth
     assert result.rivals == [rivals] + [[]] * bool(second)
     assert [each.name for each in result.scores if each.kept] == (["missing_obstacle"] * 2 if second else
                                                                  ["device_gain_offset"])
+
+
+def test_without_a_candidate_there_is_no_step():
+    """What is left may depend on variables that have no order, such as flights, of which no curve can be tried."""
+    result = SelectionResult(MODEL, scores=[CandidateScore("foliage", kept=True)], rivals=[["interference"]])
+    before = replace(result)
+    forward_selection(result, [], 0, lambda _: pytest.fail("something is being done"))
+    assert vars(result) == vars(before)
