@@ -2,6 +2,7 @@
 
 from collections import Counter
 
+from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.posterior import NONE, OTHER
 from radiotwin.report.labels import INTERPOLATIONS, join_names, name_label, variable_label
 
@@ -102,8 +103,9 @@ def side_by_side(report: dict) -> list[str]:
 
 
 def drivers(report: dict) -> list[str]:
-    """Return labels of the variables that the residual depends on."""
-    found = report["remaining"]["drivers"] or report.get("dependences_before", [])
+    """Return labels of the variables that the residual depends on; if none, that of the base."""
+    found = report["remaining"]["drivers"] or [
+        each for each in report.get("dependences_before", []) if _counts(each, report)]
     return [variable_label(each["variable"])[0] for each in found[:MAX_NAMED]]
 
 
@@ -125,6 +127,14 @@ def probability(value: float | None) -> str:
     if value is None:
         return "–"
     return "> 0.99" if value > 0.99 else "< 0.01" if value < 0.01 else f"{value:.2f}"
+
+
+def _counts(dependence: dict, report: dict) -> bool:
+    """Return whether a dependence meets the report's criteria; of version 0.1, today's."""
+    criteria = SelectionCriteria().to_json() | report.get("criteria", {})
+    p_value, effect_db = dependence["p_value"], dependence.get("effect_db")
+    return p_value is not None and p_value <= criteria["max_dependence_p_value"] and (
+        effect_db is None or effect_db >= criteria["min_dependence_db"])
 
 
 def _causes(report: dict) -> list[dict]:

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from radiotwin.errors import BadInput
 from radiotwin.report.closeloop_page import write_closeloop_page
-from radiotwin.report.closeloop_words import closeloop_summary, rivals
+from radiotwin.report.closeloop_words import closeloop_summary, drivers, rivals
 from radiotwin.report.labels import join_names, parameter_label, variable_label
 
 SCORES = {"n": 900, "bias_db": 0.04, "std_db": 3.0, "correlation": 0.9, "rmse_db": 3.0, "mae_db": 2.2, "nll": 2.5}
@@ -68,6 +68,19 @@ def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
     assert sentence in text and f"<b>{badge}</b>" in text
     assert text.index(sentence) < text.index("<h2>")
     assert not re.search(r'(src|href)="(?!data:)|https?://|<script', text)  # one file, no network
+
+
+def test_only_what_meets_the_criteria_is_said_to_matter():
+    chance, weak, strong = ({"variable": name, "p_value": p_value, "effect_db": effect_db} for name, p_value, effect_db in (
+        ("distance_m", 1.0, 2.0), ("altitude_m", 0.001, 0.1), ("time_in_flight_s", 0.001, 1.5)))
+    nothing = {"remaining": {"structured": False, "drivers": []}}
+    found = report("unexplained", dependences_before=[chance, weak, strong], **nothing)
+    assert drivers(found) == ["time in flight"]
+    assert "3.00 dB RMSE and depends on time in flight." in closeloop_summary(found)
+    assert drivers(found | {"criteria": {"max_dependence_p_value": 1.0, "min_dependence_db": 1.0}}) == [
+        "distance", "time in flight"]
+    without = closeloop_summary(report("unexplained", dependences_before=[chance, weak], **nothing))
+    assert "3.00 dB RMSE. " in without and "depends" not in without
 
 
 def test_names_from_the_data_are_no_markup(tmp_path):
