@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-AS_GOOD = 1.02  # ratio of errors up to which the plainer model would do
+AS_GOOD = 1.02  # ratio of errors up to which one model is as good as another
 
+# Of the models that are fitted; all others are published laws.
 _WORDS = {"log_distance": "the log-distance law", "segmented_log_distance": "the segmented law",
           "regression_kriging": "kriging", "extra_trees": "a tree ensemble (ExtraTrees)",
           "hist_gradient_boosting": "gradient boosting (HistGradientBoosting)"}
@@ -29,15 +30,16 @@ def compare_with_baselines(error: dict[str, Any],
         return None
     best = min(rmse_db, key=lambda name: rmse_db[name])
     words, best_db = _WORDS.get(best, best), rmse_db[best]
-    gain = 100 * (1 - combined_db / best_db)
     if best_db <= AS_GOOD * combined_db:
-        advice = (f"For prediction alone a plain regression would do: {words} {best_db:.2f} dB, "
+        plain = "a plain regression" if best in _WORDS else "a published law"
+        advice = (f"For prediction alone {plain} would do: {words} {best_db:.2f} dB, "
                   f"all that was learnt together {combined_db:.2f} dB.")
     else:
+        gain = 100 * (1 - combined_db / best_db)
         advice = (f"All that was learnt together predicts to {combined_db:.2f} dB, {gain:.0f} % "
                   f"better than the best other model ({words} alone: {best_db:.2f} dB).")
     after_db = error["after"]["rmse_db"]
-    if after_db is not None and after_db > best_db:
+    if after_db is not None and after_db > AS_GOOD * best_db:
         advice += f" The base with all that was found is behind {words}: {after_db:.2f} dB."
     return {"best_baseline": best, "best_baseline_rmse_db": best_db,
             "combined_rmse_db": combined_db, "advice": advice}

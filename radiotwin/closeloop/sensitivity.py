@@ -68,14 +68,17 @@ def detectable(hypotheses: Hypotheses, criteria: SelectionCriteria,
 
 def needed_nats(name: str, probability: float, rest_over_noise: float,
                 is_another_kind: bool = False) -> float:
-    """Return the evidence that makes an effect so probable, if nothing competes with it."""
+    """Return the evidence that makes an effect so probable, if nothing competes with it [nats].
+
+    inf where none does.
+    """
     def lack(nats: float) -> float:
         return probability_of(name, features((nats, nats, nats), 0.0, rest_over_noise,
                                              is_another_kind)) - probability
 
     if lack(0.0) >= 0:
         return 0.0
-    return float(brentq(lack, 0.0, MAX_NATS)) if lack(MAX_NATS) > 0 else MAX_NATS
+    return float(brentq(lack, 0.0, MAX_NATS)) if lack(MAX_NATS) > 0 else np.inf
 
 
 def _patterns(links: LinkData) -> Iterator[tuple[str, str, str, np.ndarray]]:
@@ -100,8 +103,7 @@ def _patterns(links: LinkData) -> Iterator[tuple[str, str, str, np.ndarray]]:
         back = 0.5 - 0.5 * np.cos(np.radians(np.nan_to_num(links.body_azimuth_deg)))
         yield "body_shadowing", "dB", "behind the receiver's body", -back
     for mine in _members(links.device):
-        toward = float(np.median(links.azimuth_deg[mine]))
-        off = (links.azimuth_deg - toward + 180) % 360 - 180
+        off = _signed_deg(links.azimuth_deg - median_azimuth_deg(links.azimuth_deg[mine]))
         yield ("antenna_pattern", "dB", f"front to back of one device, {BEAMWIDTH_DEG:.0f}° wide",
                mine * -np.minimum(0.5 * (off / BEAMWIDTH_DEG) ** 2, 1.0))
         hidden = mine & (np.abs(off) < SECTOR_DEG / 2)
@@ -111,6 +113,17 @@ def _patterns(links: LinkData) -> Iterator[tuple[str, str, str, np.ndarray]]:
         moved_m = np.linalg.norm(links.offset_m - [0.0, MOVE_M, 0.0], axis=1)
         change_db = -20 * np.log10(np.maximum(moved_m, 1.0) / links.distance_m)
         yield "device_position_error", "m", "of one device", mine * change_db / MOVE_M
+
+
+def median_azimuth_deg(azimuth_deg: np.ndarray) -> float:
+    """Return the median of directions (n,), taken around their mean: there is no step at north."""
+    mean_deg = np.degrees(np.angle(np.exp(1j * np.radians(azimuth_deg)).sum()))
+    return float((mean_deg + np.median(_signed_deg(azimuth_deg - mean_deg))) % 360)
+
+
+def _signed_deg(angle_deg: np.ndarray) -> np.ndarray:
+    """Return the same angles from -180 up to 180 [deg]."""
+    return (angle_deg + 180) % 360 - 180
 
 
 def _members(label: np.ndarray) -> list[np.ndarray]:

@@ -42,6 +42,9 @@ class NoiseFloor(ReceiverEffect):
 
         receivers: dict[ReceiverIndex, Decibels] = Field(
             description="Floor of each receiver, by index [dB].")
+        alone: bool = Field(False, description=(
+            "Whether no other receiver has a floor; else those without an estimate have the "
+            "median, where three or more have one."))
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
@@ -67,8 +70,9 @@ class NoiseFloor(ReceiverEffect):
                   for receiver in found} for share in COMMON_QUANTILES]
         # Where links are blank below a limit, a floor above it is wrong for most receivers: then
         # one may have a floor alone.
-        alone = [own] if own and own.keys() != found.keys() else []
-        return [self.Params(receivers=floors_db) for floors_db in (*alone, found, *tried)]
+        alone = own and own.keys() != found.keys()
+        return [*([self.Params(receivers=own, alone=True)] if alone else []),
+                *(self.Params(receivers=floors_db) for floors_db in (found, *tried))]
 
     @staticmethod
     def _gain_nats(view: ResidualView, rows: np.ndarray, floor_db: float) -> float:
@@ -79,8 +83,9 @@ class NoiseFloor(ReceiverEffect):
     @override
     def inputs(self, links: LinkData, params: Params) -> np.ndarray:
         floors_db = list(params.receivers.values())
-        # A receiver without an estimate has the usual floor.
-        usual_db = np.median(floors_db) if len(floors_db) >= MIN_RECEIVERS else -np.inf
+        # A receiver without an estimate has the usual floor, unless some have one alone.
+        usual = len(floors_db) >= MIN_RECEIVERS and not params.alone
+        usual_db = np.median(floors_db) if usual else -np.inf
         by_receiver_db = np.full(len(links.receiver_names), usual_db)
         by_receiver_db[list(params.receivers)] = floors_db
         return np.exp(by_receiver_db * NEPERS)[links.receiver]
@@ -96,7 +101,8 @@ class NoiseFloor(ReceiverEffect):
         return Variation(
             np.array(list(params.receivers.values())), np.full(n, 2.0), np.full(n, -250.0),
             np.full(n, 50.0),
-            lambda numbers: self.Params(receivers=dict(zip(params.receivers, numbers.tolist()))),
+            lambda numbers: self.Params(receivers=dict(zip(params.receivers, numbers.tolist())),
+                                        alone=params.alone),
             list(np.arange(n)[:, None]))
 
     @override

@@ -75,6 +75,20 @@ def test_the_advice_says_where_a_plain_model_would_do():
         error, {"regression_kriging": scores(3.61)})["advice"]
 
 
+def test_a_published_law_is_no_regression_and_an_error_of_two_in_a_hundred_more_is_none():
+    error = {"combined": scores(5.0), "after": scores(5.1)}
+    advice = compare_with_baselines(error, {"p1411": scores(5.05)})["advice"]
+    assert "a published law would do: p1411 5.05 dB" in advice and "is behind" not in advice
+    assert "is behind p1411: 5.16 dB" in compare_with_baselines(
+        error | {"after": scores(5.16)}, {"p1411": scores(5.05)})["advice"]
+
+
+def test_errors_of_zero_are_compared():
+    error = {"combined": scores(0.0), "after": scores(0.0)}
+    advice = compare_with_baselines(error, {"log_distance": scores(0.0)})["advice"]
+    assert "would do: the log-distance law 0.00 dB" in advice and "is behind" not in advice
+
+
 def test_a_model_of_fewer_links_is_not_compared():
     error = {"combined": scores(3.6), "after": scores(3.6)}
     assert compare_with_baselines(error, {"regression_kriging": scores(1.0, 50)}) is None

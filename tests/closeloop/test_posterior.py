@@ -13,7 +13,8 @@ from radiotwin.closeloop.folds import make_folds
 from radiotwin.closeloop.hypotheses import Hypotheses
 from radiotwin.closeloop.posterior import NONE, OTHER, features, judge, probability_of
 from radiotwin.closeloop.scoring import CandidateScore
-from radiotwin.closeloop.sensitivity import detectable, needed_nats
+from radiotwin.closeloop.result_file import _for_json
+from radiotwin.closeloop.sensitivity import detectable, median_azimuth_deg, needed_nats
 from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.fitting import add_effect
 from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
@@ -166,3 +167,16 @@ def test_an_effect_of_the_size_that_would_have_been_seen_has_the_evidence_for_it
     assert {"receiver_gain_offset", "device_gain_offset", "excess_attenuation"} <= set(sizes)
     assert all(size > 0 for size in sizes.values())
     assert needed_nats("foliage", 0.5, 1.0) <= needed_nats("foliage", 0.9, 1.0) <= needed_nats("foliage", 0.9, 4.0)
+
+
+def test_where_no_size_would_be_seen_there_is_none(open_ground):
+    assert needed_nats("foliage", 1.0, 1.0) == np.inf
+    _, hypotheses = looked_at(open_ground, 6)
+    sizes = [each.size for each in detectable(hypotheses, replace(CRITERIA, min_probability=1.0))]
+    assert set(sizes) == {np.inf} and set(_for_json(sizes)) == {None}
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 90.0, 180.0, 270.0])
+def test_the_median_direction_turns_with_all(turn_deg):
+    azimuth_deg = np.array([-40.0, -20.0, 5.0, 8.0, 30.0])
+    assert median_azimuth_deg((azimuth_deg + turn_deg) % 360) == pytest.approx((5.0 + turn_deg) % 360)

@@ -56,6 +56,32 @@ def test_only_the_receiver_that_has_one_gets_a_floor(flown, kind):
     assert before.objective - after.objective > 50
 
 
+@pytest.mark.parametrize("alone", [False, True])
+def test_the_usual_floor_is_not_that_of_receivers_that_have_none(make_links, alone):
+    links = make_links([[0.0, 0, 1.5]], np.ones((5, 3)), receiver=np.arange(5))
+    params = NoiseFloor.Params(receivers={0: -90.0, 1: -91.0, 2: -92.0}, alone=alone)
+    for each in (params, NoiseFloor().variation(params).params(np.array([-90.0, -91.0, -92.0]))):
+        floors_db = 10 * np.log10(np.maximum(NoiseFloor().inputs(links, each), 1e-30))
+        np.testing.assert_allclose(floors_db, [-90, -91, -92, *[-300 if alone else -91] * 2])
+
+
+def test_receivers_that_gain_nothing_by_a_floor_are_left_without(make_links):
+    """Three of six read noise."""
+    rng = np.random.default_rng(1)
+    receiver = np.repeat(np.arange(6), LINKS)
+    receiver_m = np.column_stack([rng.uniform(0, 1500, (len(receiver), 2)), np.full(len(receiver), 40.0)])
+    links = make_links([[700.0, 800, 1.5]], receiver_m, limit_db=LIMIT_DB, receiver=receiver)
+    level_db = -22 - 30 * np.log10(links.distance_m) + rng.normal(0, 2.5, len(links))
+    noise_db = np.where(receiver < 3, FLOOR_DB, -np.inf)
+    level_db = 10 * np.log10(10 ** (level_db / 10) + 10 ** (noise_db / 10))
+    links.level_db[:] = np.where(level_db < LIMIT_DB, np.nan, level_db)
+    model = FoldModel.build(links, KnownLevels(LogDistanceLine(-20.0, -3.0, 3.0)), 5.0)
+    found = add_effect(model, NoiseFloor(), model.fit())[0].effects[-1]
+    assert set(found.params.receivers) == {0, 1, 2} and found.params.alone
+    assert all(floor_db == pytest.approx(FLOOR_DB, abs=1.0) for floor_db in found.params.receivers.values())
+    assert not found.term.inputs[receiver >= 3].any() and found.term.inputs[receiver < 3].all()
+
+
 def test_links_with_line_of_sight_which_are_strong_need_not_show_it(flown):
     """As over a map: links with line of sight are far above the floor, and tell nothing of it."""
     los = flown.distance_m < 400
