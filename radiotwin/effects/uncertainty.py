@@ -19,7 +19,7 @@ from radiotwin.effects.params import Estimate, Variation
 from radiotwin.inference import student
 from radiotwin.inference.censored_regression import CensoredRegression, FitResult, Linearisation
 from radiotwin.inference.sandwich import Scores
-from radiotwin.links import evidence_blocks
+from radiotwin.links import evidence_blocks, places
 
 MIN_FLIGHTS = 4  # that clusters of flights are made of
 STEP_SHARES = (0.02, 3.0)  # of `Variation.steps`, least and greatest secant
@@ -41,7 +41,7 @@ def estimates(model: FoldModel, result: FitResult) -> list[Estimate]:
     scores = _scores(model, result, [each for of_effect in secants for each in of_effect],
                      design_effect)
     links = model.links.select(model.train)
-    clusterings = [evidence_blocks(links)]
+    clusterings = [evidence_blocks(links), places(links)]
     if len(np.unique(links.flight)) >= MIN_FLIGHTS:
         clusterings.append(links.flight)
     covariance = scores.covariance(clusterings)

@@ -14,6 +14,8 @@ from radiotwin.links.correlation import (
 from radiotwin.links.link_data import LinkData
 
 LENGTHS = 1.0  # side of a piece over the correlation length
+# Side of a place over it: a square of the area over which exp(-d/L) adds up to 1, 2 pi L².
+PLACE_LENGTHS = 2.5
 UNKNOWN_M = 100.0  # side of a piece while no residual has been looked at
 MIN_PLACES = 6  # that the ground of a campaign is cut into, where it is wide enough
 NARROWER = 0.8  # from one width that is tried to the next
@@ -33,9 +35,29 @@ def evidence_blocks(links: LinkData) -> np.ndarray:
     Returns:
         (n,) int label.
     """
+    return _evidence(links)[:, 0]
+
+
+def places(links: LinkData) -> np.ndarray:
+    """Return the place that each link belongs to: squares of ground that both its ends are in.
+
+    What stands beside a way shadows every flight that comes along it again, whatever the receiver,
+    so that more flights over the same ground tell no more of what belongs to a device.
+
+    Args:
+        links: n links.
+
+    Returns:
+        (n,) int label.
+    """
+    return _evidence(links)[:, 1]
+
+
+def _evidence(links: LinkData) -> np.ndarray:
     if links.evidence is not None:
         return links.evidence
-    return _pieces(links, fitting_width_m(links, UNKNOWN_M))
+    width_m = fitting_width_m(links, UNKNOWN_M)
+    return _pieces(links, width_m, width_m)
 
 
 def with_evidence(links: LinkData, z: np.ndarray) -> LinkData:
@@ -49,11 +71,11 @@ def with_evidence(links: LinkData, z: np.ndarray) -> LinkData:
     """
     length_m = correlation_length_m(links, z)
     width_m = fitting_width_m(links, LENGTHS * length_m)
-    pieces = _pieces(links, width_m)
-    places, notes = _occupied(moving_end_m(links), width_m), []
-    if places < LITTLE:
+    pieces = _pieces(links, width_m, fitting_width_m(links, PLACE_LENGTHS * length_m))
+    squares, notes = _occupied(moving_end_m(links), width_m), []
+    if squares < LITTLE:
         notes.append(f"links within {width_m:.0f} m of each other err alike, and the campaign has "
-                     f"been at {places} such places only, so evidence is little")
+                     f"been at {squares} such places only, so evidence is little")
     return replace(links, evidence=pieces, notes=[*links.notes, *notes])
 
 
@@ -75,12 +97,15 @@ def _occupied(position_m: np.ndarray, width_m: float) -> int:
     return len(np.unique(np.floor(position_m[:, :2] / width_m), axis=0))
 
 
-def _pieces(links: LinkData, width_m: float) -> np.ndarray:
-    """Return labels (n,) of squares of ground of one pair of ends and flight."""
-    ends = [np.floor(end[:, :2] / width_m).astype(np.int64) for end in
-            (links.receiver_m, np.nan_to_num(links.device_m[links.device]))]
-    keys = np.column_stack([*ends, pair_of_ends(links), links.flight])
-    return pd.DataFrame(keys).groupby(list(range(keys.shape[1]))).ngroup().to_numpy()
+def _pieces(links: LinkData, width_m: float, place_m: float) -> np.ndarray:
+    """Return labels (n, 2): squares of one pair of ends and flight, and larger ones of all."""
+    pieces, squares = (np.column_stack([np.floor(end[:, :2] / side_m).astype(np.int64) for end in
+                                        (links.receiver_m,
+                                         np.nan_to_num(links.device_m[links.device]))])
+                       for side_m in (width_m, place_m))
+    pieces = np.column_stack([pieces, pair_of_ends(links), links.flight])
+    return np.column_stack([pd.DataFrame(keys).groupby(list(range(keys.shape[1]))).ngroup()
+                            for keys in (pieces, squares)])
 
 
 def design_effect(block: np.ndarray, z: np.ndarray, max_z: float = 4.0) -> float:

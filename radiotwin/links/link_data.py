@@ -57,8 +57,8 @@ class LinkData:
         boresight_deg: (k,) declared azimuth of each device's antenna, clockwise from north [deg];
             NaN where none is, and where None is given.
         tilt_deg: (k,) declared tilt of each device's antenna, upwards [deg]; likewise.
-        evidence: (n,) piece of evidence of each link, see `radiotwin.links.with_evidence`; None
-            before a residual has been looked at.
+        evidence: (n, 2) piece of evidence and place of each link, see
+            `radiotwin.links.with_evidence`; None before a residual has been looked at.
     """
 
     level_db: np.ndarray
