@@ -39,7 +39,8 @@ class Step:
         unnamed_nats: evidence for a curve without a name over each variable.
         rest_db: standard deviation of what belongs to places and has no name [dB].
         noise_db: and of what belongs to nothing.
-        probabilities: of each effect that passed, of `NONE` and of `OTHER`.
+        probabilities: of each effect that was scored on held-out links, passed or not, of `NONE`
+            and of `OTHER`; they sum to 1.
     """
 
     number: int

@@ -78,7 +78,7 @@ class EffectRecord(Record):
 
 
 class CandidateRecord(Record):
-    """An effect that was tried."""
+    """An effect that was tried, or that the data do not allow to be looked for."""
 
     name: str
     step: Whole
@@ -126,7 +126,7 @@ class RemainingRecord(Record):
 
 
 class ProbabilityRecord(Record):
-    """A cause, `none` or `not in the catalogue`, and how probable it is."""
+    """An effect that was scored, passed or not, `none` or `not in the catalogue`; they sum to 1."""
 
     name: str
     probability: Number | None

@@ -93,7 +93,8 @@ class Loop(Summarised):
         """`effect`, `none`, `unexplained` or `undecided`.
 
         Without a named effect: `unexplained` where a cause without a name is the likeliest, or more
-        than `max_rest_db` belongs to places; `none` where nothing is the likeliest by far.
+        than `max_rest_db` belongs to places; `none` where nothing is the likeliest by far. Of the
+        first step; last resorts have no part in it.
         """
         if any(each.effect.is_cause and not each.effect.is_declared
                for each in self.after.whole.effects):

@@ -44,7 +44,9 @@ class SelectionResult:
     Attributes:
         model: base and effects; kept effects are in the order of the steps.
         criteria: thresholds that decided.
-        scores: every candidate of every step.
+        scores: candidates, step by step, and effects that the data do not allow to be looked for.
+            Of faults those kept and, once no more passed, the last ones refused; of effects beside
+            another (pairs, more of a kind) those kept.
         rivals: of each kept effect, names of those that the data cannot tell from it.
         steps: what each step's residual says, the first step first; the last is of what is left.
         explained: the model before any last resort.

@@ -12,8 +12,8 @@ from radiotwin.closeloop.cross_validation import cross_validate, training_parts
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.closeloop.hypotheses import Hypotheses
 from radiotwin.closeloop.posterior import NONE, OTHER, features, judge, probability_of
-from radiotwin.closeloop.scoring import CandidateScore
 from radiotwin.closeloop.result_file import _for_json
+from radiotwin.closeloop.scoring import CandidateScore
 from radiotwin.closeloop.sensitivity import detectable, median_azimuth_deg, needed_nats
 from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.fitting import add_effect
