@@ -1,6 +1,6 @@
 """The declared scene corrected by what the loop found.
 
-Boxes are added, buildings taken out, anchors moved, and antennas declared.
+Boxes are added, buildings taken out, roofs raised and lowered, anchors moved, and antennas declared.
 """
 
 from dataclasses import replace
@@ -16,6 +16,7 @@ from radiotwin.effects.boxes import Box
 from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.position_errors import DevicePositionError
 from radiotwin.effects.removed_obstacle import RemovedObstacle, buildings
+from radiotwin.effects.roof_heights import Roof, RoofHeights, surely_off
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, require_writable
 from radiotwin.inputs import is_within
@@ -90,6 +91,11 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
                f"stands at ({box.x_m:.0f}, {box.y_m:.0f}) m" for box in boxes]
     changes += ["the building at ({:.0f}, {:.0f}) m, {:.0f} m high, is taken out".format(
         *centres_m[building]) for building in gone]
+    roofs = [roof for each in effects if isinstance(each.effect, RoofHeights)
+             for roof in surely_off(each.params.roofs) if roof.building not in gone]
+    changes += [f"the roof at ({roof.x_m:.0f}, {roof.y_m:.0f}) m is "
+                f"{roof.height_m + roof.offset_m:.1f} m high, and {roof.height_m:.1f} m on the map"
+                for roof in roofs]
     config, antennas, found = with_antennas(config, loop, scene)
     changes += moves + found
     if not changes:
@@ -99,7 +105,7 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
     corrected = "; ".join(([earlier] if earlier else []) + changes)
     provenance = config.provenance | {"corrected": corrected}
     with atomic_folder(folder) as temporary:
-        _write_city(scene, temporary, keep, boxes)
+        _write_city(scene, temporary, keep, boxes, roofs)
         scene.copy_antennas(temporary)
         for file, pattern in antennas.items():
             write_antenna(pattern, temporary / file)
@@ -165,12 +171,14 @@ def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
     return Box(x_m, y_m, length_m, width_m, high[2], box.turn_deg)
 
 
-def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box]) -> None:
-    """Write `city.xml` and `meshes/`: kept faces (f,) of the scene's map, materials, and boxes."""
-    shapes, first = [], 0
+def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
+                roofs: list[Roof]) -> None:
+    """Write `city.xml` and `meshes/`: kept faces (f,) of the scene's map, roofs, and boxes."""
+    label, shapes, first = buildings(scene.city)[0], [], 0
     for shape in read_city(scene.xml_path):
-        own = keep[first:first + len(shape.mesh.faces)]
-        first += len(own)
+        part = slice(first, first + len(shape.mesh.faces))
+        own, first = keep[part], part.stop
+        shape = replace(shape, mesh=_with_roofs(shape.mesh, label[part], roofs))
         if own.all():
             shapes.append(shape)
         elif own.any():
@@ -179,6 +187,19 @@ def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box]) 
             shapes.append(replace(shape, mesh=mesh))
     taken = {name.lower() for shape in shapes for name in (shape.name, shape.material.name)}
     write_city(folder, [*shapes, *_box_shapes(scene, boxes, taken)])
+
+
+def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[Roof]) -> trimesh.Trimesh:
+    """Return a mesh whose buildings (f,) are stretched to the heights of their roofs."""
+    vertices_m = np.array(mesh.vertices, dtype=float)
+    for roof in roofs:
+        mine = np.unique(mesh.faces[label == roof.building])
+        if len(mine):
+            height_m = vertices_m[mine, 2]
+            base_m = height_m.min()
+            grown = 1.0 + roof.offset_m / max(roof.height_m - base_m, abs(roof.offset_m))
+            vertices_m[mine, 2] = base_m + grown * (height_m - base_m)
+    return trimesh.Trimesh(vertices_m, mesh.faces, process=False)
 
 
 def _box_shapes(scene: Scene, boxes: list[Box], taken: set[str]) -> list[CityShape]:

@@ -105,7 +105,7 @@ class Effect(ABC):
         is_declared: whether the tables declare it, or every map has it, so that only its numbers
             are open: it is no candidate cause but a part of the base, where held-out links gain by
             it.
-        in_paths: whether a base that follows paths has it already, so that it is no candidate there.
+        in_paths: whether a base that follows paths has it, so that it is no candidate there.
         always_exact: whether `exact` may be asked of every candidate, not only of what is kept.
         uses: columns of the measurements that it reads and that no map has, such as `quality`.
     """

@@ -142,7 +142,7 @@ class Interference(ReceiverEffect):
 
 def _fall_db(links: LinkData, position_m: Sequence[float] | np.ndarray,
              level_at: LevelAt | None) -> np.ndarray:
-    """Return the level (n,) of an emitter of 0 dB at the receivers: by free space without a channel.
+    """Return the level (n,) of an emitter of 0 dB: by the channel, or else by free space.
 
     In free space it is 0 dB at `REFERENCE_M`.
     """

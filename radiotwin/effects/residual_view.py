@@ -71,7 +71,7 @@ class ResidualView:
         """
         scale_db, blank = self.scale_db[rows], np.isnan(self.links.level_db[rows])
         before = (self.residual_db[rows] / scale_db) ** 2
-        # That of a blank is cut off at 0; how far it is below the limit decides how far it may rise.
+        # That of a blank is cut off at 0; how far it may rise, its distance to the limit says.
         spare_db = self.links.limit_db[rows] - self.mean_db[rows]
         spare_db = np.where(np.isfinite(spare_db), spare_db, np.inf)
         # It may be blank for another reason than its level, by as much as its residual is less.

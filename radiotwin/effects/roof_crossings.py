@@ -107,6 +107,10 @@ def _boxes(city: CityMap) -> dict[int, Box]:
     np.minimum.at(low_m, label, corners_m.min(axis=1))
     np.maximum.at(high_m, label, corners_m.max(axis=1))
     built = np.bincount(label[~city.on_ground], minlength=count) > 0
-    return {building: Box(*(0.5 * (low_m + high_m)[building]).tolist(),
-                          *(high_m - low_m)[building].tolist(), BOTTOMLESS_M, 0.0)
-            for building in np.flatnonzero(built).tolist()}
+    found = {}
+    for building in np.flatnonzero(built).tolist():
+        (x_m, y_m), (length_m, width_m) = (0.5 * (low_m + high_m)[building],
+                                           (high_m - low_m)[building])
+        found[building] = Box(float(x_m), float(y_m), float(length_m), float(width_m),
+                              BOTTOMLESS_M, 0.0)
+    return found

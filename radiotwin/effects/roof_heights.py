@@ -8,6 +8,7 @@ the map's; a roof that few links tell of stays about where it is.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +21,7 @@ from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.params import QUANTILE_90, EffectParams, Estimate, Length, Metres, Parameter
 from radiotwin.effects.removed_obstacle import buildings
 from radiotwin.effects.residual_view import LevelAt, ResidualView
-from radiotwin.effects.roof_crossings import RoofCrossings, roof_crossings
+from radiotwin.effects.roof_crossings import roof_crossings
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkData
 
@@ -116,8 +117,13 @@ class RoofHeights(GainEffect):
                    estimate: Estimate) -> dict[str, Parameter]:
         return {f"true_minus_mapped_height_{roof.building}_m":
                 Parameter.normal(roof.offset_m, roof.offset_sd_m, "m")
-                for roof in sorted(params.roofs, key=lambda each: -abs(each.offset_m))
-                if abs(roof.offset_m) > QUANTILE_90 * roof.offset_sd_m}
+                for roof in surely_off(params.roofs)}
+
+
+def surely_off(roofs: Sequence[Roof]) -> list[Roof]:
+    """Return the roofs whose 90 % interval leaves out the map's height, the most wrong first."""
+    return sorted((roof for roof in roofs if abs(roof.offset_m) > QUANTILE_90 * roof.offset_sd_m),
+                  key=lambda roof: -abs(roof.offset_m))
 
 
 class _Search:
@@ -129,7 +135,7 @@ class _Search:
         contrast_db: (r,) what each would lose without any line of sight [dB].
     """
 
-    def __init__(self, view: ResidualView, rows: np.ndarray, contrast_db: np.ndarray):
+    def __init__(self, view: ResidualView, rows: np.ndarray, contrast_db: np.ndarray) -> None:
         links = view.links.select(rows)
         assert links.city is not None
         self._view, self._rows, self._contrast_db = view, rows, contrast_db
@@ -164,7 +170,8 @@ class _Search:
             for building, mine in pairs.items():
                 offset_m, sd_m = self._estimate(mine, float(centres_m[building, 2]))
                 self._loss_db[mine] = self._ways.loss_db(offset_m, self._wavelength_m, mine)
-                found[building] = Roof(building, *centres_m[building].tolist(), offset_m, sd_m)
+                x_m, y_m, height_m = centres_m[building].tolist()
+                found[building] = Roof(building, x_m, y_m, height_m, offset_m, sd_m)
         return tuple(roof for roof in found.values() if abs(roof.offset_m) >= MIN_OFFSET_M)
 
     def _estimate(self, mine: np.ndarray, height_m: float) -> tuple[float, float]:

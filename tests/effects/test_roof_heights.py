@@ -1,0 +1,126 @@
+"""Roofs that are off, over blocks whose true heights the test knows, with levels of two plain laws."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from radiotwin.closeloop.bases import make_bases
+from radiotwin.effects.fitting import add_effect
+from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.params import QUANTILE_90
+from radiotwin.effects.roof_heights import Roof, RoofHeights, surely_off
+from radiotwin.errors import BadInput
+from radiotwin.scene.citymap import CityMap
+
+CORNERS_M = [(-80.0, -20.0), (-15.0, -15.0), (50.0, -25.0), (-40.0, 60.0)]  # south-western, of blocks of 30 by 30 m
+MAPPED_M = (20.0, 18.0, 22.0, 15.0)
+BEHIND_DB = 22.0
+
+
+def city():
+    ground = trimesh.creation.box(extents=[800, 800, 0.2])
+    ground.apply_translation([0, 0, -0.1])
+    blocks = [trimesh.creation.box(bounds=[[x, y, 0], [x + 30, y + 30, top]])
+              for (x, y), top in zip(CORNERS_M, MAPPED_M, strict=True)]
+    meshes = trimesh.util.concatenate([ground, *blocks])
+    return CityMap(meshes.vertices, meshes.faces)
+
+
+def blocked(a_m, b_m, heights_m):
+    """Return whether segments pass through the blocks as they are: points along them, one by one."""
+    points_m = a_m + np.linspace(0, 1, 600)[:, None, None] * (b_m - a_m)
+    found = np.zeros(len(a_m), dtype=bool)
+    for (x, y), top in zip(CORNERS_M, heights_m, strict=True):
+        low, high = np.array([x, y, 0.0]), np.array([x + 30, y + 30, top])
+        found |= ((points_m >= low) & (points_m <= high)).all(axis=2).any(axis=0)
+    return found
+
+
+@pytest.fixture
+def world(make_links):
+    """Return links over the map, levels over the true heights; receivers fly, devices stand in the streets."""
+    def make(heights_m, seed=0, count=700):
+        rng = np.random.default_rng(seed)
+        device_m = np.array([[-60.0, -90.0, 2.0], [20.0, -80.0, 2.0], [-5.0, 45.0, 2.0], [90.0, 40.0, 2.0]])
+        receiver_m = np.column_stack([rng.uniform(-150, 150, (count, 2)), rng.uniform(30, 70, count)])
+        plain = make_links(device_m, receiver_m, city=city())
+        a_m, b_m = plain.device_m[plain.device], plain.receiver_m
+        level_db = -40 - 22 * np.log10(np.linalg.norm(b_m - a_m, axis=1)) - BEHIND_DB * blocked(a_m, b_m, heights_m)
+        return make_links(device_m, receiver_m, city=city(), level_db=level_db + rng.normal(0, 2, len(a_m)))
+    return make
+
+
+def fitted(links):
+    model = FoldModel.build(links, make_bases(None, 0)["twin"].fit(links).channel, 8.0)
+    fit = model.fit()
+    return model, fit, add_effect(model, RoofHeights(), fit)
+
+
+def offsets(roofs):
+    """Return what each block is off by (4,), NaN where nothing is said, and the standard deviations."""
+    found = np.full((2, len(CORNERS_M)), np.nan)
+    for roof in roofs:
+        number = np.argmin([np.hypot(roof.x_m - x - 15, roof.y_m - y - 15) for x, y in CORNERS_M])
+        assert roof.height_m == pytest.approx(MAPPED_M[number])
+        found[:, number] = roof.offset_m, roof.offset_sd_m
+    return found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_roofs_that_are_off_are_found_and_explain_the_links(world, seed):
+    true_m = np.array([3.0, -3.0, 4.0, 0.0])
+    model, fit, (added, better) = fitted(world(np.add(MAPPED_M, true_m), seed))
+    assert fit.objective - better.objective > 50
+    off_m, sd_m = offsets(added.effects[-1].params.roofs)
+    assert off_m[:3] == pytest.approx(true_m[:3], abs=1.2)
+    assert (np.abs(off_m - true_m)[:3] < 2 * QUANTILE_90 * sd_m[:3]).all()
+    assert not abs(off_m[3]) > 1.2
+    sure = surely_off(added.effects[-1].params.roofs)
+    assert len(sure) >= 3 and abs(sure[0].offset_m) >= abs(sure[-1].offset_m)
+    named = added.effects[-1].effect.parameters(added.links, added.effects[-1].params, None)
+    assert list(named) == [f"true_minus_mapped_height_{roof.building}_m" for roof in sure]
+
+
+def test_a_map_that_is_right_stays(world):
+    links = world(MAPPED_M, 1)
+    model, fit, _ = fitted(links)
+    for params in RoofHeights().propose(model.view(fit)):
+        assert not [roof for roof in surely_off(params.roofs) if abs(roof.offset_m) > 1.0]
+
+
+def test_of_a_block_that_is_gone_nothing_is_said(world):
+    twin = make_bases(None, 0)["twin"].fit(world(MAPPED_M, 2))
+    model = FoldModel.build(world((0.0, *MAPPED_M[1:]), 2), twin.channel, 8.0)
+    for params in RoofHeights().propose(model.view(model.fit())):
+        assert np.isnan(offsets(params.roofs)[0][0])
+
+
+def test_only_links_over_a_roof_change_and_by_no_more_than_both_classes_differ(world):
+    links = world(MAPPED_M)
+    model, _, _ = fitted(links)
+    params = RoofHeights.Params(roofs=(Roof(_number((-80.0, -20.0)), -65.0, -5.0, 20.0, 5.0, 1.0),))
+    change_db = RoofHeights().term(links, params, model.level_at).offset_db
+    a_m, b_m = links.device_m[links.device], links.receiver_m
+    newly = blocked(a_m, b_m, (25.0, *MAPPED_M[1:])) & ~blocked(a_m, b_m, MAPPED_M)
+    far = (np.maximum(a_m[:, 0], b_m[:, 0]) < -82) | (np.minimum(a_m[:, 0], b_m[:, 0]) > -48)
+    assert newly.sum() > 10 and far.sum() > 100
+    assert (change_db[newly] < -3).mean() > 0.9 and change_db[newly].min() > -1.2 * BEHIND_DB
+    assert (change_db[far] == 0).all() and change_db.max() <= 0.5
+
+
+def _number(corner_m):
+    from radiotwin.effects.removed_obstacle import buildings
+
+    centres_m = buildings(city())[1]
+    return int(np.argmin(np.hypot(*(centres_m[:, :2] - np.add(corner_m, 15.0)).T)))
+
+
+def test_it_needs_a_map_a_frequency_and_the_map_that_it_was_found_on(world, make_links):
+    links = world(MAPPED_M)
+    assert RoofHeights().unavailable(links) is None
+    alone = make_links(np.array([[0.0, 0.0, 2.0]]), np.random.default_rng(0).uniform(20, 90, (50, 3)))
+    assert "no 3D map" in RoofHeights().unavailable(alone)
+    model, _, _ = fitted(links)
+    params = RoofHeights.Params(roofs=(Roof(99, 0.0, 0.0, 10.0, 2.0, 1.0),))
+    with pytest.raises(BadInput, match="building 99, but the map has"):
+        RoofHeights().term(links, params, model.level_at)
