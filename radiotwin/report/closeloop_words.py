@@ -129,9 +129,14 @@ def probability(value: float | None) -> str:
     return "> 0.99" if value > 0.99 else "< 0.01" if value < 0.01 else f"{value:.2f}"
 
 
+def _criteria(report: dict) -> dict[str, float]:
+    """Return the report's criteria; of version 0.1, today's."""
+    return SelectionCriteria().to_json() | report.get("criteria", {})
+
+
 def _counts(dependence: dict, report: dict) -> bool:
-    """Return whether a dependence meets the report's criteria; of version 0.1, today's."""
-    criteria = SelectionCriteria().to_json() | report.get("criteria", {})
+    """Return whether a dependence meets the report's criteria."""
+    criteria = _criteria(report)
     p_value, effect_db = dependence["p_value"], dependence.get("effect_db")
     return p_value is not None and p_value <= criteria["max_dependence_p_value"] and (
         effect_db is None or effect_db >= criteria["min_dependence_db"])
@@ -194,17 +199,28 @@ def _none(report: dict) -> str:
 
 
 def _unexplained(report: dict) -> str:
-    found: list[dict] = next((each["probabilities"] for each in report["posterior"]), [])
-    if not found or found[0]["name"] == OTHER:
-        text = f"Something is missing that no effect of the catalogue explains{_of(report, OTHER)}"
-    else:  # the base is wrong by places, whatever its likeliest cause
-        likely = _likely([each for each in found if each["name"] != NONE])
-        text = "Something is missing, and no name for it is probable enough"
-        text += f" (likeliest: {likely})" if likely else ""
-    text += f": the residual is {number(report['error']['before']['rmse_db'])} dB RMSE"
+    step = next(iter(report["posterior"]), None)
+    if step and step["probabilities"] and step["probabilities"][0]["name"] != OTHER:
+        return _too_much_of_places(report, step)
+    return (f"Something is missing that no effect of the catalogue explains{_of(report, OTHER)}: "
+            f"the {_residual(report)} {_sizes(report)}").strip()
+
+
+def _too_much_of_places(report: dict, step: dict) -> str:
+    """Say that no cause is the likeliest, and that more belongs to places than "none" allows."""
+    most_db = _criteria(report)["max_rest_db"]
+    shadowing = "Correlated shadowing does this, too, as do errors of the map and of its materials"
+    return (f"Unexplained: about {number(step['rest_db'])} dB of what the base misses belong to "
+            f"places, and beyond {most_db:g} dB it is not said that nothing is missing. "
+            f"{shadowing}. Likeliest: {_likely(step['probabilities'])}. About "
+            f"{number(step['noise_db'])} dB belong to single readings. "
+            f"The {_residual(report)}")
+
+
+def _residual(report: dict) -> str:
     names = drivers(report)
-    text += f" and depends on {join_names(names)}." if names else "."
-    return f"{text} {_sizes(report)}".strip()
+    depends = f" and depends on {join_names(names)}" if names else ""
+    return f"residual is {number(report['error']['before']['rmse_db'])} dB RMSE{depends}."
 
 
 def _undecided(report: dict) -> str:
