@@ -209,7 +209,8 @@ def _unexplained(report: dict) -> str:
 def _too_much_of_places(report: dict, step: dict) -> str:
     """Say that no cause is the likeliest, and that more belongs to places than "none" allows."""
     most_db = _criteria(report)["max_rest_db"]
-    shadowing = "Correlated shadowing does this, too, as do errors of the map and of its materials"
+    shadowing = "Correlated shadowing does this, too"
+    shadowing += ", as do errors of the map and of its materials" * _has_map(report)
     return (f"Unexplained: about {number(step['rest_db'])} dB of what the base misses belong to "
             f"places, and beyond {most_db:g} dB it is not said that nothing is missing. "
             f"{shadowing}. Likeliest: {_likely(step['probabilities'])}. About "
@@ -253,9 +254,17 @@ def _sizes(report: dict) -> str:
     step = report["posterior"][-1] if report["posterior"] else None
     if step is None or step["rest_db"] is None:
         return ""
+    alike = ("errors of the map and of its materials do" if _has_map(report) else
+             "shadowing does")
     return (f"Of what the base misses about {number(step['rest_db'])} dB belong to places, as "
-            "errors of the map and of its materials do, and about "
-            f"{number(step['noise_db'])} dB to single readings.")
+            f"{alike}, and about {number(step['noise_db'])} dB to single readings.")
+
+
+def _has_map(report: dict) -> bool:
+    """Return whether a 3D map was given: without one, every link counts as one with sight."""
+    hidden = report["error"].get("by_los", {}).get("nlos")
+    given = (report.get("inputs") or {}).get("scene") or report["base"] == "raytrace"
+    return bool(given or (hidden and hidden["before"]["n"]))
 
 
 def _cause(name: str) -> str:

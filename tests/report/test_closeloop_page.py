@@ -62,8 +62,7 @@ def page(content, folder):
      "To settle it: fly around the device at one distance and one height.", "undecided"),
     ("unexplained",
      "Unexplained: about 3.50 dB of what the base misses belong to places, and beyond 3 dB it is not said that nothing is "
-     "missing. Correlated shadowing does this, too, as do errors of the map and of its materials. Likeliest: nothing is missing "
-     "(0.70) and antenna pattern (0.29). About "
+     "missing. Correlated shadowing does this, too. Likeliest: nothing is missing (0.70) and antenna pattern (0.29). About "
      "1.25 dB belong to single readings. The residual is 3.00 dB RMSE and depends on time in flight.",
      "unexplained")])
 def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
@@ -172,6 +171,15 @@ def test_something_without_a_likely_name_is_missing():
     unnamed = report("unexplained")
     unnamed["posterior"][0]["probabilities"] = [{"name": "not in the catalogue", "probability": 0.9}]
     assert "missing that no effect of the catalogue explains (probability 0.90): the residual" in closeloop_summary(unnamed)
+
+
+@pytest.mark.parametrize("verdict", ["none", "undecided", "unexplained"])
+def test_errors_of_a_map_are_spoken_of_where_there_is_one(verdict):
+    without = report(verdict, base="log-distance")
+    hidden = {"by_los": {"nlos": {"before": SCORES, "after": SCORES}}}
+    assert "the map" not in closeloop_summary(without) and "shadowing does" in closeloop_summary(without)
+    for given in ({"inputs": {"scene": "city"}}, {"base": "raytrace"}, {"error": without["error"] | hidden}):
+        assert "errors of the map and of its materials" in closeloop_summary(without | given)
 
 
 def test_a_last_resort_is_not_called_an_explanation(tmp_path):
