@@ -9,6 +9,7 @@ from radiotwin.report.labels import INTERPOLATIONS, join_names, name_label, vari
 MAX_NAMED = 4  # variables or effects in a sentence
 MIN_DIFFERENCE_DB = 0.5  # of two receivers, to be worth a word: instruments' tolerance
 SURE = 0.9  # a cause that is less probable is said to be probable only
+HALF = 0.5  # more probable than not
 LIKELY = 0.05  # a cause that is less probable is not worth a word
 BADGES = {"effect": "found: ", "none": "no cause found", "unexplained": "unexplained",
           "undecided": "undecided"}
@@ -189,9 +190,20 @@ def _effect(report: dict) -> str:
     falls = "falls" if after < before else "goes"
     text = (f"The model {lacked} {join_names(causes)}{sure}. With {it} the RMSE on held-out links "
             f"{falls} from {number(before)} to {number(after)} dB.")
+    left = _unnamed_beside(report)
+    if left is not None:
+        text += f" Beside {it} something is left that has no name (probability {probability(left)})."
     if report["remaining"]["drivers"]:
         text += f" The remaining residual depends on {join_names(drivers(report))}."
     return text
+
+
+def _unnamed_beside(report: dict) -> float | None:
+    """Return how probable it is that something without a name is left; None where it is not."""
+    found = report["posterior"][-1]["probabilities"] if report["posterior"] else []
+    if not found or found[0]["name"] != OTHER:
+        return None
+    return found[0]["probability"] if (found[0]["probability"] or 0.0) >= HALF else None
 
 
 def _none(report: dict) -> str:

@@ -173,6 +173,14 @@ def test_something_without_a_likely_name_is_missing():
     assert "missing that no effect of the catalogue explains (probability 0.90): the residual" in closeloop_summary(unnamed)
 
 
+@pytest.mark.parametrize("likelihood, is_said", [(0.87, True), (0.49, False)])
+def test_what_is_left_without_a_name_beside_the_effects_is_said(likelihood, is_said):
+    found = report()
+    found["posterior"].append(found["posterior"][0] | {"step": 2, "probabilities": [
+        {"name": "not in the catalogue", "probability": likelihood}, {"name": "none", "probability": 1 - likelihood}]})
+    assert ("Beside it something is left that has no name (probability 0.87)." in closeloop_summary(found)) == is_said
+
+
 @pytest.mark.parametrize("verdict", ["none", "undecided", "unexplained"])
 def test_errors_of_a_map_are_spoken_of_where_there_is_one(verdict):
     without = report(verdict, base="log-distance")
