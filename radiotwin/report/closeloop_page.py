@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from radiotwin.closeloop.result_file import check_report
+from radiotwin.display.summary import count
 from radiotwin.report import closeloop_words as words
 from radiotwin.report.html import Table, read_picture, write_page
 from radiotwin.report.labels import (
@@ -94,7 +95,8 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
             [[name_label(each["name"]), f"{words.number(each['size'])} {each['unit']}",
               each["pattern"]] for each in report["detectable"]]),
         "side_by_side": words.side_by_side(report),
-        "trials": f"{len(candidates)} trials in {len({c['step'] for c in candidates})} steps",
+        "trials": f"{count(len(candidates), 'trial')} in "
+                  f"{count(len({c['step'] for c in candidates}), 'step')}",
         "candidates": _candidate_table(candidates),
         "remaining": Table(
             ("variable", "standard deviation of the mean residual over it [dB]", "p, corrected"),

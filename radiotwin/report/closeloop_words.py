@@ -178,14 +178,15 @@ def _effect(report: dict) -> str:
                  if each["kept"] and each["name"] not in INTERPOLATIONS]
     interpolated = any(each["name"] in INTERPOLATIONS for each in report["effects"])
     after = explained[-1] if explained and interpolated else error["after"]["rmse_db"]
-    it = "it" if len(causes) == 1 else "them"
     found = _causes(report)
+    it = "it" if len(found) == 1 else "them"  # one kind may have been found twice
     known = [each["probability"] for each in found if each.get("probability") is not None]
     lacked, sure = "lacked", ""
     if not is_sure(report):
         lacked = "probably lacked"
         if len(known) == len(found):
-            sure = f" (probability {probability(min(known))}{' and more' * (len(causes) > 1)})"
+            rest = "" if len(found) == 1 else " each" if min(known) == max(known) else " and more"
+            sure = f" (probability {probability(min(known))}{rest})"
     before = error["before"]["rmse_db"]
     falls = "falls" if after < before else "goes"
     text = (f"The model {lacked} {join_names(causes)}{sure}. With {it} the RMSE on held-out links "

@@ -96,6 +96,7 @@ def test_names_from_the_data_are_no_markup(tmp_path):
 def test_the_figures_that_planners_judge_by_stand_in_one_table_with_the_other_models(tmp_path):
     text = page(report(), tmp_path)
     table = text[text.index("Error before and after"):text.index("by device, receiver and flight")]
+    assert "2 trials in 1 step<" in text
     for words in ("bias [dB]", "standard deviation [dB]", "correlation", "log-distance law", "7.00",
                   "regression kriging", "5.50", "median db"):
         assert words in table
@@ -148,6 +149,8 @@ def test_what_is_not_sure_is_said_to_be_probable(tmp_path):
     assert "probably lacked receiver drift and foliage (probability 0.60 and more). With them" \
         in closeloop_summary(report(effects=both))
     assert "The model lacked receiver drift. With it" in closeloop_summary(report(effects=both[:1]))
+    twice = [DRIFT | {"rank": rank, "probability": 0.78} for rank in (1, 2)]
+    assert "lacked receiver drift (2 times) (probability 0.78 each). With them" in closeloop_summary(report(effects=twice))
 
 
 def test_rivals_are_those_of_the_step_at_which_the_cause_was_found(tmp_path):
