@@ -230,7 +230,13 @@ def test_a_figure_outside_the_folder_is_not_read(tmp_path):
         page(stranger, folder)
 
 
+def test_what_remains_is_said_to_be_that_before_it_is_interpolated(tmp_path):
+    before = "With the named effects, and before anything was interpolated, the residual depends on:"
+    assert before in page(report("unexplained"), tmp_path) and before not in page(report(), tmp_path)
+
+
 def test_names_in_words():
+    assert parameter_label("share") == "share that belongs to places"  # its unit is "of the variance"
     assert parameter_label("tilt_deg[uav1]") == "tilt (uav1)" and parameter_label("odd_thing_db") == "odd thing"
     assert variable_label("time_in_flight_s") == ("time in flight", "s")
     assert variable_label("odd_length_m") == ("odd length", "m")
