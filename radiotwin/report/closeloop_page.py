@@ -109,7 +109,7 @@ def _cards(report: dict) -> list[tuple[str, str]]:
     cards = []
     prediction = report.get("prediction")
     if prediction:
-        cards.append(("best prediction, RMSE",
+        cards.append(("all that was learnt together, RMSE",
                       f"{words.number(prediction['combined_rmse_db'])} dB"))
         inside = (report["error"].get("combined") or {}).get("in_90_percent_interval")
         if inside is not None:
@@ -205,6 +205,8 @@ def _facts(report: dict) -> list[str]:
 
 
 def _value(parameter: dict) -> str:
+    if words.is_reference(parameter):
+        return "0 (reference)"
     known = parameter.get("determined", True)
     return words.number(parameter["value"]) if known else "not determined"
 

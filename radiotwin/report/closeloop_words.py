@@ -110,6 +110,11 @@ def drivers(report: dict) -> list[str]:
     return [variable_label(each["variable"])[0] for each in found[:MAX_NAMED]]
 
 
+def is_reference(parameter: dict) -> bool:
+    """Return whether a parameter is that of the member which the others are compared with."""
+    return parameter["value"] == parameter["low"] == parameter["high"] == 0
+
+
 def number(value: float | None) -> str:
     """Return a number as a page shows it."""
     if value is None:

@@ -7,6 +7,7 @@ from io import BytesIO
 import pytest
 from matplotlib.figure import Figure
 
+from radiotwin.cli import loop
 from radiotwin.errors import BadInput
 from radiotwin.report.closeloop_page import write_closeloop_page
 from radiotwin.report.closeloop_words import closeloop_summary, drivers, rivals
@@ -134,6 +135,23 @@ def test_receivers_that_were_at_the_same_places_are_compared(tmp_path, ends, sen
     assert (sentence in closeloop_summary(content)) == in_lead
 
 
+def test_the_member_that_others_are_compared_with_is_marked_and_no_table_is_empty(tmp_path, monkeypatch):
+    offsets = {f"offset_db[{name}]": {"value": value, "low": value - width, "high": value + width, "unit": "dB"}
+               for name, value, width in (("a", 0.0, 0.0), ("b", 3.0, 0.5))}
+    found = report(effects=[DRIFT | {"name": "receiver_gain_offset", "probability": 0.9, "parameters": offsets}])
+    text = page(found, tmp_path)
+    assert re.search(r"offset \(a\)</td><td>0 \(reference\)</td><td>–</td>", text)
+    assert not re.search(r"</th></tr>\s*</table>", page(report(effects=[DRIFT | {"parameters": {}, "probability": 0.9}]), tmp_path))
+    printed = {}
+    monkeypatch.setattr(loop, "print_rows", lambda title, columns, rows: printed.update({title: rows}))
+    error = {"error": report()["error"] | {"by_los": {}}, "baselines": {}}
+    loop._print(found | error)
+    assert [row[2] for row in printed["Added to the base"]] == ["reference", 3.0]
+    printed.clear()
+    loop._print(report("none") | error)
+    assert len(printed) == 1  # of errors
+
+
 def test_numbers_that_are_not_known_are_dashes(tmp_path):
     unknown = report("none", baselines={"log_distance": NOTHING}, dependences_before=[])
     unknown["error"] |= {"before": NOTHING, "after": NOTHING}
@@ -249,5 +267,6 @@ def test_the_page_tells_how_far_intervals_can_be_trusted(tmp_path):
     error = report()["error"] | {"combined": SCORES | {"rmse_db": 1.9, "in_90_percent_interval": 0.874}}
     text = page(report(prediction=prediction, error=error), tmp_path)
     assert "held-out readings in its 90 % intervals" in text and "87 %" in text
+    assert "<span>all that was learnt together, RMSE</span><b>1.90 dB</b>" in text
     error["combined"] = SCORES  # of a file that was written before
     assert "in its 90 % intervals" not in page(report(prediction=prediction, error=error), tmp_path)
