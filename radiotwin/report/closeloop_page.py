@@ -93,7 +93,8 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         "detectable": Table(
             ("effect", "would have been named from", "what its size is"),
             [[name_label(each["name"]), f"{words.number(each['size'])} {each['unit']}",
-              each["pattern"]] for each in report["detectable"]]),
+              each["pattern"]] for each in report["detectable"] if each["size"] is not None]),
+        "undetectable": words.undetectable(report),
         "side_by_side": words.side_by_side(report),
         "trials": f"{count(len(candidates), 'trial')} in "
                   f"{count(len({c['step'] for c in candidates}), 'step')}",

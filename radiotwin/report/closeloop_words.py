@@ -89,13 +89,10 @@ def rivals(report: dict) -> str:
     return text + (f"What else it may be: {join_names(likely[:MAX_NAMED])}." if likely else "")
 
 
-def detectable(report: dict) -> str:
-    """Say how large effects would have had to be, to be named."""
-    named = {each["name"] for each in report["effects"]}
-    sizes = [f"{name_label(each['name'])} {each['pattern']}: {number(each['size'])} {each['unit']}"
-             for each in report["detectable"]
-             if each["size"] is not None and each["name"] not in named]
-    return "; ".join(sizes)
+def undetectable(report: dict) -> str:
+    """Say which effects would not have been named at any size that they may have; else empty."""
+    names = [name_label(each["name"]) for each in report["detectable"] if each["size"] is None]
+    return f"Not to be seen at any size that they may have: {join_names(names)}." if names else ""
 
 
 def side_by_side(report: dict) -> list[str]:
@@ -198,7 +195,8 @@ def _effect(report: dict) -> str:
             f"{falls} from {number(before)} to {number(after)} dB.")
     left = _unnamed_beside(report)
     if left is not None:
-        text += f" Beside {it} something is left that has no name (probability {probability(left)})."
+        text += (f" Beside {it} something is left that has no name (probability "
+                 f"{probability(left)}).")
     if report["remaining"]["drivers"]:
         text += f" The remaining residual depends on {join_names(drivers(report))}."
     return text

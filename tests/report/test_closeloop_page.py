@@ -253,6 +253,14 @@ def test_what_remains_is_said_to_be_that_before_it_is_interpolated(tmp_path):
     assert before in page(report("unexplained"), tmp_path) and before not in page(report(), tmp_path)
 
 
+def test_an_effect_that_no_size_would_have_shown_is_no_row(tmp_path):
+    unseen = {"name": "episode", "size": None, "unit": "dB", "pattern": "over 10 % of the time"}
+    text = page(report(detectable=[*report()["detectable"], unseen]), tmp_path)
+    assert "Not to be seen at any size that they may have: episode." in text and "– dB" not in text
+    text = page(report(detectable=[unseen]), tmp_path)
+    assert "may have: episode." in text and "would have been named from" not in text
+
+
 def test_names_in_words():
     assert parameter_label("share") == "share that belongs to places"  # its unit is "of the variance"
     assert parameter_label("tilt_deg[uav1]") == "tilt (uav1)" and parameter_label("odd_thing_db") == "odd thing"
