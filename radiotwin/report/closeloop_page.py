@@ -187,13 +187,19 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
 
 
 def _candidate_table(candidates: list[dict]) -> Table:
-    rows = [[c["step"], name_label(c["name"]), "kept" if c["kept"] else c["reason"],
+    rows = [[c["step"], _with_variant(c), "kept" if c["kept"] else c["reason"],
              words.probability(c.get("probability")), words.number(c["heldout_rmse_db"]),
              words.number(c.get("evidence_nats")), words.number(c["heldout_nll_gain"])]
             for c in candidates]
     return Table(("step", "effect", "kept, or why not", "probability", "held-out RMSE [dB]",
                   "evidence [nats]", "held-out gain [nats]"), rows, "", 3,
                  {number for number, c in enumerate(candidates) if c["kept"]})
+
+
+def _with_variant(candidate: dict) -> str:
+    """Return the name of a candidate, of which there may be several forms."""
+    name, variant = name_label(candidate["name"]), candidate.get("variant")
+    return f"{name}: {variant}" if variant else name
 
 
 def _facts(report: dict) -> list[str]:

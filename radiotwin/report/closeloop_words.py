@@ -246,11 +246,31 @@ def _undecided(report: dict) -> str:
     if step is None:
         return text
     text += f" Likeliest: {_likely(step['probabilities'])}."
-    advice = [SETTLES[each["name"]] for each in step["probabilities"]
+    advice = [_settles(each["name"], step["step"], report) for each in step["probabilities"]
               if (each["probability"] or 0) >= LIKELY and each["name"] in SETTLES]
     if advice:
         text += f" To settle it: {'; '.join(dict.fromkeys(advice[:2]))}."
     return f"{text} {_sizes(report)}".strip()
+
+
+def _settles(name: str, step: int, report: dict) -> str:
+    """Say what would settle whether an effect is there, and of which device or receiver."""
+    tried = [each for each in report["candidates"]
+             if each["name"] == name and each["step"] == step]
+    best = max(tried, key=lambda each: each.get("probability") or 0.0, default={})
+    for end in ("device", "receiver"):
+        names = best.get(f"{end}s") or []
+        if not names:
+            continue
+        shown = ", ".join(names[:MAX_NAMED]) + " and others" * (len(names) > MAX_NAMED)
+        who = f"{end}{'s' * (len(names) > 1)} {shown}"
+        # The antenna of a receiver turns with it.
+        turns = name == "antenna_pattern" and end == "receiver"
+        text = SETTLES["body_shadowing" if turns else name]
+        if end == "device" and len(names) == 1 and "the device" in text:
+            return text.replace("the device", who)
+        return f"{text} ({who})"
+    return SETTLES[name]
 
 
 def _likely(probabilities: list[dict]) -> str:

@@ -73,6 +73,17 @@ def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
     assert not re.search(r'(src|href)="(?!data:)|https?://|<script', text)  # one file, no network
 
 
+@pytest.mark.parametrize("ends, sentence", [
+    ({"devices": ["n3"]}, "fly around device n3 at one distance"),
+    ({"devices": ["n3", "n4"]}, "fly around the device at one distance and one height (devices n3, n4)."),
+    ({"receivers": ["uav0"]}, "fly the same track in both directions (receiver uav0).")])
+def test_what_would_settle_it_names_the_end(tmp_path, ends, sentence):
+    tried = report()["candidates"][0] | {"name": "antenna_pattern", "variant": "of some kind", "probability": 0.4, "kept": False}
+    found = report("undecided", candidates=[tried, tried | ends | {"probability": 0.45}])
+    assert f"To settle it: {sentence}" in closeloop_summary(found)
+    assert "antenna pattern: of some kind</td>" in page(found, tmp_path)
+
+
 def test_only_what_meets_the_criteria_is_said_to_matter():
     chance, weak, strong = ({"variable": name, "p_value": p_value, "effect_db": effect_db} for name, p_value, effect_db in (
         ("distance_m", 1.0, 2.0), ("altitude_m", 0.001, 0.1), ("time_in_flight_s", 0.001, 1.5)))
