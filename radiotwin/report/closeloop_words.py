@@ -84,8 +84,11 @@ def rivals(report: dict) -> str:
               if each["name"] not in named}
     left = 1.0 - report["effects"][first - 1]["probability"]
     share = min(1.0, left / max(sum(others.values()), 1e-9))
-    likely = [f"{_cause(name)} {probability(share * each)}" for name, each in others.items()
-              if share * each >= LIKELY]
+    same = report["effects"][first - 1].get("indistinguishable_from", [])
+    # A number would say that the data can tell them apart.
+    likely = [f"{name_label(name)} (the data cannot tell them apart)" for name in same]
+    likely += [f"{_cause(name)} {probability(share * each)}" for name, each in others.items()
+               if share * each >= LIKELY and name not in same]
     return text + (f"What else it may be: {join_names(likely[:MAX_NAMED])}." if likely else "")
 
 
