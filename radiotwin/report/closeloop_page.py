@@ -191,8 +191,8 @@ def _candidate_table(candidates: list[dict]) -> Table:
              words.probability(c.get("probability")), words.number(c["heldout_rmse_db"]),
              words.number(c.get("evidence_nats")), words.number(c["heldout_nll_gain"])]
             for c in candidates]
-    return Table(("step", "effect", "kept, or why not", "probability", "held-out RMSE [dB]",
-                  "evidence [nats]", "held-out gain [nats]"), rows, "", 3,
+    return Table(("step", "effect", "kept, or why not", "probability by itself",
+                  "held-out RMSE [dB]", "evidence [nats]", "held-out gain [nats]"), rows, "", 3,
                  {number for number, c in enumerate(candidates) if c["kept"]})
 
 

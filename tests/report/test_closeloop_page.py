@@ -126,7 +126,8 @@ def test_how_probable_it_is_and_what_would_have_been_seen_is_said(tmp_path):
     text = page(report(effects=[DRIFT | {"probability": 0.6, "size_db": {
         "value": 4.0, "low": 3.0, "high": 5.0, "unit": "dB", "determined": True}}]), tmp_path)
     assert "Probability that it is there: receiver drift 0.60." in text
-    assert "What else it may be: nothing is missing 0.28 and antenna pattern 0.12." in text  # 0.4 are left
+    assert "What else it may be: receiver gain offset (the data cannot tell them apart), nothing is missing 0.28 and antenna " \
+        "pattern 0.12." in text  # 0.4 are left
     assert "by 4.00 dB (RMS; 90 % interval 3.00 to 5.00)" in text
     assert "would have been named from" in text and "4.20 dB/km" in text
     assert "belong to places" in closeloop_summary(report("none"))
@@ -189,6 +190,12 @@ def test_rivals_are_those_of_the_step_at_which_the_cause_was_found(tmp_path):
     found["posterior"][0]["step"] = 2
     text = rivals(found)
     assert text == "Probability that it is there: episode 0.70 and receiver drift 0.80. "
+
+
+def test_a_rival_that_the_data_cannot_tell_from_it_has_no_number_beside_it():
+    found = report(effects=[DRIFT | {"probability": 0.6, "indistinguishable_from": ["antenna_pattern"]}])
+    assert rivals(found).endswith("What else it may be: antenna pattern (the data cannot tell them apart) and nothing is "
+                                  "missing 0.28.")
 
 
 def test_a_step_between_flights_has_no_probability_and_is_called_probable(tmp_path):
@@ -257,6 +264,11 @@ def test_a_figure_outside_the_folder_is_not_read(tmp_path):
     os.truncate(folder / "waterfall.png", 2**34)
     with pytest.raises(BadInput, match="bytes; at most .* RADIOTWIN_MAX_PICTURE_BYTES"):
         page(stranger, folder)
+
+
+def test_the_two_probabilities_of_one_effect_are_told_apart(tmp_path):
+    text = page(report("undecided"), tmp_path)
+    assert "probability by itself" in text and "competes with others" in text and "sum to 1" in text
 
 
 def test_what_remains_is_said_to_be_that_before_it_is_interpolated(tmp_path):
