@@ -260,7 +260,7 @@ def _settles(name: str, step: int, report: dict) -> str:
     """Say what would settle whether an effect is there, and of which device or receiver."""
     tried = [each for each in report["candidates"]
              if each["name"] == name and each["step"] == step]
-    best = max(tried, key=lambda each: each.get("probability") or 0.0, default={})
+    best: dict = max(tried, key=lambda each: each.get("probability") or 0.0, default={})
     for end in ("device", "receiver"):
         names = best.get(f"{end}s") or []
         if not names:
