@@ -75,14 +75,23 @@ def say(message: str) -> None:
 
 
 def show_warnings_plainly() -> None:
-    """Show warnings of both packages as one line each, without source lines, and no others."""
+    """Show warnings of both packages as one line each, once, without source lines, and no others.
+
+    Each model that is fitted to the same measurements says the same of them.
+    """
+    shown: set[str] = set()
+
     def show(message: Warning | str, category: type[Warning], filename: str, lineno: int,
              file: TextIO | None = None, line: str | None = None) -> None:
         path = filename.replace("\\", "/")
         if issubclass(category, UserWarning) and ("/radiotwin/" in path or "/marl/" in path):
+            text = printable(str(message))
+            if text in shown:
+                return
+            shown.add(text)
             with suppress(OSError):
                 error_console.print("[yellow]warning:[/] ", end="")
-                error_console.print(printable(str(message)), markup=False, soft_wrap=True)
+                error_console.print(text, markup=False, soft_wrap=True)
 
     warnings.showwarning = show
     if logging.lastResort is not None:  # of libraries that log; nothing else sets up logging

@@ -53,6 +53,16 @@ def test_messages_warnings_logs_and_tables(out, capsys, monkeypatch):
         assert SHOWN in text and not set(text) & set("\x1b\x07\x9b\x7f\r\u202e\u2066\u2028\udcff")
 
 
+def test_a_warning_of_each_of_many_models_is_shown_once_in_a_command(out, monkeypatch):
+    monkeypatch.setattr(warnings, "showwarning", warnings.showwarning)
+    for _ in range(2):  # commands
+        show_warnings_plainly()
+        for line in (1, 2, 1):
+            for text in ("the limit is not used", "another"):
+                warnings.showwarning(UserWarning(text), UserWarning, "/x/radiotwin/y.py", line)
+    assert out.getvalue().split("\n") == 2 * ["warning: the limit is not used", "warning: another"] + [""]
+
+
 def test_a_table_is_cut_nowhere(monkeypatch):
     """In a pipe a line is as long as it needs to be; on a narrow terminal a cell goes on in its next line."""
     words = ["a" * 70, "b" * 60]

@@ -107,12 +107,22 @@ def _print(report: dict[str, Any]) -> None:
     print_rows(
         f"Error on held-out links (by {report['heldout']['by']}) [dB], base {report['base']}",
         {"links": "left", "": "left", "RMSE": "right", "MAE": "right", "bias": "right"}, rows)
-    rows = [[effect["name"], name,
-             _number(estimate["value"]) if estimate.get("determined", True) else "not determined",
-             *(_number(estimate[key]) for key in ("low", "high")), estimate["unit"]]
+    rows = [[effect["name"], name, *_estimate(estimate), estimate["unit"]]
             for effect in report["effects"] for name, estimate in effect["parameters"].items()]
-    print_rows("Effects found", {"effect": "left", "parameter": "left", "value": "right",
-                                 "low": "right", "high": "right", "unit": "left"}, rows)
+    if rows:
+        print_rows("Added to the base", {
+            "effect": "left", "parameter": "left", "value": "right", "low": "right",
+            "high": "right", "unit": "left"}, rows)
+
+
+def _estimate(estimate: dict[str, Any]) -> list[float | str]:
+    """Return value and interval as the table shows them."""
+    from radiotwin.report.closeloop_words import is_reference
+
+    if is_reference(estimate):
+        return ["reference", float("nan"), float("nan")]
+    value, low, high = (_number(estimate[key]) for key in ("value", "low", "high"))
+    return [value if estimate.get("determined", True) else "not determined", low, high]
 
 
 def _number(value: float | None) -> float:

@@ -107,7 +107,7 @@ def _unless_outdone(fault: Candidate, lasting: list[Candidate],
                   and each.gain >= fault.gain and _acts(each)[here].mean() >= MIN_SHARED), None)
     if rival is None:
         return fault
-    return CandidateScore(fault.effect.name, step=step, reason=(
+    return CandidateScore(fault.effect.name, step=step, variant=fault.effect.variant, reason=(
         f"{rival.effect.name} explains as much: {rival.gain:.0f} nats of the links that it is "
         f"fitted to, and this {fault.gain:.0f}"))
 

@@ -50,11 +50,13 @@ def make_report(loop: Loop) -> dict[str, Any]:
                        selection.rivals, strict=True), start=1)]
     if loop.after.shadowing:
         effects.append(_shadowing(kept[-1], loop.after, len(effects) + 1))
-    candidates = [{"name": score.name, "step": score.step + 1, "heldout_rmse_db": score.rmse_db,
+    candidates = [{"name": score.name, "variant": score.variant, "step": score.step + 1,
+                   "heldout_rmse_db": score.rmse_db,
                    "heldout_nll_gain": score.nll_gain, "p_value": score.p_value, "kept": score.kept,
                    "reason": score.reason, "passed": score.passed,
                    "evidence_nats": score.evidence_nats, "features": list(score.features),
-                   "probability": score.probability}
+                   "probability": score.probability,
+                   "devices": list(score.devices), "receivers": list(score.receivers)}
                   for score in selection.scores]
     links = loop.after.links
     error: dict[str, Any] = {"before": scores(loop.before), "after": scores(loop.after),

@@ -81,6 +81,7 @@ class CandidateRecord(Record):
     """An effect that was tried, or that the data do not allow to be looked for."""
 
     name: str
+    variant: str = ""
     step: Whole
     heldout_rmse_db: Number | None
     heldout_nll_gain: Number | None
@@ -91,6 +92,8 @@ class CandidateRecord(Record):
     passed: bool = False
     features: list[Number | None] = Field(default_factory=list)
     probability: Number | None = None
+    devices: list[str] = Field(default_factory=list)
+    receivers: list[str] = Field(default_factory=list)
 
 
 class WeightRecord(Record):

@@ -8,10 +8,11 @@ import numpy as np
 
 from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.closeloop.ends import ends_of
 from radiotwin.closeloop.hypotheses import Hypotheses, is_judged_by_levels
 from radiotwin.effects.base import Effect
 from radiotwin.effects.fitting import add_effect
-from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.fold_model import FittedEffect, FoldModel
 from radiotwin.effects.params import EffectParams
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.evidence import cross_fit_p_value, sign_flip_p_value
@@ -44,6 +45,9 @@ class CandidateScore:
             where it was not tried.
         probability: that it is there.
         params: as fitted to all links; None where it was not tried.
+        variant: of the effect.
+        devices: names of those that `params` belong to, see `ends_of`.
+        receivers: the same of receivers.
     """
 
     name: str
@@ -60,6 +64,9 @@ class CandidateScore:
     features: tuple[float, ...] = ()
     probability: float = np.nan
     params: EffectParams | None = None
+    variant: str = ""
+    devices: tuple[str, ...] = ()
+    receivers: tuple[str, ...] = ()
 
     @property
     def held_out_nats(self) -> float:
@@ -98,7 +105,7 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
         criteria: that decide.
         hypotheses: about what the model lacks; None: not to be looked at.
     """
-    refused = CandidateScore(effect.name, step=step)
+    refused = CandidateScore(effect.name, step=step, variant=effect.variant)
     whole = add_effect(model.whole, effect, model.fits[0])
     if whole is None:
         return replace(refused, reason="nothing in the residual looks like it")
@@ -134,6 +141,9 @@ def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.
         the score, and the model with it; None where it does not pass.
     """
     models, fits = [candidate.whole], [candidate.fit]
+    fitted = FittedEffect(candidate.effect, candidate.whole.effects[-1].params,
+                          candidate.fit.coefficients[candidate.whole.coefficient_slices[-1]])
+    devices, receivers = ends_of(fitted, model.links)
     like = candidate.whole.effects[-1].params
     for each, fit in zip(model.folds, model.fits[1:], strict=True):
         extended_fold, extended_fit = add_effect(each, candidate.effect, fit, like) or (each, fit)
@@ -141,7 +151,8 @@ def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.
         fits.append(extended_fit)
     extended = model.extended(models, fits)
     score = CandidateScore(candidate.effect.name, step=step, evidence_nats=candidate.evidence,
-                           params=like)
+                           params=like, variant=candidate.effect.variant, devices=devices,
+                           receivers=receivers)
     score = score_model(model, extended, score, block, tried, seed, criteria,
                         nlos_only=candidate.effect.nlos_only)
     return score, None if score.reason else extended

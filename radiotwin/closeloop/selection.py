@@ -106,7 +106,8 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
     for effect in effects:
         why = effect.unavailable(result.model.links)
         if why:
-            result.scores.append(CandidateScore(effect.name, reason=f"not looked for: {why}"))
+            result.scores.append(CandidateScore(effect.name, reason=f"not looked for: {why}",
+                                                variant=effect.variant))
         else:
             available.append(effect)
     causes = all(effect.is_cause for effect in effects)
@@ -192,7 +193,8 @@ def _score(result: SelectionResult, candidates: list[Candidate], available: list
             why = (f"{better.score.name} gains more on held-out links than this on those that it "
                    f"is fitted to ({candidate.gain:.0f} nats)")
             score, extended = CandidateScore(effect.name, reason=why, step=step,
-                                             evidence_nats=candidate.evidence), None
+                                             evidence_nats=candidate.evidence,
+                                             variant=effect.variant), None
             outdone.append((candidate, score))
         result.scores.append(score)
         if extended is not None:

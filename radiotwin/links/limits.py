@@ -138,7 +138,7 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
     """
     declared = -np.inf if declared_db is None else declared_db
     apart = _says_nothing(links, declared)
-    if apart:
+    if apart is not None:
         declared = -np.inf
     count = np.bincount(links.receiver, minlength=len(links.receiver_names))
     rows = np.split(np.argsort(links.receiver, kind="stable"), np.cumsum(count)[:-1])
@@ -160,11 +160,14 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
         else:
             lost.append(receiver)
     notes = _notes(links, rows, own_db, found, declared, lost)
-    return own_db[links.receiver], [*apart, *notes]
+    if apart is not None:
+        used = _used_instead(links, own_db, found, list(range(len(rows))))
+        notes.insert(0, f"{apart}. {used}")
+    return own_db[links.receiver], notes
 
 
-def _says_nothing(links: LinkData, declared_db: float) -> list[str]:
-    """Return why a declared limit is not looked at, a sentence; empty where it may be right.
+def _says_nothing(links: LinkData, declared_db: float) -> str | None:
+    """Return why a declared limit is not looked at, a sentence; None where it may be right.
 
     Signals of all levels arrive, so where some are too weak others are just strong enough. A limit
     far below all readings stands for "not known", and blanks below it would be impossible.
@@ -172,13 +175,19 @@ def _says_nothing(links: LinkData, declared_db: float) -> list[str]:
     readings, lowest_db = int(np.isfinite(links.level_db).sum()), _lowest_db(links.level_db)
     blanks = len(links) - readings
     if not np.isfinite(declared_db) or not readings or blanks < MIN_BLANKS:
-        return []
+        return None
     if lowest_db - declared_db < FAR_DB:
-        return []
-    unit = links.level_unit
-    return [f"the declared limit of detection, {declared_db:g} {unit}, is not used: but for odd "
-            f"ones, the weakest of {readings:,} readings is {lowest_db:g} {unit}, far above it, "
-            f"though {blanks:,} links are blank"]
+        return None
+    return (f"{_declared(links, declared_db)} is not used: but for odd ones, the weakest of "
+            f"{readings:,} readings is {lowest_db:g} {links.level_unit}, far above it, though "
+            f"{blanks:,} links are blank")
+
+
+def _declared(links: LinkData, declared_db: float) -> str:
+    """Name a declared limit by its value and by where it is declared."""
+    of = "sensitivity_dbm less tx_power_dbm" if links.is_gain else "sensitivity_dbm"
+    return (f"the declared limit of detection, {declared_db:g} {links.level_unit} ({of} of "
+            "scene.toml; the default, if nobody set it),")
 
 
 def _usual_db(links: LinkData, rows: list[np.ndarray], found: list[LimitEstimate | None],
@@ -265,10 +274,8 @@ def _notes(links: LinkData, rows: list[np.ndarray], own_db: np.ndarray,
         if below:
             lie = (f"{below:,} of {len(read_db):,} readings ({below / len(read_db):.1%}) lie below "
                    f"it, down to {read_db.min():g}")
-        used = "; ".join(_used(links.receiver_names[r], own_db[r], found[r], unit)
-                         for r in other[:MAX_NAMED])
-        notes.append(f"the declared limit of detection, {declared_db:g} {unit}, is not that of the "
-                     f"readings: {lie}. Used instead: {used}{_more(other)}")
+        notes.append(f"{_declared(links, declared_db)} is not that of the readings: {lie}. "
+                     f"{_used_instead(links, own_db, found, other)}")
     elif len(known_db) and np.ptp(known_db) > DIFFER_DB:
         low, high = (links.receiver_names[int(np.flatnonzero(own_db == end)[0])]
                      for end in (known_db.min(), known_db.max()))
@@ -282,6 +289,13 @@ def _notes(links: LinkData, rows: list[np.ndarray], own_db: np.ndarray,
             notes.append(f"links of receiver {names}{_more(receivers)} {what}: they count as lost, "
                          "not as weak")
     return notes
+
+
+def _used_instead(links: LinkData, own_db: np.ndarray, found: list[LimitEstimate | None],
+                  receivers: list[int]) -> str:
+    used = "; ".join(_used(links.receiver_names[r], own_db[r], found[r], links.level_unit)
+                     for r in receivers[:MAX_NAMED])
+    return f"Used instead: {used}{_more(receivers)}"
 
 
 def _used(name: str, limit_db: float, found: LimitEstimate | None, unit: str) -> str:

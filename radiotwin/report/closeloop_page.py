@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from radiotwin.closeloop.result_file import check_report
+from radiotwin.display.summary import count
 from radiotwin.report import closeloop_words as words
 from radiotwin.report.html import Table, read_picture, write_page
 from radiotwin.report.labels import (
@@ -92,9 +93,11 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         "detectable": Table(
             ("effect", "would have been named from", "what its size is"),
             [[name_label(each["name"]), f"{words.number(each['size'])} {each['unit']}",
-              each["pattern"]] for each in report["detectable"]]),
+              each["pattern"]] for each in report["detectable"] if each["size"] is not None]),
+        "undetectable": words.undetectable(report),
         "side_by_side": words.side_by_side(report),
-        "trials": f"{len(candidates)} trials in {len({c['step'] for c in candidates})} steps",
+        "trials": f"{count(len(candidates), 'trial')} in "
+                  f"{count(len({c['step'] for c in candidates}), 'step')}",
         "candidates": _candidate_table(candidates),
         "remaining": Table(
             ("variable", "standard deviation of the mean residual over it [dB]", "p, corrected"),
@@ -107,7 +110,7 @@ def _cards(report: dict) -> list[tuple[str, str]]:
     cards = []
     prediction = report.get("prediction")
     if prediction:
-        cards.append(("best prediction, RMSE",
+        cards.append(("all that was learnt together, RMSE",
                       f"{words.number(prediction['combined_rmse_db'])} dB"))
         inside = (report["error"].get("combined") or {}).get("in_90_percent_interval")
         if inside is not None:
@@ -184,13 +187,19 @@ def _error_table(report: dict, kinds: tuple[str, ...]) -> Table:
 
 
 def _candidate_table(candidates: list[dict]) -> Table:
-    rows = [[c["step"], name_label(c["name"]), "kept" if c["kept"] else c["reason"],
+    rows = [[c["step"], _with_variant(c), "kept" if c["kept"] else c["reason"],
              words.probability(c.get("probability")), words.number(c["heldout_rmse_db"]),
              words.number(c.get("evidence_nats")), words.number(c["heldout_nll_gain"])]
             for c in candidates]
-    return Table(("step", "effect", "kept, or why not", "probability", "held-out RMSE [dB]",
-                  "evidence [nats]", "held-out gain [nats]"), rows, "", 3,
+    return Table(("step", "effect", "kept, or why not", "probability by itself",
+                  "held-out RMSE [dB]", "evidence [nats]", "held-out gain [nats]"), rows, "", 3,
                  {number for number, c in enumerate(candidates) if c["kept"]})
+
+
+def _with_variant(candidate: dict) -> str:
+    """Return the name of a candidate, of which there may be several forms."""
+    name, variant = name_label(candidate["name"]), candidate.get("variant")
+    return f"{name}: {variant}" if variant else name
 
 
 def _facts(report: dict) -> list[str]:
@@ -203,6 +212,8 @@ def _facts(report: dict) -> list[str]:
 
 
 def _value(parameter: dict) -> str:
+    if words.is_reference(parameter):
+        return "0 (reference)"
     known = parameter.get("determined", True)
     return words.number(parameter["value"]) if known else "not determined"
 

@@ -9,6 +9,7 @@ from radiotwin.report.labels import INTERPOLATIONS, join_names, name_label, vari
 MAX_NAMED = 4  # variables or effects in a sentence
 MIN_DIFFERENCE_DB = 0.5  # of two receivers, to be worth a word: instruments' tolerance
 SURE = 0.9  # a cause that is less probable is said to be probable only
+HALF = 0.5  # more probable than not
 LIKELY = 0.05  # a cause that is less probable is not worth a word
 BADGES = {"effect": "found: ", "none": "no cause found", "unexplained": "unexplained",
           "undecided": "undecided"}
@@ -83,18 +84,18 @@ def rivals(report: dict) -> str:
               if each["name"] not in named}
     left = 1.0 - report["effects"][first - 1]["probability"]
     share = min(1.0, left / max(sum(others.values()), 1e-9))
-    likely = [f"{_cause(name)} {probability(share * each)}" for name, each in others.items()
-              if share * each >= LIKELY]
+    same = report["effects"][first - 1].get("indistinguishable_from", [])
+    # A number would say that the data can tell them apart.
+    likely = [f"{name_label(name)} (the data cannot tell them apart)" for name in same]
+    likely += [f"{_cause(name)} {probability(share * each)}" for name, each in others.items()
+               if share * each >= LIKELY and name not in same]
     return text + (f"What else it may be: {join_names(likely[:MAX_NAMED])}." if likely else "")
 
 
-def detectable(report: dict) -> str:
-    """Say how large effects would have had to be, to be named."""
-    named = {each["name"] for each in report["effects"]}
-    sizes = [f"{name_label(each['name'])} {each['pattern']}: {number(each['size'])} {each['unit']}"
-             for each in report["detectable"]
-             if each["size"] is not None and each["name"] not in named]
-    return "; ".join(sizes)
+def undetectable(report: dict) -> str:
+    """Say which effects would not have been named at any size that they may have; else empty."""
+    names = [name_label(each["name"]) for each in report["detectable"] if each["size"] is None]
+    return f"Not to be seen at any size that they may have: {join_names(names)}." if names else ""
 
 
 def side_by_side(report: dict) -> list[str]:
@@ -107,6 +108,11 @@ def drivers(report: dict) -> list[str]:
     found = report["remaining"]["drivers"] or [
         each for each in report.get("dependences_before", []) if _counts(each, report)]
     return [variable_label(each["variable"])[0] for each in found[:MAX_NAMED]]
+
+
+def is_reference(parameter: dict) -> bool:
+    """Return whether a parameter is that of the member which the others are compared with."""
+    return parameter["value"] == parameter["low"] == parameter["high"] == 0
 
 
 def number(value: float | None) -> str:
@@ -129,9 +135,14 @@ def probability(value: float | None) -> str:
     return "> 0.99" if value > 0.99 else "< 0.01" if value < 0.01 else f"{value:.2f}"
 
 
+def _criteria(report: dict) -> dict[str, float]:
+    """Return the report's criteria; of version 0.1, today's."""
+    return SelectionCriteria().to_json() | report.get("criteria", {})
+
+
 def _counts(dependence: dict, report: dict) -> bool:
-    """Return whether a dependence meets the report's criteria; of version 0.1, today's."""
-    criteria = SelectionCriteria().to_json() | report.get("criteria", {})
+    """Return whether a dependence meets the report's criteria."""
+    criteria = _criteria(report)
     p_value, effect_db = dependence["p_value"], dependence.get("effect_db")
     return p_value is not None and p_value <= criteria["max_dependence_p_value"] and (
         effect_db is None or effect_db >= criteria["min_dependence_db"])
@@ -172,21 +183,34 @@ def _effect(report: dict) -> str:
                  if each["kept"] and each["name"] not in INTERPOLATIONS]
     interpolated = any(each["name"] in INTERPOLATIONS for each in report["effects"])
     after = explained[-1] if explained and interpolated else error["after"]["rmse_db"]
-    it = "it" if len(causes) == 1 else "them"
     found = _causes(report)
+    it = "it" if len(found) == 1 else "them"  # one kind may have been found twice
     known = [each["probability"] for each in found if each.get("probability") is not None]
     lacked, sure = "lacked", ""
     if not is_sure(report):
         lacked = "probably lacked"
         if len(known) == len(found):
-            sure = f" (probability {probability(min(known))}{' and more' * (len(causes) > 1)})"
+            rest = "" if len(found) == 1 else " each" if min(known) == max(known) else " and more"
+            sure = f" (probability {probability(min(known))}{rest})"
     before = error["before"]["rmse_db"]
     falls = "falls" if after < before else "goes"
     text = (f"The model {lacked} {join_names(causes)}{sure}. With {it} the RMSE on held-out links "
             f"{falls} from {number(before)} to {number(after)} dB.")
+    left = _unnamed_beside(report)
+    if left is not None:
+        text += (f" Beside {it} something is left that has no name (probability "
+                 f"{probability(left)}).")
     if report["remaining"]["drivers"]:
         text += f" The remaining residual depends on {join_names(drivers(report))}."
     return text
+
+
+def _unnamed_beside(report: dict) -> float | None:
+    """Return how probable it is that something without a name is left; None where it is not."""
+    found = report["posterior"][-1]["probabilities"] if report["posterior"] else []
+    if not found or found[0]["name"] != OTHER:
+        return None
+    return found[0]["probability"] if (found[0]["probability"] or 0.0) >= HALF else None
 
 
 def _none(report: dict) -> str:
@@ -194,17 +218,29 @@ def _none(report: dict) -> str:
 
 
 def _unexplained(report: dict) -> str:
-    found: list[dict] = next((each["probabilities"] for each in report["posterior"]), [])
-    if not found or found[0]["name"] == OTHER:
-        text = f"Something is missing that no effect of the catalogue explains{_of(report, OTHER)}"
-    else:  # the base is wrong by places, whatever its likeliest cause
-        likely = _likely([each for each in found if each["name"] != NONE])
-        text = "Something is missing, and no name for it is probable enough"
-        text += f" (likeliest: {likely})" if likely else ""
-    text += f": the residual is {number(report['error']['before']['rmse_db'])} dB RMSE"
+    step = next(iter(report["posterior"]), None)
+    if step and step["probabilities"] and step["probabilities"][0]["name"] != OTHER:
+        return _too_much_of_places(report, step)
+    return (f"Something is missing that no effect of the catalogue explains{_of(report, OTHER)}: "
+            f"the {_residual(report)} {_sizes(report)}").strip()
+
+
+def _too_much_of_places(report: dict, step: dict) -> str:
+    """Say that no cause is the likeliest, and that more belongs to places than "none" allows."""
+    most_db = _criteria(report)["max_rest_db"]
+    shadowing = "Correlated shadowing does this, too"
+    shadowing += ", as do errors of the map and of its materials" * _has_map(report)
+    return (f"Unexplained: about {number(step['rest_db'])} dB of what the base misses belong to "
+            f"places, and beyond {most_db:g} dB it is not said that nothing is missing. "
+            f"{shadowing}. Likeliest: {_likely(step['probabilities'])}. About "
+            f"{number(step['noise_db'])} dB belong to single readings. "
+            f"The {_residual(report)}")
+
+
+def _residual(report: dict) -> str:
     names = drivers(report)
-    text += f" and depends on {join_names(names)}." if names else "."
-    return f"{text} {_sizes(report)}".strip()
+    depends = f" and depends on {join_names(names)}" if names else ""
+    return f"residual is {number(report['error']['before']['rmse_db'])} dB RMSE{depends}."
 
 
 def _undecided(report: dict) -> str:
@@ -213,11 +249,31 @@ def _undecided(report: dict) -> str:
     if step is None:
         return text
     text += f" Likeliest: {_likely(step['probabilities'])}."
-    advice = [SETTLES[each["name"]] for each in step["probabilities"]
+    advice = [_settles(each["name"], step["step"], report) for each in step["probabilities"]
               if (each["probability"] or 0) >= LIKELY and each["name"] in SETTLES]
     if advice:
         text += f" To settle it: {'; '.join(dict.fromkeys(advice[:2]))}."
     return f"{text} {_sizes(report)}".strip()
+
+
+def _settles(name: str, step: int, report: dict) -> str:
+    """Say what would settle whether an effect is there, and of which device or receiver."""
+    tried = [each for each in report["candidates"]
+             if each["name"] == name and each["step"] == step]
+    best: dict = max(tried, key=lambda each: each.get("probability") or 0.0, default={})
+    for end in ("device", "receiver"):
+        names = best.get(f"{end}s") or []
+        if not names:
+            continue
+        shown = ", ".join(names[:MAX_NAMED]) + " and others" * (len(names) > MAX_NAMED)
+        who = f"{end}{'s' * (len(names) > 1)} {shown}"
+        # The antenna of a receiver turns with it.
+        turns = name == "antenna_pattern" and end == "receiver"
+        text = SETTLES["body_shadowing" if turns else name]
+        if end == "device" and len(names) == 1 and "the device" in text:
+            return text.replace("the device", who)
+        return f"{text} ({who})"
+    return SETTLES[name]
 
 
 def _likely(probabilities: list[dict]) -> str:
@@ -237,9 +293,17 @@ def _sizes(report: dict) -> str:
     step = report["posterior"][-1] if report["posterior"] else None
     if step is None or step["rest_db"] is None:
         return ""
+    alike = ("errors of the map and of its materials do" if _has_map(report) else
+             "shadowing does")
     return (f"Of what the base misses about {number(step['rest_db'])} dB belong to places, as "
-            "errors of the map and of its materials do, and about "
-            f"{number(step['noise_db'])} dB to single readings.")
+            f"{alike}, and about {number(step['noise_db'])} dB to single readings.")
+
+
+def _has_map(report: dict) -> bool:
+    """Return whether a 3D map was given: without one, every link counts as one with sight."""
+    hidden = report["error"].get("by_los", {}).get("nlos")
+    given = (report.get("inputs") or {}).get("scene") or report["base"] == "raytrace"
+    return bool(given or (hidden and hidden["before"]["n"]))
 
 
 def _cause(name: str) -> str:

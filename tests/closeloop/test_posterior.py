@@ -18,7 +18,7 @@ from radiotwin.closeloop.sensitivity import detectable, median_azimuth_deg, need
 from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.fitting import add_effect
 from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
-from radiotwin.effects.position_errors import DevicePositionError
+from radiotwin.effects.position_errors import MIN_MOVE_M, DevicePositionError
 from radiotwin.inference.correlated_evidence import Columns
 from radiotwin.links import prepare_links
 
@@ -174,6 +174,21 @@ def test_where_no_size_would_be_seen_there_is_none(open_ground):
     _, hypotheses = looked_at(open_ground, 6)
     sizes = [each.size for each in detectable(hypotheses, replace(CRITERIA, min_probability=1.0))]
     assert set(sizes) == {np.inf} and set(_for_json(sizes)) == {None}
+
+
+def test_only_what_was_looked_for_and_sizes_that_an_effect_may_have_would_have_been_seen(open_ground):
+    _, hypotheses = looked_at(open_ground, 6)
+    assert hypotheses.links.city is None and np.isfinite(hypotheses.links.frequency_hz)
+    sizes = {each.name: each.size for each in detectable(hypotheses, CRITERIA)}
+    assert "removed_obstacle" not in sizes and "foliage" in sizes
+    assert sizes["excess_attenuation"] == np.inf  # rain takes a few dB/km at most
+    assert sizes["device_position_error"] >= MIN_MOVE_M
+    unknown = replace(hypotheses, links=replace(hypotheses.links, frequency_hz=np.nan))
+    without = {each.name: each.size for each in detectable(unknown, CRITERIA)}
+    assert "missing_obstacle" not in without and 10 < without["excess_attenuation"] < np.inf
+    late = hypotheses.links.flight * 1e6 + hypotheses.links.time_s
+    apart = replace(hypotheses, links=replace(hypotheses.links, time_s=late))
+    assert {each.name: each.size for each in detectable(apart, CRITERIA)}["episode"] < np.inf
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 90.0, 180.0, 270.0])

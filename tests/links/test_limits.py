@@ -1,5 +1,6 @@
 """Limits of detection by the readings, in links made by a law, shadowing and receivers of the test's own."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -69,7 +70,7 @@ def test_a_declared_limit_that_readings_contradict_is_overruled_and_told(seed, o
     np.testing.assert_allclose(limits_db, -110.0, atol=0.6)
     below = int((links.level_db < -110.0 + off_db).sum())
     said = f"{below:,} of {np.isfinite(links.level_db).sum():,} readings" if off_db > 0 else "no reading lies near"
-    assert f"declared limit of detection, {-110 + off_db:g} dB," in note and said in note and "for r1" in note
+    assert f"declared limit of detection, {-110 + off_db:g} dB (sens" in note and said in note and "for r1" in note
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -84,7 +85,10 @@ def test_a_declared_limit_that_readings_allow_stays_to_the_bit(seed, given):
 def test_a_limit_far_below_all_readings_stands_for_none(seed, given):
     links = fly(seed, **given)
     limits_db, notes = estimated(links, -250.0)
-    assert notes[0].startswith("the declared limit of detection, -250 dB, is not used: but for odd ones, the weakest")
+    assert notes[0].startswith("the declared limit of detection, -250 dB (sensitivity_dbm less tx_power_dbm of scene.toml; the "
+                               "default, if nobody set it), is not used: but for odd ones, the weakest")
+    used_db = re.search(r"links are blank\. Used instead: (-[\d.]+) ± [\d.]+ dB for r0; ", notes[0])
+    assert float(used_db[1]) == pytest.approx(limits_db[0], abs=0.06)
     np.testing.assert_array_equal(limits_db, estimated(links)[0])
     np.testing.assert_allclose(limits_db, -110.0, atol=0.8)
 

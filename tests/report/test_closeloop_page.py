@@ -7,6 +7,7 @@ from io import BytesIO
 import pytest
 from matplotlib.figure import Figure
 
+from radiotwin.cli import loop
 from radiotwin.errors import BadInput
 from radiotwin.report.closeloop_page import write_closeloop_page
 from radiotwin.report.closeloop_words import closeloop_summary, drivers, rivals
@@ -41,7 +42,8 @@ def report(verdict="effect", **changes):
                       "regression_kriging": {"rmse_db": 5.5, "median_db": 1}},
         "dependences_before": drivers,
         "remaining": {"structured": verdict == "unexplained", "drivers": drivers if verdict == "unexplained" else []},
-        "posterior": [{"step": 1, "unnamed_nats": {"time": 12.0}, "rest_db": 2.5, "noise_db": 1.25, "probabilities": [
+        "posterior": [{"step": 1, "unnamed_nats": {"time": 12.0},
+                       "rest_db": 3.5 if verdict == "unexplained" else 2.5, "noise_db": 1.25, "probabilities": [
             {"name": "none", "probability": 0.705}, {"name": "antenna_pattern", "probability": 0.29},
             {"name": "not in the catalogue", "probability": 0.005}]}],
         "detectable": [{"name": "excess_attenuation", "size": 4.2, "unit": "dB/km", "pattern": "on all links"}],
@@ -60,14 +62,26 @@ def page(content, folder):
     ("undecided", "Undecided: these measurements do not tell. Likeliest: nothing is missing (0.70) and antenna pattern (0.29). "
      "To settle it: fly around the device at one distance and one height.", "undecided"),
     ("unexplained",
-     "Something is missing, and no name for it is probable enough (likeliest: antenna pattern (0.29)): the residual is "
-     "3.00 dB RMSE and depends on time in flight",
+     "Unexplained: about 3.50 dB of what the base misses belong to places, and beyond 3 dB it is not said that nothing is "
+     "missing. Correlated shadowing does this, too. Likeliest: nothing is missing (0.70) and antenna pattern (0.29). About "
+     "1.25 dB belong to single readings. The residual is 3.00 dB RMSE and depends on time in flight.",
      "unexplained")])
 def test_each_verdict_is_told_first(tmp_path, verdict, sentence, badge):
     text = page(report(verdict), tmp_path)
     assert sentence in text and f"<b>{badge}</b>" in text
     assert text.index(sentence) < text.index("<h2>")
     assert not re.search(r'(src|href)="(?!data:)|https?://|<script', text)  # one file, no network
+
+
+@pytest.mark.parametrize("ends, sentence", [
+    ({"devices": ["n3"]}, "fly around device n3 at one distance"),
+    ({"devices": ["n3", "n4"]}, "fly around the device at one distance and one height (devices n3, n4)."),
+    ({"receivers": ["uav0"]}, "fly the same track in both directions (receiver uav0).")])
+def test_what_would_settle_it_names_the_end(tmp_path, ends, sentence):
+    tried = report()["candidates"][0] | {"name": "antenna_pattern", "variant": "of some kind", "probability": 0.4, "kept": False}
+    found = report("undecided", candidates=[tried, tried | ends | {"probability": 0.45}])
+    assert f"To settle it: {sentence}" in closeloop_summary(found)
+    assert "antenna pattern: of some kind</td>" in page(found, tmp_path)
 
 
 def test_only_what_meets_the_criteria_is_said_to_matter():
@@ -80,7 +94,7 @@ def test_only_what_meets_the_criteria_is_said_to_matter():
     assert drivers(found | {"criteria": {"max_dependence_p_value": 1.0, "min_dependence_db": 1.0}}) == [
         "distance", "time in flight"]
     without = closeloop_summary(report("unexplained", dependences_before=[chance, weak], **nothing))
-    assert "3.00 dB RMSE. " in without and "depends" not in without
+    assert without.endswith("3.00 dB RMSE.") and "depends" not in without
 
 
 def test_names_from_the_data_are_no_markup(tmp_path):
@@ -94,6 +108,7 @@ def test_names_from_the_data_are_no_markup(tmp_path):
 def test_the_figures_that_planners_judge_by_stand_in_one_table_with_the_other_models(tmp_path):
     text = page(report(), tmp_path)
     table = text[text.index("Error before and after"):text.index("by device, receiver and flight")]
+    assert "2 trials in 1 step<" in text
     for words in ("bias [dB]", "standard deviation [dB]", "correlation", "log-distance law", "7.00",
                   "regression kriging", "5.50", "median db"):
         assert words in table
@@ -111,7 +126,8 @@ def test_how_probable_it_is_and_what_would_have_been_seen_is_said(tmp_path):
     text = page(report(effects=[DRIFT | {"probability": 0.6, "size_db": {
         "value": 4.0, "low": 3.0, "high": 5.0, "unit": "dB", "determined": True}}]), tmp_path)
     assert "Probability that it is there: receiver drift 0.60." in text
-    assert "What else it may be: nothing is missing 0.28 and antenna pattern 0.12." in text  # 0.4 are left
+    assert "What else it may be: receiver gain offset (the data cannot tell them apart), nothing is missing 0.28 and antenna " \
+        "pattern 0.12." in text  # 0.4 are left
     assert "by 4.00 dB (RMS; 90 % interval 3.00 to 5.00)" in text
     assert "would have been named from" in text and "4.20 dB/km" in text
     assert "belong to places" in closeloop_summary(report("none"))
@@ -131,6 +147,23 @@ def test_receivers_that_were_at_the_same_places_are_compared(tmp_path, ends, sen
     assert (sentence in closeloop_summary(content)) == in_lead
 
 
+def test_the_member_that_others_are_compared_with_is_marked_and_no_table_is_empty(tmp_path, monkeypatch):
+    offsets = {f"offset_db[{name}]": {"value": value, "low": value - width, "high": value + width, "unit": "dB"}
+               for name, value, width in (("a", 0.0, 0.0), ("b", 3.0, 0.5))}
+    found = report(effects=[DRIFT | {"name": "receiver_gain_offset", "probability": 0.9, "parameters": offsets}])
+    text = page(found, tmp_path)
+    assert re.search(r"offset \(a\)</td><td>0 \(reference\)</td><td>–</td>", text)
+    assert not re.search(r"</th></tr>\s*</table>", page(report(effects=[DRIFT | {"parameters": {}, "probability": 0.9}]), tmp_path))
+    printed = {}
+    monkeypatch.setattr(loop, "print_rows", lambda title, columns, rows: printed.update({title: rows}))
+    error = {"error": report()["error"] | {"by_los": {}}, "baselines": {}}
+    loop._print(found | error)
+    assert [row[2] for row in printed["Added to the base"]] == ["reference", 3.0]
+    printed.clear()
+    loop._print(report("none") | error)
+    assert len(printed) == 1  # of errors
+
+
 def test_numbers_that_are_not_known_are_dashes(tmp_path):
     unknown = report("none", baselines={"log_distance": NOTHING}, dependences_before=[])
     unknown["error"] |= {"before": NOTHING, "after": NOTHING}
@@ -146,6 +179,8 @@ def test_what_is_not_sure_is_said_to_be_probable(tmp_path):
     assert "probably lacked receiver drift and foliage (probability 0.60 and more). With them" \
         in closeloop_summary(report(effects=both))
     assert "The model lacked receiver drift. With it" in closeloop_summary(report(effects=both[:1]))
+    twice = [DRIFT | {"rank": rank, "probability": 0.78} for rank in (1, 2)]
+    assert "lacked receiver drift (2 times) (probability 0.78 each). With them" in closeloop_summary(report(effects=twice))
 
 
 def test_rivals_are_those_of_the_step_at_which_the_cause_was_found(tmp_path):
@@ -155,6 +190,12 @@ def test_rivals_are_those_of_the_step_at_which_the_cause_was_found(tmp_path):
     found["posterior"][0]["step"] = 2
     text = rivals(found)
     assert text == "Probability that it is there: episode 0.70 and receiver drift 0.80. "
+
+
+def test_a_rival_that_the_data_cannot_tell_from_it_has_no_number_beside_it():
+    found = report(effects=[DRIFT | {"probability": 0.6, "indistinguishable_from": ["antenna_pattern"]}])
+    assert rivals(found).endswith("What else it may be: antenna pattern (the data cannot tell them apart) and nothing is "
+                                  "missing 0.28.")
 
 
 def test_a_step_between_flights_has_no_probability_and_is_called_probable(tmp_path):
@@ -169,6 +210,23 @@ def test_something_without_a_likely_name_is_missing():
     unnamed = report("unexplained")
     unnamed["posterior"][0]["probabilities"] = [{"name": "not in the catalogue", "probability": 0.9}]
     assert "missing that no effect of the catalogue explains (probability 0.90): the residual" in closeloop_summary(unnamed)
+
+
+@pytest.mark.parametrize("likelihood, is_said", [(0.87, True), (0.49, False)])
+def test_what_is_left_without_a_name_beside_the_effects_is_said(likelihood, is_said):
+    found = report()
+    found["posterior"].append(found["posterior"][0] | {"step": 2, "probabilities": [
+        {"name": "not in the catalogue", "probability": likelihood}, {"name": "none", "probability": 1 - likelihood}]})
+    assert ("Beside it something is left that has no name (probability 0.87)." in closeloop_summary(found)) == is_said
+
+
+@pytest.mark.parametrize("verdict", ["none", "undecided", "unexplained"])
+def test_errors_of_a_map_are_spoken_of_where_there_is_one(verdict):
+    without = report(verdict, base="log-distance")
+    hidden = {"by_los": {"nlos": {"before": SCORES, "after": SCORES}}}
+    assert "the map" not in closeloop_summary(without) and "shadowing does" in closeloop_summary(without)
+    for given in ({"inputs": {"scene": "city"}}, {"base": "raytrace"}, {"error": without["error"] | hidden}):
+        assert "errors of the map and of its materials" in closeloop_summary(without | given)
 
 
 def test_a_last_resort_is_not_called_an_explanation(tmp_path):
@@ -208,7 +266,26 @@ def test_a_figure_outside_the_folder_is_not_read(tmp_path):
         page(stranger, folder)
 
 
+def test_the_two_probabilities_of_one_effect_are_told_apart(tmp_path):
+    text = page(report("undecided"), tmp_path)
+    assert "probability by itself" in text and "competes with others" in text and "sum to 1" in text
+
+
+def test_what_remains_is_said_to_be_that_before_it_is_interpolated(tmp_path):
+    before = "With the named effects, and before anything was interpolated, the residual depends on:"
+    assert before in page(report("unexplained"), tmp_path) and before not in page(report(), tmp_path)
+
+
+def test_an_effect_that_no_size_would_have_shown_is_no_row(tmp_path):
+    unseen = {"name": "episode", "size": None, "unit": "dB", "pattern": "over 10 % of the time"}
+    text = page(report(detectable=[*report()["detectable"], unseen]), tmp_path)
+    assert "Not to be seen at any size that they may have: episode." in text and "– dB" not in text
+    text = page(report(detectable=[unseen]), tmp_path)
+    assert "may have: episode." in text and "would have been named from" not in text
+
+
 def test_names_in_words():
+    assert parameter_label("share") == "share that belongs to places"  # its unit is "of the variance"
     assert parameter_label("tilt_deg[uav1]") == "tilt (uav1)" and parameter_label("odd_thing_db") == "odd thing"
     assert variable_label("time_in_flight_s") == ("time in flight", "s")
     assert variable_label("odd_length_m") == ("odd length", "m")
@@ -221,5 +298,6 @@ def test_the_page_tells_how_far_intervals_can_be_trusted(tmp_path):
     error = report()["error"] | {"combined": SCORES | {"rmse_db": 1.9, "in_90_percent_interval": 0.874}}
     text = page(report(prediction=prediction, error=error), tmp_path)
     assert "held-out readings in its 90 % intervals" in text and "87 %" in text
+    assert "<span>all that was learnt together, RMSE</span><b>1.90 dB</b>" in text
     error["combined"] = SCORES  # of a file that was written before
     assert "in its 90 % intervals" not in page(report(prediction=prediction, error=error), tmp_path)

@@ -1,0 +1,28 @@
+"""Whom a candidate belongs to."""
+
+import numpy as np
+import pytest
+
+from radiotwin.closeloop.ends import ends_of
+from radiotwin.effects.clock_offset import ReceiverClockOffset
+from radiotwin.effects.fold_model import FittedEffect
+from radiotwin.effects.foliage import Foliage
+from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
+from radiotwin.effects.position_errors import DevicePositionError
+from radiotwin.effects.sector_antenna import SectorAntenna, SectorPattern
+from radiotwin.links import prepare_links
+
+
+@pytest.mark.parametrize("effect, params, coefficients, devices, receivers", [
+    (DeviceGainOffset(), {"members": [0, 1, 2], "offsets_sd_db": 3.0}, [0.1, -4.0, 0.3], ["d1"], []),
+    (ReceiverGainOffset(), {"members": [0], "offsets_sd_db": 3.0}, [2.0], [], ["r0"]),
+    (DevicePositionError(), {"device": 2, "move_m": (3.0, 4.0)}, [], ["d2"], []),
+    (ReceiverClockOffset(), {"receiver": 1, "offset_s": 2.0, "speed_m_s": 10.0}, [], [], ["r1"]),
+    (SectorAntenna(), {"devices": {0: SectorPattern(), 2: SectorPattern()}}, [0.0, 0.0], ["d0", "d2"], []),
+    (Foliage(), {"box": (0.0, 0.0, 9.0, 9.0, 9.0, 0.0)}, [], [], [])])
+def test_names_are_of_the_ends_that_parameters_belong_to(open_ground, effect, params, coefficients, devices, receivers):
+    links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
+    fitted = FittedEffect(effect, effect.Params(**params), np.array(coefficients))
+    names = {"d": list(links.device_names), "r": list(links.receiver_names)}
+    expected = [tuple(names[each[0]][int(each[1:])] for each in ends) for ends in (devices, receivers)]
+    assert list(ends_of(fitted, links)) == expected
