@@ -131,8 +131,8 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
                            "another system, or are x and y swapped?")
     if not (np.isfinite(longitude) & np.isfinite(latitude)).all():
         i = int(np.argmin(np.isfinite(longitude) & np.isfinite(latitude)))
-        raise BadInput(f"x, y = {x[i]:g}, {y[i]:g} is no place of {shown(crs)}; is it another system, "
-                       "or another unit?")
+        raise BadInput(f"x, y = {x[i]:g}, {y[i]:g} is no place of {shown(crs)}; is it another "
+                       "system, or another unit?")
     degrees = np.full((len(positions), 2), np.nan)
     degrees[known] = np.column_stack([longitude, latitude])
     return positions.drop(columns=["x", "y"]).assign(longitude=degrees[:, 0],

@@ -13,7 +13,7 @@ from radiotwin.budgets import ROWS
 from radiotwin.cells import read_cells, write_csv
 from radiotwin.errors import BadInput
 from radiotwin.execution import Executor
-from radiotwin.files import atomic_path, require_writable
+from radiotwin.files import atomic_path, require_suffix, require_writable
 from radiotwin.geodesy import to_local
 from radiotwin.pieces import KeptParts
 from radiotwin.scene import Scene
@@ -100,8 +100,7 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | 
         RunFailed: No usable libLLVM.
     """
     if out_path is not None:
-        if not str(out_path).endswith((".csv", ".csv.gz")):
-            raise BadInput(f"{out_path}: unknown format; allowed are .csv and .csv.gz")
+        require_suffix(out_path, ".csv", ".csv.gz")
         require_writable(out_path)
     settings = settings or SolverSettings.of_quality()
     points_m = np.asarray(points_m, dtype=float).reshape(-1, 3)
