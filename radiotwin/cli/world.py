@@ -55,14 +55,15 @@ def trace(
     cluster: Cluster = None,
     device: ComputeDevice = "auto",
     plan: Annotated[bool, typer.Option(
-        "--plan", help="Only estimate time and memory, from a few batches.")] = False,
+        "--plan", help="Only estimate time and memory, from a few batches: takes some seconds, and "
+                       "the batches are kept for the run.")] = False,
 ) -> None:
     """Ray-trace the truth with Sionna RT.
 
     A killed run is resumed, a finished one is reused.
     """
     from radiotwin.cuda import tracing_device
-    from radiotwin.execution import open_executor
+    from radiotwin.execution import open_executor, worker_count
     from radiotwin.inputs import keep_inputs
     from radiotwin.scene import Scene
     from radiotwin.scene.folder import files_of
@@ -75,6 +76,7 @@ def trace(
     settings = _settings(scene, scene.lattice.positions_m, names, quality, target_db, solver=solver,
                          combining=combining, seed=seed, radius_m=radius,
                          compute_device=used)
+    worker_count(workers)  # a plan needs none, but a mistake is one
     if plan:
         _print_plan(scene, settings, names)
         return
