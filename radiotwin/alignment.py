@@ -7,6 +7,7 @@ from scipy.ndimage import gaussian_filter
 
 from radiotwin.errors import BadInput
 from radiotwin.frames import is_same_frame, place
+from radiotwin.measurement_columns import MAX_COORDINATE_M
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 from radiotwin.tables import Origin
@@ -16,6 +17,7 @@ SEARCHED_M, COARSE_M, FINE_M = 500.0, 10.0, 2.0  # translations that are tried, 
 MAX_POINTS = 4_000  # receiver positions that are tried
 MAX_CELLS = 4_000_000  # of the grid of what is built; bounds the memory
 AROUND_M = 30.0  # standard deviation of the surroundings that a position is compared with
+MAX_OUTSIDE = 0.5  # share of the receivers off the map, after a translation that the user gives
 MIN_CONTRAST = 5.0  # standard deviations, from which a translation is proposed
 
 
@@ -37,18 +39,25 @@ def in_scene_frame(measurements: Measurements, scene: Scene,
 
     Raises:
         BadInput: the frames cannot be related and the receivers do not fit; with the translation
-            that makes them fit best. Or heights are given twice, see `Measurements.on_ground`.
+            that makes them fit best. Or the given translation is impossible, or heights are given
+            twice, see `Measurements.on_ground`.
     """
     there = scene.config.origin
     related = shift_m is not None or (measurements.origin is not None and there is not None)
     measurements = in_known_frame(measurements, there, "the scene")
     if shift_m is not None:
+        if not max(map(abs, shift_m)) <= MAX_COORDINATE_M:
+            raise BadInput(f"a shift by {shift_m[0]:g}, {shift_m[1]:g} m is not possible; allowed "
+                           f"are -{MAX_COORDINATE_M:g} to {MAX_COORDINATE_M:g} m: give the metres "
+                           "from the frame of the measurements to the scene's")
         offset_m = np.array([*shift_m, 0.0])
         measurements = measurements.moved(lambda position_m: position_m + offset_m, there)
     measurements = measurements.on_ground(
         scene.city.ground_height_m if scene.city.terrain is not None else None)
     if not related:
         _require_fit(measurements, scene)
+    elif shift_m is not None and any(shift_m):
+        _refuse_off_map(measurements, scene, shift_m)
     return measurements
 
 
@@ -72,6 +81,19 @@ def in_known_frame(measurements: Measurements, there: Origin | None, what: str) 
                   f"{place(there)}: positions are converted (moved by {moved_m[0]:+.1f} m east, "
                   f"{moved_m[1]:+.1f} m north)", stacklevel=3)
     return converted
+
+
+def _refuse_off_map(measurements: Measurements, scene: Scene,
+                    shift_m: tuple[float, float]) -> None:
+    """Raise BadInput where a translation takes most receivers off the map."""
+    receiver_m = measurements.receiver_m
+    low_m, high_m = _bounds_m(scene)
+    outside = ((receiver_m[:, :2] < low_m) | (receiver_m[:, :2] > high_m)).any(axis=1)
+    if len(outside) and outside.mean() > MAX_OUTSIDE:
+        raise BadInput(f"the shift by {shift_m[0]:g}, {shift_m[1]:g} m takes {outside.mean():.1%} "
+                       f"of the links' receivers off the 3D map, which goes from ({low_m[0]:.0f}, "
+                       f"{low_m[1]:.0f}) to ({high_m[0]:.0f}, {high_m[1]:.0f}) m; correct its size "
+                       "and its signs (metres east, north)")
 
 
 def _require_fit(measurements: Measurements, scene: Scene) -> None:

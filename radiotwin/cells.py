@@ -164,8 +164,8 @@ def _selected(path: Path, names: list[str], required: Collection[str],
                        "unique")
     missing = [name for name in required if name not in names]
     if missing:
-        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {list(required)}, it "
-                       f"has {listed(names)}")
+        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs "
+                       f"{', '.join(required)}, it has {listed(names)}")
     return [name for name in names if optional is None or name in required or name in optional]
 
 

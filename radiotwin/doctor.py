@@ -134,8 +134,12 @@ def _check_packages(diagnosis: Diagnosis) -> Rows:
         diagnosis.problems.append("radiotwin runs from a folder and is not installed: pip install "
                                   "-e .")
         return [("radiotwin", "not installed")]
+    listed = {"radiotwin"}  # extras name each other, and a package may be of several
     for requirement in requirements:
         name = re.findall(r"^[\w.-]+", requirement)[0]
+        if name in listed:
+            continue
+        listed.add(name)
         extra = re.search(r"extra == ['\"]([\w-]+)", requirement)
         try:
             rows.append((name, version(name)))

@@ -54,6 +54,13 @@ def require_writable(path: Path | str) -> None:
         (folder / path.name).touch()
 
 
+def require_suffix(path: Path | str, *allowed: str) -> None:
+    """Raise BadInput unless a file's name ends in one of the allowed suffixes."""
+    if not str(path).lower().endswith(allowed):
+        raise BadInput(f"{path}: unknown format; allowed {'are' if len(allowed) > 1 else 'is'} "
+                       f"{' and '.join(allowed)}")
+
+
 @contextmanager
 def atomic_path(path: Path | str, flush: bool = True) -> Iterator[Path]:
     """Write a file atomically, by code that raises OSError where a write or a close fails.

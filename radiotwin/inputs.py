@@ -50,6 +50,22 @@ def require_within(folder: Path, path: Path, source: str) -> Path:
     return path
 
 
+def keep_inputs(out: Path, *read: Path | None) -> None:
+    """Check that an output replaces nothing that the command reads; call it before long work.
+
+    Args:
+        out: file or folder that will be replaced.
+        read: files and folders; None where an option is not given.
+
+    Raises:
+        BadInput: one of them is `out`, or lies in it, once links are followed.
+    """
+    for path in read:
+        if path is not None and is_within(path, out):
+            raise BadInput(f"cannot write {out}: the command reads {path}, which would be lost; "
+                           "choose another output path")
+
+
 def require_plain(folder: Path) -> None:
     """Check that a folder holds nothing but regular files and folders, before it is written to.
 

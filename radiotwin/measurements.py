@@ -306,8 +306,8 @@ def read_measurements(path: Path | str, devices_path: Path | str | None = None) 
     table = read_columns(path, REQUIRED, OPTIONAL + LEVELS, _MAY_BE_EMPTY)
     levels = [name for name in LEVELS if name in table]
     if len(levels) != 1:
-        raise BadInput(f"{path}: needs exactly one of the columns {LEVELS}, it has "
-                       f"{levels or 'neither'}")
+        raise BadInput(f"{path}: needs exactly one of the columns {' and '.join(LEVELS)}, it "
+                       f"has {'both' if levels else 'neither'}")
     named = devices_path is not None
     devices_path = Path(devices_path) if devices_path else path.parent / "devices.csv"
     if not os.path.exists(devices_path):
@@ -360,7 +360,7 @@ def read_devices(path: Path | str) -> pd.DataFrame:
     if wrong.any():
         row = int(np.flatnonzero(wrong)[0])
         raise BadInput(f"{path}: row {row + 2}, column role: {shown(devices['role'][row])}; "
-                       f"allowed are {ROLES}")
+                       f"allowed are {' and '.join(ROLES)}")
     unplaced = (devices["role"] == "anchor") & devices[["x_m", "y_m"]].isna().any(axis=1)
     if unplaced.any():
         row = int(np.flatnonzero(unplaced)[0])

@@ -81,6 +81,14 @@ def test_receivers_indoors_in_a_frame_that_is_said_to_be_the_same(rbm):
     np.testing.assert_array_equal(in_scene_frame(inside, rbm, (0.0, 0.0)).receiver_m, inside.receiver_m)
 
 
+@pytest.mark.parametrize(("shift_m", "message"), [
+    ((1e308, 0.0), r"a shift by 1e\+308, 0 m is not possible; allowed are -1e\+07 to 1e\+07 m"),
+    ((1e7, 0.0), r"takes 100.0% of the links' receivers off the 3D map")])
+def test_a_shift_off_the_map(rbm, shift_m, message):
+    with pytest.raises(BadInput, match=message):
+        in_scene_frame(measured(walked(rbm, 1)), rbm, shift_m)
+
+
 def test_known_frames_are_converted_and_told(rbm):
     receiver_m = walked(rbm, 3)
     there = placed(rbm, THERE)

@@ -57,10 +57,12 @@ def test_without_llvm(no_llvm):
 
 def test_missing_packages(untraced, monkeypatch):
     elsewhere = "elsewhere>=1; platform_machine == 'z80'"
-    needed = ["numpy>=1", "no-such-package>=2.1", elsewhere, "more>=1; extra == 'plus'"]
+    needed = ["numpy>=1", "no-such-package>=2.1", elsewhere, "more>=1; extra == 'plus'", "more>=1; extra == 'all'",
+              "radiotwin[plus]; extra == 'all'"]
     monkeypatch.setattr(doctor, "requires", lambda name: needed)
     diagnosis = doctor.diagnose()
     rows = dict(diagnosis.sections["Packages"])
+    assert len(rows) == len(diagnosis.sections["Packages"])  # each once
     assert rows["no-such-package"] == "MISSING"
     assert rows["more"] == "not installed (extra 'plus')"
     (problem,) = diagnosis.problems

@@ -10,6 +10,7 @@ from radiotwin.budgets import ROWS
 from radiotwin.errors import BadInput
 from radiotwin.inputs import (
     check_input,
+    keep_inputs,
     open_gzip,
     read_bytes,
     read_json,
@@ -113,6 +114,17 @@ def test_toml_is_searched_for_long_keys_in_linear_time(tmp_path):
             read_toml(tmp_path / "a.toml")
     (tmp_path / "a.toml").write_text('a.b."c d" = "' + "x." * 200 + '"')
     assert read_toml(tmp_path / "a.toml")["a"]["b"]["c d"].startswith("x.x")
+
+
+def test_what_is_read_is_not_replaced(tmp_path):
+    read = tmp_path / "in" / "a.csv"
+    read.parent.mkdir()
+    read.write_text("1")
+    (tmp_path / "link.csv").symlink_to(read)
+    for out in (read, read.parent, tmp_path / "link.csv", tmp_path / "in" / ".." / "in" / "a.csv"):
+        with pytest.raises(BadInput, match=r"the command reads .*a\.csv, which would be lost; choose another"):
+            keep_inputs(out, None, read)
+    keep_inputs(read.parent / "b.csv", None, read)
 
 
 def test_a_file_that_is_named_lies_in_the_folder(tmp_path):

@@ -36,7 +36,7 @@ LAYERS = (
     {"measurement_columns"},
     {"execution"},
     {"array_file", "geodesy", "llvm", "cuda", "safe_xml", "cells", "progress", "published", "records", "hdf5", "zarr_check",
-     "threads", "processes"},
+     "threads", "processes", "reference_systems"},
     {"pieces"},
     {"console", "csv_layout"},
     {"sqlite_tables"},

@@ -87,6 +87,7 @@ def coverage(
     from radiotwin.coverage.areas import read_areas
     from radiotwin.coverage.output import FILES, available_formats, write_formats, write_tables
     from radiotwin.files import atomic_folder, require_writable
+    from radiotwin.inputs import keep_inputs
     from radiotwin.report import write_coverage_pictures
     from radiotwin.scene.build import check_target
 
@@ -101,6 +102,7 @@ def coverage(
     world = _world(source, scene, model)
     usable, notes = available_formats(world, split_names(formats))
     check_target(out, FILES)
+    keep_inputs(out, transmitters, polygon, world.folder, source)
     require_writable(out / "coverage.json")
     areas = read_areas(polygon, world) if polygon else []
     table = read_transmitters(transmitters, world) if transmitters else None

@@ -13,6 +13,7 @@ from radiotwin.cli.options import (
     Shift,
     Workers,
     in_frame_of,
+    keep_scene_apart,
 )
 from radiotwin.console import notice, print_rows, say
 
@@ -67,6 +68,7 @@ def close_loop(
     data = read_measurements(measurements, devices)
     world = Scene.load(scene) if scene else None
     data = in_frame_of(world, data, shift)
+    keep_scene_apart(out, world)
     check_closeloop_folder(out)
     if write_scene is not None:
         check_corrected_target(write_scene, world, out)
@@ -146,13 +148,18 @@ def locate(
     It works with or without a 3D map.
     """
     from radiotwin.cells import write_csv
-    from radiotwin.files import atomic_path, require_writable
+    from radiotwin.files import atomic_path, require_suffix, require_writable
+    from radiotwin.inputs import keep_inputs
     from radiotwin.measurements import read_devices, read_measurements
     from radiotwin.scene import Scene
+    from radiotwin.scene.folder import files_of
     from radiotwin.twin import Twin
     from radiotwin.twin.locate import check_can_locate, locate_devices, position_errors
 
+    require_suffix(out, ".csv", ".csv.gz")
+    keep_inputs(out, measurements, devices or measurements.parent / "devices.csv", truth)
     known, world = Twin.load(twin), Scene.load(scene) if scene else None
+    keep_inputs(out, *(files_of(world) if world else []))
     check_can_locate(known, world)  # before a file is read that may be large
     data = in_frame_of(world, read_measurements(measurements, devices), shift)
     true = read_devices(truth) if truth else None

@@ -16,6 +16,7 @@ from radiotwin.cli.options import (
     Shift,
     Workers,
     in_frame_of,
+    keep_scene_apart,
     open_model,
     split_names,
 )
@@ -107,9 +108,11 @@ def map_(
 
     It holds the gain of every device over the scene's lattice.
     """
+    from radiotwin.inputs import keep_inputs
     from radiotwin.map_file import is_map
     from radiotwin.report import check_map_target, export_map
     from radiotwin.scene import Scene
+    from radiotwin.scene.folder import files_of
 
     if out is None and is_map(twin):
         raise BadInput(f"{twin} is a radio map already; give the file to write with --out")
@@ -117,6 +120,7 @@ def map_(
     out = out or place.with_name(f"{place.name}.nc")
     world = Scene.load(scene)
     check_map_target(out, world)
+    keep_inputs(out, twin, *files_of(world))
     with open_model(twin) as source:
         written = export_map(source, world, out, devices=split_names(devices),
                              altitudes_m=_altitudes(altitudes), name=str(twin), tell=notice)
@@ -172,6 +176,7 @@ def compare(
 
     require_writable(out / "compare.json")
     world = Scene.load(scene)
+    keep_scene_apart(out, world)
     data = in_frame_of(world, read_measurements(measurements, devices), shift)
     split_flights(data, held_out)  # refuses before a map is read
     truth_map = read_truth(world, truth) if truth else None

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from radiotwin.errors import BadInput
+from radiotwin.inputs import is_within
 
 if TYPE_CHECKING:
     from radiotwin.measurements import Measurements
@@ -138,6 +139,13 @@ def in_frame_of(scene: "Scene | None", measurements: "Measurements",
         return measurements.on_ground(None)
     return in_scene_frame(measurements, scene,
                           None if shift_m is None else (shift_m[0], shift_m[1]))
+
+
+def keep_scene_apart(out: Path, scene: "Scene | None") -> None:
+    """Raise BadInput if the folder of a result is that of the scene, which would get its files."""
+    if scene is not None and is_within(scene.folder, out) and is_within(out, scene.folder):
+        raise BadInput(f"cannot write {out}: it is the scene's folder; choose another output "
+                       "folder")
 
 
 def parse_numbers(option: str, text: str, count: int | None = None) -> list[float]:

@@ -30,11 +30,12 @@ def report(
 
     It shows the city in 3D with maps, flights and devices, and tables, and needs no network.
     """
-    from radiotwin.files import require_writable
+    from radiotwin.files import require_suffix, require_writable
     from radiotwin.report import read_run, write_report
 
-    found = read_run(run, scene, truth, measurements)
     out = out or run / "report.html"
+    require_suffix(out, ".html", ".htm")
+    found = read_run(run, scene, truth, measurements)
     require_writable(out)
     write_report(found, out)
     for note in found.notes:

@@ -146,13 +146,17 @@ def export(
 
     One loss for each pair: nothing moves.
     """
+    from radiotwin.inputs import keep_inputs
     from radiotwin.point_gains import export_ns3
     from radiotwin.scene import Scene
+    from radiotwin.scene.folder import files_of
     from radiotwin.trace import read_points
 
     if to != "ns3":
         raise BadInput(f"--to {to!r} is unknown; allowed is ns3")
     world = Scene.load(scene)
+    for name in ("nodes.csv", "losses.csv"):
+        keep_inputs(out / name, points, *files_of(world))
     ends_m = read_points(points, world.config.origin, world.city)
     with open_model(source) as model:
         pairs = export_ns3(model, world, ends_m, out, devices=split_names(devices))

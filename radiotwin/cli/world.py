@@ -55,26 +55,31 @@ def trace(
     cluster: Cluster = None,
     device: ComputeDevice = "auto",
     plan: Annotated[bool, typer.Option(
-        "--plan", help="Only estimate time and memory, from a few batches.")] = False,
+        "--plan", help="Only estimate time and memory, from a few batches: takes some seconds, and "
+                       "the batches are kept for the run.")] = False,
 ) -> None:
     """Ray-trace the truth with Sionna RT.
 
     A killed run is resumed, a finished one is reused.
     """
     from radiotwin.cuda import tracing_device
-    from radiotwin.execution import open_executor
+    from radiotwin.execution import open_executor, worker_count
+    from radiotwin.inputs import keep_inputs
     from radiotwin.scene import Scene
+    from radiotwin.scene.folder import files_of
     from radiotwin.trace import trace_map, truth_path
 
     used = tracing_device(device)
     scene, names = Scene.load(folder), split_names(devices)
+    out = out or truth_path(scene, names)
+    keep_inputs(out, *files_of(scene))
     settings = _settings(scene, scene.lattice.positions_m, names, quality, target_db, solver=solver,
                          combining=combining, seed=seed, radius_m=radius,
                          compute_device=used)
+    worker_count(workers)  # a plan needs none, but a mistake is one
     if plan:
         _print_plan(scene, settings, names)
         return
-    out = out or truth_path(scene, names)
     with open_executor(workers, cluster, notice) as executor:
         facts = trace_map(scene, settings, out, names, executor).dataset.attrs
     say(f"wrote {out}: {facts['links']} links, {facts['links_detected']} detected, "
@@ -127,12 +132,15 @@ def gains(
     """
     from radiotwin.cuda import tracing_device
     from radiotwin.execution import open_executor
+    from radiotwin.inputs import keep_inputs
     from radiotwin.pieces import keep_pieces
     from radiotwin.scene import Scene
+    from radiotwin.scene.folder import files_of
     from radiotwin.trace import read_points, trace_points
 
     used = tracing_device(device)
     scene, names = Scene.load(folder), split_names(devices)
+    keep_inputs(out, points, *files_of(scene))
     points_m = read_points(points, scene.config.origin, scene.city)
     settings = _settings(scene, points_m, names, quality, target_db, combining=combining, seed=seed,
                          radius_m=radius, compute_device=used)
@@ -160,11 +168,14 @@ def paths(
 
     Each link gets its delay spread, K factor and angular spreads. No ray tracer is needed.
     """
+    from radiotwin.inputs import keep_inputs
     from radiotwin.paths.listing import list_paths
     from radiotwin.scene import Scene
+    from radiotwin.scene.folder import files_of
     from radiotwin.trace import read_points
 
     scene = Scene.load(folder)
+    keep_inputs(out, points, *files_of(scene))
     points_m = read_points(points, scene.config.origin, scene.city)
     found = list_paths(scene, points_m, out, split_names(devices),
                        None if velocity is None else _speeds(velocity), bandwidth_hz)
@@ -228,10 +239,14 @@ def survey(
 
     Their measurements are written, with a table of the devices.
     """
+    from radiotwin.inputs import keep_inputs
     from radiotwin.scene import Scene
+    from radiotwin.scene.folder import files_of
     from radiotwin.survey import fly_survey, read_truth
 
     scene = Scene.load(folder)
+    for written in (out, out.parent / "devices.csv"):
+        keep_inputs(written, *files_of(scene))
     measurements = fly_survey(scene, read_truth(scene, truth), flights=flights, pattern=pattern,
                               seed=seed, noise_db=noise_db)
     measurements.write(out)

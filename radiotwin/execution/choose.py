@@ -29,7 +29,7 @@ def open_executor(workers: str = AUTO, cluster: str | None = None,
     Raises:
         BadInput: Not a number of workers, or no such cluster.
     """
-    count = _count(workers)
+    count = worker_count(workers)
     if cluster is None and (count == 1 or (count is None and usable_cores() == 1)):
         yield Executor()
         return
@@ -40,7 +40,12 @@ def open_executor(workers: str = AUTO, cluster: str | None = None,
         pool.close()
 
 
-def _count(workers: str) -> int | None:
+def worker_count(workers: str) -> int | None:
+    """Return the number of processes that the user gives; None for `auto`.
+
+    Raises:
+        BadInput: not a number of workers.
+    """
     if workers == AUTO:
         return None
     if not (workers.isascii() and workers.isdigit() and 0 < int(workers) <= MAX_WORKERS):

@@ -286,7 +286,9 @@ def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> lis
         east_, north_ = np.nanmax(bounds_deg[:, 2:], axis=0)
         swapped = ((bounds_deg[:, 1] <= east) & (bounds_deg[:, 3] >= west)
                    & (bounds_deg[:, 0] <= north) & (bounds_deg[:, 2] >= south)).any()
-        hint = "; latitude and longitude seem to be swapped in the file" if swapped else ""
+        hint = ("; latitude and longitude seem to be swapped: --bbox is "
+                "LAT_MIN,LON_MIN,LAT_MAX,LON_MAX; if it is right, the file's are swapped"
+                ) if swapped else ""
         raise BadInput(f"{path}: no building reaches into the bbox "
                        f"{south:g},{west:g},{north:g},{east:g}; the file's lie in "
                        f"{south_:.5f},{west_:.5f},{north_:.5f},{east_:.5f} "

@@ -140,6 +140,15 @@ def no_height_text(rows: list[Mapping[str, str]]) -> str | None:
     numeric = [key for key, count in counts.items() if count]
     if not numeric:
         return None
+    for column in KNOWN:  # the sign of a usable height is checked where it is read
+        if column.name in numeric and not column.ground:
+            value = next(tags[column.name] for tags in rows
+                         if _NUMBER.fullmatch(tags.get(column.name, "")))
+            return (f"no building has a height that can be used: column {column.name!r} holds none "
+                    f"above 0 and up to 1,000 m, only such as {value.strip()[:20]}. Correct it, "
+                    "name another column with --height-column NAME, or give all buildings one "
+                    "height with --height-default M. Its columns of numbers are: "
+                    f"{_listed(numeric)}")
     elevations = [f"{column.name} is an elevation, from which the ground's ({column.ground}) has "
                   "to be subtracted, and the file has none"
                   for column in KNOWN if column.ground and column.name in counts

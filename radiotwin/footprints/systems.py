@@ -1,8 +1,4 @@
-"""Coordinate reference systems that files name, and their coordinates in degrees.
-
-A name comes from a stranger. In PROJ's own language, or in WKT with grids, it can open any file:
-only an authority with its code, a title of PROJ's database, and WKT without grids are used.
-"""
+"""Coordinate reference systems that files name, and their coordinates in degrees."""
 
 import re
 from collections.abc import Callable
@@ -12,14 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from radiotwin.errors import BadInput
+from radiotwin.reference_systems import reference_system
 
 if TYPE_CHECKING:
     from pyproj import CRS
 
 WGS84 = ("EPSG:4326", "OGC:CRS84", "urn:ogc:def:crs:OGC:1.3:CRS84", "urn:ogc:def:crs:EPSG::4326")
-_CODE = re.compile(r"(?:urn:ogc:def:crs:)?([A-Za-z]+):(?:[\d.]*:)?(\w+)")
-_TITLE = re.compile(r"[\w .,()/'-]+")
-_FILES_IN_WKT = ("PARAMETERFILE", "EXTENSION", "NADGRIDS", "+INIT")
 # Names in GML and CityJSON: URN, URI, and lists of a horizontal and a vertical system
 _EPSG = re.compile(r"EPSG(?::|/)(?:[\d.]*(?::|/))?(\d{4,6})(?!\d)", re.IGNORECASE)
 _EPSG_OLD = re.compile(r"epsg\.xml#(\d{4,6})$", re.IGNORECASE)
@@ -38,22 +32,13 @@ def find_system(path: Path, name: str) -> "CRS":
     Raises:
         BadInput: it is not known, or a name that could open a file.
     """
-    from pyproj import CRS
     from pyproj.exceptions import CRSError
 
     try:
-        if code := _CODE.fullmatch(name):
-            return CRS.from_authority(code[1].upper(), code[2])
-        if _TITLE.fullmatch(name) or _is_harmless_wkt(name):
-            return CRS.from_user_input(name)
-        raise CRSError("it is neither AUTHORITY:CODE, nor a title, nor WKT without grids")
+        return reference_system(name)
     except CRSError as error:
         raise BadInput(f"{path}: its coordinate reference system {name[:60]!r} is unknown "
-                       f"({error}); export it in EPSG:4326") from None
-
-
-def _is_harmless_wkt(text: str) -> bool:
-    return "[" in text and not any(word in text.upper() for word in _FILES_IN_WKT)
+                       f"({error!s:.200}); export it in EPSG:4326") from None
 
 
 def degrees_from(path: Path, system: "CRS") -> Callable[[np.ndarray], np.ndarray]:

@@ -8,6 +8,7 @@ import pandas as pd
 from radiotwin.cells import shown
 from radiotwin.errors import BadInput
 from radiotwin.geodesy import to_local
+from radiotwin.reference_systems import ALLOWED, reference_system
 from radiotwin.tables import Origin
 
 AREA_MARGIN_DEG = 1.0  # accepted outside the area for which a projected system is defined
@@ -85,7 +86,8 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
 
     Args:
         positions: any columns of `POSITION`; x, y in the unit of `crs`.
-        crs: projected reference system, as PROJ knows it; None leaves x, y as they are.
+        crs: name of a projected reference system, see `reference_system`; None leaves x, y as
+            they are.
 
     Returns:
         latitude and longitude instead of x and y, and the other columns as they are.
@@ -95,21 +97,26 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
     """
     if crs is None or "x" not in positions:
         return positions
-    from pyproj import CRS, Transformer
-    from pyproj.exceptions import CRSError
+    from pyproj import Transformer
+    from pyproj.exceptions import CRSError, ProjError
 
     try:
-        system = CRS(crs)
+        system = reference_system(crs)
     except CRSError as error:
-        raise BadInput(f"crs {shown(crs)} is unknown; allowed is what PROJ knows, such as "
-                       f"EPSG:32633 (UTM 33 N): {str(error)[:200]}") from None
+        raise BadInput(f"crs {shown(crs)} is unknown ({error!s:.200}); give {ALLOWED}, such as "
+                       "EPSG:32633 (UTM 33 N)") from None
     if not system.is_projected:
-        raise BadInput(f"crs {crs} is {system.type_name}, not a projected one with x and y; "
+        raise BadInput(f"crs {shown(crs)} is {system.type_name}, not a projected one with x and y; "
                        "degrees go into latitude and longitude")
-    transformer = Transformer.from_crs(system, "EPSG:4326", always_xy=True)
     known = positions["x"].notna() & positions["y"].notna()
     x, y = positions["x"][known].to_numpy(), positions["y"][known].to_numpy()
-    longitude, latitude = transformer.transform(x, y)
+    try:
+        transformer = Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+        longitude, latitude = transformer.transform(x, y)
+    except ProjError as error:
+        raise BadInput(f"crs {shown(crs)} cannot be converted to latitude and longitude "
+                       f"({error!s:.200}); give another one, such as EPSG:32633 (UTM 33 N)"
+                       ) from None
     area = system.area_of_use
     if area is not None:
         width = area.east - area.west
@@ -120,12 +127,12 @@ def to_geographic(positions: pd.DataFrame, crs: str | None) -> pd.DataFrame:
         if not inside.all():
             i = int(np.argmin(inside))
             raise BadInput(f"x, y = {x[i]:g}, {y[i]:g} is latitude {latitude[i]:.3f}, longitude "
-                           f"{longitude[i]:.3f}, far outside of the area of {crs}; is it another "
-                           "system, or are x and y swapped?")
+                           f"{longitude[i]:.3f}, far outside of the area of {shown(crs)}; is it "
+                           "another system, or are x and y swapped?")
     if not (np.isfinite(longitude) & np.isfinite(latitude)).all():
         i = int(np.argmin(np.isfinite(longitude) & np.isfinite(latitude)))
-        raise BadInput(f"x, y = {x[i]:g}, {y[i]:g} is no place of {crs}; is it another system, or "
-                       "another unit?")
+        raise BadInput(f"x, y = {x[i]:g}, {y[i]:g} is no place of {shown(crs)}; is it another "
+                       "system, or another unit?")
     degrees = np.full((len(positions), 2), np.nan)
     degrees[known] = np.column_stack([longitude, latitude])
     return positions.drop(columns=["x", "y"]).assign(longitude=degrees[:, 0],

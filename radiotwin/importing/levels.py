@@ -12,6 +12,7 @@ from radiotwin.importing.source import EMPTY, Source, as_text
 
 LEVEL_COLUMN = {"dBm": "rssi_dbm", "mW": "rssi_dbm", "W": "rssi_dbm", "dB": "gain_db"}
 """Unit in the file -> column of `measurements.csv`."""
+NOT_A_NUMBER = "nan"
 MILLIWATTS = {"mW": 1.0, "W": 1e3}
 POSSIBLE_DB = (-250.0, 0.0)
 """Open interval [dBm or dB]: thermal noise in 1 Hz is -174 dBm, no receiver gets a milliwatt
@@ -47,17 +48,22 @@ def read_levels(source: Source, spec: str, settings: Settings,
         BadInput: the unit is not declared, a cell is not a number, or empty cells have no declared
             meaning.
     """
-    text = as_text(source.cells(spec, "level"))
+    cells = source.cells(spec, "level")
+    text = as_text(cells)
+    is_text = cells.dtype.kind not in "fiu"
+    if is_text:  # the word, unlike an empty cell, is what a program wrote
+        named = cells.notna() & (cells.astype(str).str.strip().str.lower() == NOT_A_NUMBER)
+        text = text.mask(named, NOT_A_NUMBER)
     numbers = as_numbers(text)
-    not_measured = _is_one_of(text, numbers, settings.not_measured)
-    not_detected = _is_one_of(text, numbers, settings.not_detected) & ~not_measured
+    not_measured = _is_one_of(text, numbers, settings.not_measured, is_text)
+    not_detected = _is_one_of(text, numbers, settings.not_detected, is_text) & ~not_measured
     declared = not_measured | not_detected
     source.refuse(spec, text, (text == "") & ~declared,
                   "is empty; say what that means: not_detected = [\"empty\"] (it was too weak, "
                   "which is information) or not_measured = [\"empty\"] (nobody listened)")
     source.refuse(spec, text, ~np.isfinite(numbers) & ~declared,
                   "is not a number; if it means that the level was not detected, put it into "
-                  "not_detected")
+                  "not_detected; if nobody listened, into not_measured")
     _check_unit(source, spec, numbers[~declared], settings.level_unit)
     if settings.not_detected_at_or_below is not None:
         not_detected |= ~declared & (numbers <= settings.not_detected_at_or_below)
@@ -71,10 +77,15 @@ def read_levels(source: Source, spec: str, settings: Settings,
     return Levels(db, not_measured, impossible)
 
 
-def _is_one_of(text: pd.Series, numbers: np.ndarray, values: list[float | str]) -> np.ndarray:
-    """Return where a cell equals one of the values, (n,) bool; texts in any case."""
+def _is_one_of(text: pd.Series, numbers: np.ndarray, values: list[float | str],
+               is_text: bool) -> np.ndarray:
+    """Return where a cell equals one of the values, (n,) bool; texts in any case.
+
+    Only in a column of texts is the word NaN another value than an empty cell.
+    """
     labels = {value.strip().lower() for value in values if isinstance(value, str)}
-    labels = {"" if label in (*EMPTY, "empty") else label for label in labels}
+    labels = {label if label == NOT_A_NUMBER and is_text else
+              "" if label in (*EMPTY, "empty") else label for label in labels}
     result = np.isin(numbers, [value for value in values if not isinstance(value, str)])
     if labels:
         result |= text.str.lower().isin(labels).to_numpy(dtype=bool)

@@ -13,6 +13,8 @@ from radiotwin.tables import Number, Origin, Table
 Spec = Annotated[str, Field(min_length=1)]
 """Name of a column of the file, or `always VALUE` for a constant."""
 Positive = Annotated[Number, Field(gt=0)]
+_NO_TEXTS = ("idna", "punycode", "unicode_escape", "raw_unicode_escape", "undefined")
+"""Codecs of names and of source code: none is the encoding of a file."""
 DELIMITERS = (",", ";", "\t", "|")
 BY_DAY, BY_FILE, BY_POSITION = "by day", "by file", "by position"
 POSITION = ("latitude", "longitude", "altitude", "height", "x", "y", "z")
@@ -192,6 +194,9 @@ class Settings(Table):
             if name is not None:
                 codecs.getincrementaldecoder(name)
                 "a".encode(name)  # of some names are no texts
+                bytes(range(256)).decode(name, "replace")
+                if codecs.lookup(name).name.replace("-", "_") in _NO_TEXTS:
+                    raise LookupError
         except (LookupError, ValueError):
             raise ValueError("unknown; allowed are utf-8, utf-16, cp1252, latin-1 and other names "
                              "that Python knows") from None

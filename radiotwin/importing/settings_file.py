@@ -61,7 +61,8 @@ def read_settings(path: Path | str | None, given: Mapping[str, Any],
         return Settings.model_validate(data | dict(given))
     except ValidationError as error:
         # Pydantic reports each type of a union that it tried; the first report of a key is kept.
-        lines = {_key(problem): _message(problem, path) for problem in reversed(error.errors())}
+        lines = {_key(problem): _message(problem, _source_of(problem, path, given))
+                 for problem in reversed(error.errors())}
         raise BadInput("\n".join(reversed(lines.values()))) from None
 
 
@@ -108,7 +109,17 @@ def _key(problem: Mapping[str, Any]) -> str:
                     if isinstance(part, int) or part in names or extra)
 
 
-def _message(problem: Mapping[str, Any], path: Path | None) -> str:
+def _source_of(problem: Mapping[str, Any], path: Path | None, given: Mapping[str, Any]) -> str:
+    """Return where a problem is from: an option overrules the file."""
+    key = problem["loc"][0] if problem["loc"] else None
+    if key in given:
+        return f"--{str(key).replace('_', '-')}"
+    if path is None:
+        return "the options"
+    return f"{path} with the options" if key is None and given else str(path)
+
+
+def _message(problem: Mapping[str, Any], source: str | None) -> str:
     key = _key(problem)
     reason = problem["msg"].removeprefix("Value error, ")
     table = problem["loc"][0] if problem["loc"] else ""
@@ -122,7 +133,7 @@ def _message(problem: Mapping[str, Any], path: Path | None) -> str:
                   f'{problem["input"]}" for a constant')
     elif problem["type"] != "value_error":
         reason = f"{problem['input']!r}: {reason}"
-    return ": ".join(filter(None, [str(path or "the options"), key, reason]))
+    return ": ".join(filter(None, [source or "the options", key, reason]))
 
 
 def write_settings(settings: Settings, path: Path, folder: Path) -> None:

@@ -20,6 +20,7 @@ MAX_NAMED = 5  # names in a message
 MAX_OUTSIDE = 0.5  # share of the links
 GROUND_M, ROOFS = 0.5, 0.95  # above it something is built; share of its corners that are roofs
 BURIED = "its height, or that of the map's ground, is off; z counts from the scene's datum"
+COPIED = "they are in the file twice"
 INDOORS = "it was indoors (see building_entry), or its position or the wall is off by metres"
 
 
@@ -36,6 +37,16 @@ def refuse_empty_levels(level_db: np.ndarray, column: str) -> None:
     if len(level_db) > MIN_LINKS_OF_RECEIVER and np.nanmin(level_db) == np.nanmax(level_db):
         raise BadInput(f"all levels are {np.nanmin(level_db):g}, so there is nothing to explain; "
                        f"check the column {column}")
+
+
+def copied_rows(table: pd.DataFrame) -> np.ndarray:
+    """Return which rows (n,) repeat an earlier one: the file was put together twice.
+
+    Without a time, equal rows may be equal measurements.
+    """
+    if "time_s" not in table:
+        return np.zeros(len(table), dtype=bool)
+    return table.duplicated().to_numpy() & table["time_s"].notna().to_numpy()
 
 
 def require_one_frame(measurements: Measurements, scene: Scene | None) -> None:

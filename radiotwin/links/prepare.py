@@ -7,11 +7,13 @@ import pandas as pd
 
 from radiotwin.errors import BadInput
 from radiotwin.links.checks import (
+    COPIED,
     MIN_LINKS,
     ceiling_notes,
     check_names,
     check_positions,
     check_tilts,
+    copied_rows,
     find_fill_value,
     refuse_empty_levels,
     require_one_frame,
@@ -98,9 +100,7 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     from_device_m = np.abs(receiver_m[:, :2] - device_m[device_index, :2]).max(axis=1)
     leave_out(from_device_m > MAX_EXTENT_M, f"their receiver is more than {MAX_EXTENT_M / 1000:.0f}"
               " km from the device; both need one frame, in metres")
-    if "time_s" in table:  # without a time, equal rows may be equal measurements
-        twice = table.duplicated().to_numpy() & table["time_s"].notna().to_numpy()
-        leave_out(twice, "they are in the file twice")
+    leave_out(copied_rows(table), COPIED)
     low_z = np.isnan(receiver_m[:, 2])
     if low_z.any() and scene is not None:
         leave_out(low_z, "their receiver's height is empty, and the 3D map needs it: fill in "

@@ -17,7 +17,7 @@ from scipy.constants import speed_of_light
 
 from radiotwin.budgets import PATHS, RESPONSE_VALUES, ROWS
 from radiotwin.errors import BadInput
-from radiotwin.files import atomic_file, require_writable
+from radiotwin.files import atomic_file, require_suffix, require_writable
 from radiotwin.map_file import CONVENTIONS
 from radiotwin.paths import statistics
 from radiotwin.paths.images import MAX_INTERACTIONS
@@ -116,8 +116,7 @@ def _check(points_m: np.ndarray, velocity: np.ndarray | None, bandwidth_hz: floa
     if bandwidth_hz is not None and not 0 < bandwidth_hz < np.inf:
         raise BadInput(f"the bandwidth is {bandwidth_hz:g} Hz; it must be positive")
     if out_path is not None:
-        if not str(out_path).endswith(".nc"):
-            raise BadInput(f"{out_path}: unknown format; allowed is .nc")
+        require_suffix(out_path, ".nc")
         require_writable(out_path)
 
 

@@ -21,6 +21,13 @@ SCENE_FILES = frozenset({"scene.toml", "city.xml", "meshes", "preview.png", "bui
 COPIED = ("buildings.csv",)  # beside what is written anew
 
 
+def files_of(scene: Scene) -> list[Path]:
+    """Return the files and folders that a scene is read from, and its tables."""
+    ends: list[DeviceConfig | UavConfig] = [*scene.config.devices, *scene.config.uavs]
+    names = SCENE_FILES | {end.antenna for end in ends if end.antenna is not None}
+    return [scene.folder / name for name in sorted(names)]
+
+
 def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | None = None) -> None:
     """Raise BadInput if writing the folder would erase something else.
 

@@ -10,10 +10,10 @@ from scipy.constants import speed_of_light
 
 from radiotwin.antennas import Antenna
 from radiotwin.budgets import ROWS
-from radiotwin.cells import read_cells, write_csv
+from radiotwin.cells import as_numbers, listed, read_cells, write_csv
 from radiotwin.errors import BadInput
 from radiotwin.execution import Executor
-from radiotwin.files import atomic_path, require_writable
+from radiotwin.files import atomic_path, require_suffix, require_writable
 from radiotwin.geodesy import to_local
 from radiotwin.pieces import KeptParts
 from radiotwin.scene import Scene
@@ -24,6 +24,8 @@ from radiotwin.trace.run import device_indices
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import IMPOSSIBLE_DB
 from radiotwin.trace.tiles import with_radius
+
+MAX_APART_M = 1.0  # two positions of a point in a file, rounded to 1e-5 degrees
 
 
 def trace_gains(scene: Scene, device_m: np.ndarray, points_m: np.ndarray, settings: SolverSettings,
@@ -100,8 +102,7 @@ def trace_points(scene: Scene, points_m: np.ndarray, settings: SolverSettings | 
         RunFailed: No usable libLLVM.
     """
     if out_path is not None:
-        if not str(out_path).endswith((".csv", ".csv.gz")):
-            raise BadInput(f"{out_path}: unknown format; allowed are .csv and .csv.gz")
+        require_suffix(out_path, ".csv", ".csv.gz")
         require_writable(out_path)
     settings = settings or SolverSettings.of_quality()
     points_m = np.asarray(points_m, dtype=float).reshape(-1, 3)
@@ -157,11 +158,13 @@ def read_points(path: Path | str, origin: Origin | None = None,
     columns = (["latitude_deg", "longitude_deg", height] if geographic else ["x_m", "y_m", height])
     missing = [name for name in columns if name not in raw]
     if missing:
-        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {columns}, it has "
-                       f"{list(raw.columns)}")
+        raise BadInput(f"{path}: column {missing[0]!r} is missing; it needs {', '.join(columns)}, "
+                       f"it has {listed(raw.columns)}")
     if raw.empty:
         raise BadInput(f"{path}: has no rows; it needs at least one point")
     points = np.column_stack([_numbers(path, raw, name) for name in columns])
+    if origin is not None and not geographic and {"latitude_deg", "longitude_deg"} <= set(raw):
+        _check_agreement(path, raw, points, origin)
     if geographic:
         if origin is None:
             raise BadInput(f"{path} gives latitude and longitude, and the scene has no [origin] in "
@@ -176,6 +179,22 @@ def read_points(path: Path | str, origin: Origin | None = None,
         raise BadInput(f"{path}: row {row + 2}: ({position}) m lies too far from the origin of the "
                        f"local frame; allowed are {-MAX_COORDINATE_M:g} to {MAX_COORDINATE_M:g} m")
     return points
+
+
+def _check_agreement(path: Path, raw: pd.DataFrame, points: np.ndarray, origin: Origin) -> None:
+    """Raise BadInput where x, y (n, 3) are not where latitude and longitude are."""
+    latitude_deg, longitude_deg = (as_numbers(raw[name].astype(str).str.strip())
+                                   for name in ("latitude_deg", "longitude_deg"))
+    known = np.flatnonzero((np.abs(latitude_deg) <= 90) & (np.abs(longitude_deg) <= 360))
+    other_m = np.column_stack(to_local(origin, longitude_deg[known], latitude_deg[known]))
+    apart_m = np.linalg.norm(points[known, :2] - other_m, axis=1)
+    if (apart_m > MAX_APART_M).any():
+        i = int(np.argmax(apart_m > MAX_APART_M))
+        raise BadInput(
+            f"{path}: row {known[i] + 2}: x_m, y_m = {points[known[i], 0]:g}, "
+            f"{points[known[i], 1]:g} is {apart_m[i]:,.0f} m from latitude_deg, longitude_deg = "
+            f"{latitude_deg[known[i]]:g}, {longitude_deg[known[i]]:g} about the scene's origin "
+            f"({(apart_m > MAX_APART_M).sum()} such rows); leave out the wrong two columns")
 
 
 def _numbers(path: Path, raw: pd.DataFrame, name: str) -> np.ndarray:

@@ -12,6 +12,7 @@ from radiotwin.channel.path_kriging import PathKriging
 from radiotwin.errors import BadInput
 from radiotwin.execution import Executor
 from radiotwin.links import join_links, prepare_links
+from radiotwin.links.checks import COPIED, copied_rows, refuse_empty_levels
 from radiotwin.localize import LocalizeSettings
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
@@ -57,7 +58,8 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
         BadInput: no anchor, nothing detected, links that no channel can be learnt from, an unknown
             model, or devices that may be indoors with one that follows paths.
     """
-    flights, measurements = measurements.flights, _thinned(measurements, seed)
+    flights = measurements.flights
+    measurements = _thinned(_usable(measurements), seed)
     if start is not None:
         start.warn_of_another_scene(scene, scene.content_hash())
     channel = channel_named(model)
@@ -78,6 +80,17 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
     twin = fit_links(links, scene, channel, seed, start, settings)
     twin.provenance.update(flights=flights, seed=seed)
     return twin
+
+
+def _usable(measurements: Measurements) -> Measurements:
+    """Return the links without copies; raise BadInput where all levels are equal."""
+    if np.isfinite(measurements.level_db).any():  # where none is, the model says what it lacks
+        refuse_empty_levels(measurements.level_db, measurements.level_column)
+    copied = copied_rows(measurements.table)
+    if not copied.any():
+        return measurements
+    warnings.warn(f"{copied.sum():,} of {len(copied):,} links left out: {COPIED}", stacklevel=3)
+    return measurements.select(~copied)
 
 
 def _warn(notes: list[str]) -> None:

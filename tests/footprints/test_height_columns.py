@@ -79,6 +79,11 @@ def test_no_known_column_is_an_error_that_lists_the_columns(tmp_path):
     assert tops == [(12, "default")] * 2 and not report.problems
 
 
+def test_a_known_column_without_a_usable_value_is_named(tmp_path):
+    with pytest.raises(BadInput, match=r"column 'height' holds none above 0 and up to 1,000 m, only such as -5"):
+        build(tmp_path, [{"height": -5, "id": 1}, {"height": -5, "id": 2}])
+
+
 def test_an_elevation_without_its_ground_is_explained(tmp_path):
     with pytest.raises(BadInput, match=r"b3_h_dak_max is an elevation, .* \(b3_h_maaiveld\) has to be subtracted"):
         build(tmp_path, [{"b3_h_dak_max": 12.5}])

@@ -110,8 +110,9 @@ def test_a_decimal_comma_is_not_a_separator_of_thousands(read):
 def test_encodings_that_are_declared_and_wrong(read):
     with pytest.raises(BadInput, match="is not text in utf-8; give another --encoding"):
         read("ü".encode("latin-1") + b",a\n1,2\n", encoding="utf-8")
-    with pytest.raises(ValueError, match="unknown; allowed are utf-8"):
-        Settings(encoding="hex")
+    for name in ("hex", "idna", "punycode", "unicode_escape", "raw-unicode-escape", "undefined", "none"):
+        with pytest.raises(ValueError, match="unknown; allowed are utf-8"):
+            Settings(encoding=name)
     _, table = read("a,b\nü,1\n".encode("utf-16-le"), encoding="utf-16-le")
     assert table == [["a", "b"], ["ü", "1"]]
 

@@ -80,7 +80,9 @@ def test_local_and_geographic_positions_need_an_origin():
     ("EPSG:1", 0, 0, "EPSG:1.*is unknown.*such as EPSG:32633"),
     ("EPSG:4326", 11, 48, "not a projected one"),
     ("EPSG:32632", 11, 48, "x, y = 11, 48 is latitude 0.000, longitude 4.511, far outside"),
-    ("EPSG:32632", 5.3e6, 5e5, "far outside of the area of EPSG:32632.*swapped"),
+    ("EPSG:32632", 5.3e6, 5e5, "far outside of the area of 'EPSG:32632'.*swapped"),
+    ("+proj=utm +zone=32 +ellps=bessel +nadgrids=/etc/passwd", 5e5, 5.3e6, "is unknown.*AUTHORITY:CODE"),
+    ("+init=/etc/passwd:1", 5e5, 5.3e6, "is unknown.*AUTHORITY:CODE"),
 ])
 def test_systems_that_do_not_fit(crs, x, y, message):
     with pytest.raises(BadInput, match=message):

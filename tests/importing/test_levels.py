@@ -30,6 +30,11 @@ def test_not_detected_is_blank_and_not_measured_is_gone(bring_in, local):
         ("not measured", 1, "row 5")]
 
 
+def test_the_word_nan_is_no_empty_cell(bring_in, local):
+    result = bring_in(rows(-80, "", "nan"), columns=local, length_unit="m", not_detected=["empty"], not_measured=["nan"])
+    np.testing.assert_array_equal(result.table["rssi_dbm"], [-80, np.nan])
+
+
 def test_the_threshold_is_in_the_files_unit(bring_in, local):
     result = bring_in(rows("1e-12", "1e-9"), columns=local, length_unit="m", level_unit="mW",
                       not_detected_at_or_below=1e-11)
@@ -51,6 +56,7 @@ def test_impossible_levels_are_counted_and_left_out(bring_in, local, unit, level
      r"column level: level_unit is not given; allowed are dBm, mW and W.*dB.*run from -120 to -60, median -75"),
     ({}, (-90, "weak"), r"row 3, column level: 'weak' is not a number.*not_detected"),
     ({}, (-90, ""), r"row 3, column level: '' is empty; say what that means.*not_detected.*not_measured"),
+    ({"not_detected": ["empty"]}, (-90, "NaN"), r"row 3, column level: 'nan' is not a number.*not_detected.*not_measured"),
     ({}, (-90, "inf"), r"row 3, column level: 'inf' is not a number"),
     ({"level_unit": "dBW"}, (-90,), "level_unit.*dBW.*dBm"),
 ])

@@ -99,6 +99,15 @@ def test_points_that_no_gain_is_for(small_scene, law):
     assert table["gain_db"].notna().tolist() == [False, False, True, False]
 
 
+def test_two_positions_of_a_point_agree(tmp_path):
+    origin = Origin(latitude_deg=47.5, longitude_deg=8.7)
+    text = "x_m,y_m,z_m,latitude_deg,longitude_deg\n0,111.19,3,47.501,8.7\n0,0,3,,\n{},0,3,47.5,8.7\n"
+    same = write(tmp_path / "same.csv", text.format(0.3))
+    assert read_points(same, origin).tolist() == read_points(same).tolist() == [[0, 111.19, 3], [0, 0, 3], [0.3, 0, 3]]
+    with pytest.raises(BadInput, match=r"row 4: x_m, y_m = 50, 0 is 50 m from latitude_deg.* \(1 such rows\)"):
+        read_points(write(tmp_path / "other.csv", text.format(50)), origin)
+
+
 def test_points_in_degrees(tmp_path):
     origin = Origin(latitude_deg=47.5, longitude_deg=8.7)
     path = write(tmp_path / "points.csv", "longitude_deg,latitude_deg,z_m\n8.7,47.5,3\n8.7,47.501,4\n")

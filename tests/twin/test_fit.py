@@ -18,6 +18,19 @@ def test_positions_of_unknown_devices_are_not_read(small_scene, flown, twin):
     assert again.devices == twin.devices
 
 
+def test_levels_that_say_nothing_are_refused(small_scene, flown):
+    constant = Measurements(flown.table.assign(gain_db=-80.0), flown.devices)
+    with pytest.raises(BadInput, match="all levels are -80, so there is nothing to explain"):
+        fit_twin(constant, small_scene, model="log_distance")
+
+
+def test_copies_of_links_are_left_out(small_scene, flown):
+    twice = Measurements(pd.concat([flown.table, flown.table], ignore_index=True), flown.devices)
+    with pytest.warns(UserWarning, match="links left out: they are in the file twice"):
+        again = fit_twin(twice, small_scene, model="log_distance", seed=0)
+    assert again.devices == fit_twin(flown, small_scene, model="log_distance", seed=0).devices
+
+
 def test_anchors_keep_their_positions(flown, twin):
     for device, declared_m in zip(twin.devices, flown.device_m):
         if device.role == "anchor":
