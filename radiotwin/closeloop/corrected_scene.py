@@ -1,6 +1,6 @@
 """The declared scene corrected by what the loop found.
 
-Boxes are added, buildings taken out, roofs raised and lowered, anchors moved, and antennas declared.
+Boxes are added, buildings taken out, roofs raised and lowered, anchors moved, antennas declared.
 """
 
 from dataclasses import replace
