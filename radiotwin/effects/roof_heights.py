@@ -3,7 +3,7 @@
 Many heights are counted from storeys or guessed. A link that passes a roof's edge loses as behind
 two knife edges (ITU-R P.526), but no more than what is left on other paths: the law without line of
 sight. The height of each roof with such links is estimated beside all others, with a prior around
-the map's; a roof that few links tell of stays about where it is.
+the map's; a roof of which the links do not tell one bit stays where it is.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ OFFSETS_M = np.arange(-8.0, 8.25, 0.5)  # that are tried
 LEAST_SHARE = 0.2  # of a roof's height that is left
 TELLING_DB = 1.0  # a link tells of a roof if these change it by more
 MIN_LINKS = 8  # that tell of a roof
+MAX_SD_SHARE = 0.5  # of the prior's that may be left of a roof's uncertainty: one bit is learnt
 MIN_OFFSET_M = 0.25  # smaller ones are none
 SWEEPS = 3  # over all roofs, each beside the others as they are
 MAX_LINKS = 6000  # that are looked at
@@ -197,6 +198,8 @@ class _Search:
         share /= share.sum()
         mean_m = float(share @ offsets_m)
         spread_m = np.sqrt(share @ (offsets_m - mean_m) ** 2 + np.diff(offsets_m)[0] ** 2 / 12)
+        if spread_m > MAX_SD_SHARE * PRIOR_SD_M:
+            return 0.0, PRIOR_SD_M
         slope = float(np.median(self._slope[link[telling]]))
         return mean_m, float(np.hypot(spread_m, WALL_SD_M * slope))
 
