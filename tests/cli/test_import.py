@@ -174,7 +174,7 @@ LOCAL = "--columns level=l,device=d,x=x,y=y --level-unit dBm --length-unit m -o 
     ("d,x,y,l,h\na,0,0,-80,1e300\n", LOCAL.replace("y=y", "y=y,heading=h"), "row 2, column h: '1e300' is out of range"),
     ("d,x,y,l\n\x1b[2Ja,0,0,-80\n", LOCAL, r"column d: '\x1b[2Ja' is no name"),
     ("d,x,y,l\na,1e300,0,-80\n", LOCAL, "1e+297 km from the origin"),
-    ("d,x,y,l\na,1e300,0,-80\n", LOCAL + " --crs EPSG:32633", "1e+300, 0 is no place of"),
+    ("d,x,y,l\na,1e300,0,-80\n", LOCAL + " --crs EPSG:32633", "far outside of the area of"),
     (f"d,x,y,l\nb,{'9' * 6000},0,-80\n", LOCAL, "is not a number"),
     ("d,x,y,l\na,0,0,-80\n", LOCAL.replace("out", "n" * 300), "cannot write"),
     ("d,x,y,l\na,0,0,-80\n", LOCAL + " --devices " + "n" * 300 + ".csv", "cannot be read"),
