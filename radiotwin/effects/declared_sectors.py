@@ -178,11 +178,10 @@ class DeclaredSectors(SectorAntenna):
         # The common one is the channel's.
         shares = np.column_stack([_shared(params)[:, 1:], np.eye(len(params.devices))])
         level_db = shares @ estimate.coefficients[1:]
-        variance = np.einsum("ij,jk,ik->i", shares, estimate.covariance[1:, 1:], shares)
-        for device, value_db, sd_db in zip(params.devices, level_db, np.sqrt(variance),
-                                           strict=True):
+        sd_db = estimate.sd_of(np.column_stack([np.zeros(len(shares)), shares]))
+        for device, value_db, each_sd_db in zip(params.devices, level_db, sd_db, strict=True):
             reported[f"gain_db[{links.device_names[device]}]"] = Parameter.normal(
-                float(value_db), float(sd_db), "dB")
+                float(value_db), float(each_sd_db), "dB")
         return reported
 
 

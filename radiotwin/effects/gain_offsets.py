@@ -93,8 +93,7 @@ class _GainOffset(GainEffect):
         order = np.argsort(estimate.coefficients)
         median = order[len(order) // 2]
         contrast = np.eye(len(order)) - np.eye(len(order))[median]
-        variance = np.einsum("ij,jk,ik->i", contrast, estimate.covariance, contrast)
-        sd_db, names = np.sqrt(np.maximum(variance, 0)), self._names(links)
+        sd_db, names = estimate.sd_of(contrast), self._names(links)
         return {f"offset_db[{names[member]}]": Parameter.normal(value_db, each_sd_db, "dB")
                 for member, value_db, each_sd_db in zip(
                     params.members, contrast @ estimate.coefficients, sd_db)}

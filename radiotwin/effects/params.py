@@ -1,6 +1,6 @@
 """Parameters of an effect: typed, with units and bounds, for the search and for the report."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
@@ -134,19 +134,25 @@ class Estimate:
 
     Attributes:
         coefficients: (q,) of the columns of its term.
-        covariance: (q, q) of them.
+        covariances: (q, q) of them, by each way in which links may err alike.
         sides_sd: (2, r) standard deviations of the r numbers of its `variation`, below and above
             them, all other numbers and coefficients unknown, too.
     """
 
     coefficients: np.ndarray
-    covariance: np.ndarray
+    covariances: Sequence[np.ndarray]
     sides_sd: np.ndarray
 
     @property
     def coefficients_sd(self) -> np.ndarray:
         """(q,) standard deviations of the coefficients."""
-        return np.sqrt(np.diag(self.covariance))
+        return self.sd_of(np.eye(len(self.coefficients)))
+
+    def sd_of(self, shares: np.ndarray) -> np.ndarray:
+        """Return standard deviations (m,) of weighted sums, (m, q), of coefficients: the widest."""
+        variance = np.max([np.einsum("ij,jk,ik->i", shares, each, shares)
+                           for each in self.covariances], axis=0)
+        return np.sqrt(np.maximum(variance, 0.0))
 
     @property
     def params_sd(self) -> np.ndarray:

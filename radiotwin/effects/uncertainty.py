@@ -44,15 +44,17 @@ def estimates(model: FoldModel, result: FitResult) -> list[Estimate]:
     clusterings = [evidence_blocks(links), places(links)]
     if len(np.unique(links.flight)) >= MIN_FLIGHTS:
         clusterings.append(links.flight)
-    covariance = scores.covariance(clusterings)
+    covariances = scores.covariances(clusterings)
+    every_sd = np.sqrt(np.max([np.diag(each) for each in covariances], axis=0))
     first, found = len(result.coefficients), []
     for own, of_effect, variation in zip(model.coefficient_slices, secants, variations,
                                          strict=True):
-        sd = np.sqrt(np.diag(covariance))[first:first + len(of_effect)]
+        sd = every_sd[first:first + len(of_effect)]
         if variation is not None:
             sd = np.hypot(sd, variation.resolution_sd)
         sides = np.reshape([each.sides for each in of_effect], (-1, 2)).T
-        found.append(Estimate(result.coefficients[own], covariance[own, own], sd * sides))
+        found.append(Estimate(result.coefficients[own],
+                              [each[own, own] for each in covariances], sd * sides))
         first += len(of_effect)
     return found
 

@@ -46,18 +46,19 @@ class Scores:
         """(q, q) inverse of the information of rows and prior."""
         return np.linalg.inv(_dense(self.root.T @ self.root) + np.diag(self.precision + 1e-12))
 
-    def covariance(self, clusterings: list[np.ndarray]) -> np.ndarray:
-        """Return a covariance (q, q) whose 1.645 standard deviations are the end of 90 % intervals.
+    def covariances(self, clusterings: list[np.ndarray]) -> list[np.ndarray]:
+        """Return covariances (q, q) whose 1.645 standard deviations are the end of 90 % intervals.
 
-        Of each parameter the widest of: independent rows, and each clustering with its t quantile.
+        First that of independent rows, then of each clustering, with its t quantile. The interval
+        of a parameter, or of a sum or difference of some, is the widest of them. What hangs on too
+        few clusters has the standard deviation of independent rows.
 
         Args:
             clusterings: (n,) integer labels of rows that err alike, such as places, or flights.
         """
         bread, information = self.bread, _dense(self.root.T @ self.root)
-        best = bread @ (information + np.diag(self.prior_score_variance)) @ bread
-        sd = np.sqrt(np.diag(best))
-        shape = best / np.outer(sd, sd)
+        alone = bread @ (information + np.diag(self.prior_score_variance)) @ bread
+        found = [alone]
         for label in clusterings:
             own = np.unique(label, return_inverse=True)[1].ravel()
             count = own.max() + 1
@@ -68,12 +69,9 @@ class Scores:
             clusters = self._effective_clusters(bread, own, count)
             widening = t.ppf(QUANTILE, np.maximum(clusters - 1, 1.0)) / norm.ppf(QUANTILE)
             own_sd = np.sqrt(np.maximum(np.diag(clustered), 1e-300))
-            wider = own_sd * widening > sd
-            wider &= clusters >= MIN_CLUSTERS
-            if wider.mean() > 0.5:  # correlations of the clustering that most widths come from
-                shape = clustered / np.outer(own_sd, own_sd)
-            sd = np.where(wider, own_sd * widening, sd)
-        return shape * np.outer(sd, sd)
+            sd = np.where(clusters >= MIN_CLUSTERS, own_sd * widening, np.sqrt(np.diag(alone)))
+            found.append(clustered * np.outer(sd / own_sd, sd / own_sd))
+        return found
 
     def _clustered(self, bread: np.ndarray, own: np.ndarray, count: int) -> np.ndarray:
         """Return the covariance (q, q) by clusters (n,) that err by themselves.

@@ -83,7 +83,7 @@ def test_a_step_is_somewhere_between_two_readings():
                             time_s=np.tile([0.0, 10.0, 20.0, 80.0, 90.0, np.nan], 2), level_db=np.zeros(12))
     links.level_db[2] = np.nan  # which shows nothing
     params = ReceiverDrift.Params(receivers={0: Drift("step", 50.0)})
-    when = ReceiverDrift().parameters(links, params, Estimate(np.zeros(2), np.eye(2), np.zeros((2, 0))))["step_time_s[u0]"]
+    when = ReceiverDrift().parameters(links, params, Estimate(np.zeros(2), [np.eye(2)], np.zeros((2, 0))))["step_time_s[u0]"]
     assert (when.low, when.value, when.high) == (10.0, 50.0, 80.0)
 
 

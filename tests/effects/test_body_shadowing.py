@@ -82,7 +82,7 @@ def test_what_was_found_is_reported_for_each_receiver(links):
     params = BodyShadowing.Params(receivers={1: Body(depth_db=8.0, azimuth_deg=420.0, elevation_deg=5.0)})
     variation = BodyShadowing().variation(params)
     assert variation.params(variation.values) == params and len(variation.members) == 1
-    found = BodyShadowing().parameters(links, params, Estimate(np.zeros(0), np.zeros((0, 0)), np.ones((2, 4))))
+    found = BodyShadowing().parameters(links, params, Estimate(np.zeros(0), [np.zeros((0, 0))], np.ones((2, 4))))
     assert {name: parameter.value for name, parameter in found.items()} == {
         "body_depth_db[r1]": 8, "body_azimuth_deg[r1]": 60, "body_elevation_deg[r1]": 5,
         "body_width_deg[r1]": 180}

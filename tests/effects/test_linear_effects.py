@@ -28,7 +28,7 @@ def test_an_offset_is_added_to_its_own_links(links, view, effect, kind):
 
 def test_offsets_are_reported_relative_to_the_median_member_with_the_error_of_the_difference(links):
     covariance = np.array([[0.5, 0.1, 0.2], [0.1, 0.4, 0.0], [0.2, 0.0, 0.9]])
-    estimate = Estimate(np.array([5.0, -1.0, 2.0]), covariance, np.zeros((2, 0)))
+    estimate = Estimate(np.array([5.0, -1.0, 2.0]), [0.3 * np.eye(3), covariance], np.zeros((2, 0)))
     params = DeviceGainOffset.Params(members=[0, 1, 2], offsets_sd_db=2.5)
     offsets = DeviceGainOffset().parameters(links, params, estimate)
     assert [offsets[f"offset_db[d{i}]"].value for i in range(3)] == [3.0, -3.0, 0.0]
