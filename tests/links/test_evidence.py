@@ -11,6 +11,7 @@ from radiotwin.links import (
     LinkData,
     correlation_length_m,
     evidence_blocks,
+    places,
     residual_variables,
     with_evidence,
 )
@@ -65,6 +66,23 @@ def test_pieces_are_as_wide_as_errors_are_alike():
     assert widest <= length_m + 1e-9
     some = marked.select(np.arange(50))
     np.testing.assert_array_equal(evidence_blocks(some), block[:50])  # fixed once: candidates are compared on the same
+
+
+def test_another_flight_and_receiver_over_the_same_ground_is_at_the_same_places():
+    once = flown(0, 40.0)
+    marked = with_evidence(once, once.level_db)
+    both = once.select(np.tile(np.arange(len(once)), 2))
+    second = np.arange(len(both)) >= len(once)
+    both = replace(both, flight=both.flight + 6 * second, receiver=second.astype(int), receiver_names=["r0", "r1"],
+                   flight_names=[f"f{i}" for i in range(12)], tracks=None, time_in_flight_s=None)
+    twice = with_evidence(both, both.level_db)
+    count = {name: [len(np.unique(label(each))) for each in (marked, twice)]
+             for name, label in (("places", places), ("pieces", evidence_blocks))}
+    assert count["places"][1] < 1.2 * count["places"][0] and count["pieces"][1] > 1.7 * count["pieces"][0]
+    assert count["places"][0] < count["pieces"][0]
+    np.testing.assert_array_equal(places(twice)[second], places(twice)[~second])
+    widest = max(np.ptp(once.receiver_m[places(marked) == each, :2], axis=0).max() for each in np.unique(places(marked)))
+    assert widest > correlation_length_m(once, once.level_db)
 
 
 def test_a_campaign_within_100_m_is_cut_into_smaller_pieces_and_says_so():
