@@ -47,7 +47,7 @@ def _calibration(loop: Loop) -> RadiusCalibration:
     model, links = loop.after, loop.links
     if model.whole.channel.follows_paths:  # which locates nothing: `check_can_locate`
         return RadiusCalibration()
-    models = [EffectModel.of(fold, fit)
+    models = [EffectModel.of(fold, fit).for_positions()
               for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
     held_out = [links.select(model.index == number) for number in range(len(models))]
     return calibrate_radii(models, held_out, whole_area(models[0], links), 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -119,6 +119,15 @@ class EffectModel:
                    result.coefficients[:model.level_columns.shape[1]], result.scale_db, model.dof,
                    model.links.device_m, tuple(model.links.receiver_names), model.links.first_s,
                    sd_db, unheard=Unheard.of(model, result, sd_db))
+
+    def for_positions(self) -> EffectModel:
+        """Return the same without what the base says of errors of a map.
+
+        A position is sought over thousands of links, each of which that would follow over nine
+        maps; how far errors of a map displace devices is in `radius_factor`.
+        """
+        return replace(self, effects=tuple(each for each in self.effects if each.effect.is_cause
+                                           or not each.effect.is_declared))
 
     def on_links(self, links: LinkData) -> tuple[FoldModel, FitResult]:
         """Return the model of any links (n,), and the fit that goes with it.

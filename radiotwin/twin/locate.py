@@ -61,8 +61,8 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
             twin's, or nothing that can be used.
     """
     check_can_locate(twin, scene)
-    model = twin.fitted
-    assert model is not None
+    assert twin.fitted is not None
+    model = twin.fitted.for_positions()
     measurements = in_known_frame(measurements, twin.origin, "the twin")
     unknown = measurements.select(~measurements.is_anchor[measurements.device_index])
     if unknown.table.empty:
