@@ -168,14 +168,20 @@ def buildings(city: CityMap) -> tuple[np.ndarray, np.ndarray]:
                        shape=(vertex.max() + 1,) * 2)
     component = connected_components(graph, directed=False)[1]
     label = np.unique(component[faces[:, 0]], return_inverse=True)[1]
+    low_m, high_m = building_extents_m(city, label)
+    centre_m = np.column_stack([0.5 * (low_m + high_m)[:, :2], high_m[:, 2]])
+    label.flags.writeable = centre_m.flags.writeable = False
+    return label, centre_m
+
+
+def building_extents_m(city: CityMap, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the least and the greatest x, y and z (buildings, 3) of faces by their label (f,)."""
     corners_m = city.vertices[city.faces]
     low_m = np.full((label.max() + 1, 3), np.inf)
     high_m = -low_m
     np.minimum.at(low_m, label, corners_m.min(axis=1))
     np.maximum.at(high_m, label, corners_m.max(axis=1))
-    centre_m = np.column_stack([0.5 * (low_m + high_m)[:, :2], high_m[:, 2]])
-    label.flags.writeable = centre_m.flags.writeable = False
-    return label, centre_m
+    return low_m, high_m
 
 
 @lru_cache(maxsize=32)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from radiotwin.effects.boxes import Box, cross, two_edges_db
-from radiotwin.effects.removed_obstacle import buildings
+from radiotwin.effects.removed_obstacle import building_extents_m, buildings
 from radiotwin.scene.citymap import CityMap
 
 SAMPLES = 24  # points of a link over the box around a building
@@ -100,17 +100,11 @@ def _roof_over_m(city: CityMap, points_m: np.ndarray, is_mine: np.ndarray) -> np
 def _boxes(city: CityMap) -> dict[int, Box]:
     """Return a bottomless box around each building; the ground is none."""
     label = buildings(city)[0]
-    count = int(label.max()) + 1
-    corners_m = city.vertices[city.faces][:, :, :2]
-    low_m = np.full((count, 2), np.inf)
-    high_m = -low_m
-    np.minimum.at(low_m, label, corners_m.min(axis=1))
-    np.maximum.at(high_m, label, corners_m.max(axis=1))
-    built = np.bincount(label[~city.on_ground], minlength=count) > 0
+    low_m, high_m = building_extents_m(city, label)
+    middle_m, size_m = 0.5 * (low_m + high_m), high_m - low_m
     found = {}
-    for building in np.flatnonzero(built).tolist():
-        (x_m, y_m), (length_m, width_m) = (0.5 * (low_m + high_m)[building],
-                                           (high_m - low_m)[building])
-        found[building] = Box(float(x_m), float(y_m), float(length_m), float(width_m),
-                              BOTTOMLESS_M, 0.0)
+    for building in np.unique(label[~city.on_ground]).tolist():
+        (x_m, y_m, _), (length_m, width_m, _) = (each[building].tolist()
+                                                 for each in (middle_m, size_m))
+        found[building] = Box(x_m, y_m, length_m, width_m, BOTTOMLESS_M, 0.0)
     return found

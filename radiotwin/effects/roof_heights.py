@@ -3,12 +3,13 @@
 Many heights are counted from storeys or guessed. A link that passes a roof's edge loses as behind
 two knife edges (ITU-R P.526), but no more than what is left on other paths: the law without line of
 sight. The height of each roof with such links is estimated beside all others, with a prior around
-the map's; a roof of which the links do not tell one bit stays where it is.
+the map's; a roof whose uncertainty its links do not halve stays where it is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,7 @@ from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.effects.roof_crossings import roof_crossings
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkData
+from radiotwin.scene.citymap import CityMap
 
 PRIOR_SD_M = 3.0  # a storey
 WALL_SD_M = 1.0  # where an edge is not known better, neither is how high above it a link passes
@@ -67,7 +69,7 @@ class RoofHeights(GainEffect):
     is_cause = False
 
     class Params(EffectParams):
-        """The roofs that links tell of."""
+        """Roofs whose heights links decide."""
 
         roofs: tuple[Roof, ...] = Field(description="Roofs, and how much higher they are.")
 
@@ -103,7 +105,7 @@ class RoofHeights(GainEffect):
         rows, link = np.unique(ways.link, return_inverse=True)
         if not len(rows):
             return Term.of_offset(offset_db)
-        others = city.without(np.isin(buildings(city)[0], which))
+        others = _without(city, tuple(which.tolist()))
         hidden = ~others.line_of_sight(ends_m[0][rows], ends_m[1][rows])
         wavelength_m = speed_of_light / links.frequency_hz
         before_db, after_db = (np.where(hidden, HIDDEN_DB, 0.0) for _ in range(2))
@@ -202,6 +204,12 @@ class _Search:
             return 0.0, PRIOR_SD_M
         slope = float(np.median(self._slope[link[telling]]))
         return mean_m, float(np.hypot(spread_m, WALL_SD_M * slope))
+
+
+@lru_cache(maxsize=8)
+def _without(city: CityMap, which: tuple[int, ...]) -> CityMap:
+    """Return the map without some buildings; a map is predicted in many batches over the same."""
+    return city.without(np.isin(buildings(city)[0], which))
 
 
 def _contrast_db(links: LinkData, level_at: LevelAt) -> np.ndarray:
