@@ -137,17 +137,14 @@ class CrossValidatedModel:
 def same_effects(whole: FoldModel, fold: FoldModel) -> list[int | None]:
     """Return the place in a fold of each effect of the whole; None for what it has not found.
 
-    Of several of a kind, of which a fold lacks some, those are the same that act on the same links:
-    one faulty flight is not another.
+    Of several of a kind those are the same that act on the same links: one faulty flight is not
+    another. Where a fold has as many, each is one of them, if in another order.
     """
     places: list[int | None] = [None] * len(whole.effects)
     for effect in dict.fromkeys(each.effect for each in whole.effects):
         of_whole, of_fold = ([place for place, each in enumerate(model.effects)
                               if each.effect is effect] for model in (whole, fold))
-        pairs = list(zip(of_whole, of_fold, strict=False))
-        if len(of_whole) != len(of_fold):
-            pairs = _on_the_same_links(whole, fold, of_whole, of_fold)
-        for place, found in pairs:
+        for place, found in _on_the_same_links(whole, fold, of_whole, of_fold):
             places[place] = found
     return places
 
@@ -155,15 +152,19 @@ def same_effects(whole: FoldModel, fold: FoldModel) -> list[int | None]:
 def _on_the_same_links(whole: FoldModel, fold: FoldModel, of_whole: list[int],
                        of_fold: list[int]) -> list[tuple[int, int]]:
     """Return pairs of places of one kind of effect whose links overlap most, all in all."""
-    shared = np.zeros((len(of_whole), len(of_fold)))
+    as_many = len(of_whole) == len(of_fold)
+    if as_many and len(of_whole) == 1:
+        return [(of_whole[0], of_fold[0])]
+    # Where nothing tells them apart, the order in which they were found does.
+    shared = np.eye(len(of_whole), len(of_fold)) * 1e-9
     for row, place in enumerate(of_whole):
         acts = whole.effects[place].acts
         for column, found in enumerate(of_fold):
             others = fold.effects[found].acts
-            shared[row, column] = (acts & others).sum() / max((acts | others).sum(), 1)
+            shared[row, column] += (acts & others).sum() / max((acts | others).sum(), 1)
     return [(of_whole[row], of_fold[column])
             for row, column in zip(*linear_sum_assignment(shared, maximize=True), strict=True)
-            if shared[row, column] > 0]
+            if as_many or shared[row, column] > 1e-9]
 
 
 def without_quality(model: CrossValidatedModel) -> CrossValidatedModel:

@@ -33,6 +33,7 @@ from radiotwin.closeloop.scoring import (
 from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.base import DetectionEffect, Effect
 from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.gain_drift import DeviceDrift, ReceiverDrift
 from radiotwin.links import LinkData, evidence_blocks
 from radiotwin.links.correlation import devices_move
 
@@ -122,14 +123,16 @@ def _acts(candidate: Candidate) -> np.ndarray:
 def drop_idle_faults(result: SelectionResult) -> None:
     """Take back what the effects that were found later explain: an emitter is no episode.
 
-    Faults come first, and are held against no other effect.
+    Faults and steps in time come first, and are held against no other effect.
 
     Args:
-        result: is changed where a fault gains nothing any more on the links that it is fitted to.
+        result: is changed where one gains nothing any more on the links that it is fitted to.
     """
     for number in reversed(range(len(result.model.whole.effects))):
         whole, applied = result.model.whole, result.model.whole.effects[number]
-        if not applied.effect.within_flights:
+        timed = applied.effect.within_flights or isinstance(applied.effect,
+                                                            ReceiverDrift | DeviceDrift)
+        if not timed:
             continue
         alone = whole.with_effects([each for each in whole.effects if each is not applied])
         fit = alone.fit()

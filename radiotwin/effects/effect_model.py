@@ -121,13 +121,15 @@ class EffectModel:
                    sd_db, unheard=Unheard.of(model, result, sd_db))
 
     def for_positions(self) -> EffectModel:
-        """Return the same without what the base says of errors of a map.
+        """Return the same without what takes too long for each place where a device may be.
 
-        A position is sought over thousands of links, each of which that would follow over nine
-        maps; how far errors of a map displace devices is in `radius_factor`.
+        That is what the base says of errors of a map, for which each link is followed over nine
+        maps, and effects that follow paths. How far their lack displaces devices is in
+        `radius_factor`.
         """
-        return replace(self, effects=tuple(each for each in self.effects if each.effect.is_cause
-                                           or not each.effect.is_declared))
+        return replace(self, effects=tuple(
+            each for each in self.effects if not each.effect.in_paths
+            and (each.effect.is_cause or not each.effect.is_declared)))
 
     def on_links(self, links: LinkData) -> tuple[FoldModel, FitResult]:
         """Return the model of any links (n,), and the fit that goes with it.

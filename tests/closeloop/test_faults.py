@@ -7,14 +7,25 @@ import pandas as pd
 import pytest
 
 import radiotwin as rt
-from radiotwin.closeloop.cross_validation import CrossValidatedModel, same_effects
-from radiotwin.closeloop.faults import _without
+from radiotwin.closeloop.bases import make_bases
+from radiotwin.closeloop.change_points import with_effect
+from radiotwin.closeloop.cross_validation import (
+    CrossValidatedModel,
+    cross_validate,
+    same_effects,
+    training_parts,
+)
+from radiotwin.closeloop.faults import _without, drop_idle_faults
+from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.scoring import CandidateScore
+from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.base import Term
 from radiotwin.effects.episode import Episode
 from radiotwin.effects.faulty_flight import FaultyFlight
 from radiotwin.effects.fold_model import AppliedEffect
 from radiotwin.effects.gain_drift import Drift, ReceiverDrift
 from radiotwin.effects.params import Estimate
+from radiotwin.links import prepare_links
 from radiotwin.measurements import Measurements
 
 LOSS_DB, BEGIN_S, END_S = 9.0, 330.0, 365.0
@@ -108,6 +119,30 @@ def test_one_fault_is_not_another_where_a_fold_has_not_seen_the_first(effect):
     assert same_effects(whole, model_of(first, trend)) == [0, 1, None]
     assert same_effects(whole, model_of(on_links(effect, 40, 50))) == [None, None, None]
     assert same_effects(whole, model_of()) == [None, None, None]
+
+
+@pytest.mark.parametrize("effect", [FaultyFlight(), Episode()])
+def test_two_of_a_kind_that_a_fold_found_in_another_order_are_not_swapped(effect):
+    first, second = on_links(effect, 10, 30), on_links(effect, 60, 80)
+    whole = model_of(first, second)
+    assert same_effects(whole, model_of(on_links(effect, 61, 80), on_links(effect, 10, 28))) == [1, 0]
+    assert same_effects(whole, model_of(on_links(effect, 31, 40), on_links(effect, 40, 50))) == [0, 1]
+    assert same_effects(whole, model_of(on_links(effect, 31, 40), on_links(effect, 15, 50))) == [1, 0]
+
+
+@pytest.mark.parametrize("step_db", [0.0, 8.0])
+def test_a_step_that_other_effects_explain_is_taken_back(step_db):
+    links = prepare_links(campaign(4, loss_db=0.0, step_db=step_db), None)
+    folds = make_folds(links, 0, "flight")
+    model = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
+    result = SelectionResult(model)
+    step = ReceiverDrift.Params(receivers={0: Drift("step", 600.0)})
+    result.keep(CandidateScore("receiver_drift", step=0), with_effect(model, ReceiverDrift(True), step))
+    drop_idle_faults(result)
+    stays = step_db > 0
+    assert len(result.model.whole.effects) == len(result.rivals) == stays
+    assert result.scores[0].kept == stays
+    assert [len(fold.effects) for fold in result.model.folds] == [stays] * 5
 
 
 def test_what_there_is_one_of_is_the_same_wherever_a_fold_finds_it():
