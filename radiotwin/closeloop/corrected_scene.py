@@ -13,9 +13,10 @@ from radiotwin.closeloop.corrected_antennas import FOLDER as ANTENNAS
 from radiotwin.closeloop.corrected_antennas import with_antennas, write_antenna
 from radiotwin.closeloop.run import Loop
 from radiotwin.effects.boxes import Box
+from radiotwin.effects.mapped_buildings import buildings
 from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.position_errors import DevicePositionError
-from radiotwin.effects.removed_obstacle import RemovedObstacle, buildings
+from radiotwin.effects.removed_obstacle import RemovedObstacle
 from radiotwin.effects.roof_heights import Roof, RoofHeights, surely_off
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_folder, require_writable

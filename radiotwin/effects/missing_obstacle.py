@@ -281,9 +281,10 @@ def _with_box(city: CityMap, box: Box) -> CityMap:
     depth_m = 0.0 if city.terrain is None else max(box.length_m, box.width_m)  # into a slope
     pose[:3, 3] = box.x_m, box.y_m, base_m + 0.5 * (box.height_m - depth_m)
     mesh = trimesh.creation.box((box.length_m, box.width_m, box.height_m + depth_m), pose)
-    material = np.concatenate([city.material, np.full(len(mesh.faces), len(city.materials))])
+    count = len(mesh.faces)
+    material = np.concatenate([city.material, np.full(count, len(city.materials))])
+    terrain, height_sd_m = (None if each is None else np.concatenate([each, np.full(count, own)])
+                            for each, own in ((city.terrain, False), (city.height_sd_m, np.nan)))
     return CityMap(np.vstack([city.vertices, mesh.vertices]),
                    np.vstack([city.faces, mesh.faces + len(city.vertices)]),
-                   (*city.materials, CONCRETE), material, city.vegetation,
-                   None if city.terrain is None
-                   else np.concatenate([city.terrain, np.zeros(len(mesh.faces), dtype=bool)]))
+                   (*city.materials, CONCRETE), material, city.vegetation, terrain, height_sd_m)

@@ -13,13 +13,12 @@ from functools import lru_cache
 
 import numpy as np
 from pydantic import Field
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from typing_extensions import override
 
 from radiotwin.effects.arrays import city_of
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.boxes import Box, near_box, obstruction_nats
+from radiotwin.effects.mapped_buildings import building_height_sds_m, buildings
 from radiotwin.effects.params import EffectParams, Estimate, Metres, Parameter
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.errors import BadInput
@@ -29,8 +28,7 @@ from radiotwin.scene.citymap import CityMap
 MAX_PROPOSALS = 4  # of buildings whose removal is tried exactly
 MIN_LINKS = 8  # that a building hides
 RISES_DB = (-4.0, -8.0, -12.0, -16.0, -20.0)  # losses that a link behind it would not have
-WELD_M = 0.05  # vertices closer together belong to one building
-LOWER_M = (2.5, 5.0)  # by which the height of a mapped building may be off
+LOWER = (5 / 6, 5 / 3)  # standard deviations of its mapped height, by which a building may be lower
 FLAT_M = 0.5  # least height of a building that is lower
 # Very strong evidence (Kass and Raftery 1995, 'Bayes factors', J. Am. Stat. Assoc. 90, Sec. 3.2).
 MIN_LEAD_NATS = 5.0
@@ -77,8 +75,9 @@ class RemovedObstacle(GainEffect):
                  for building in likely}
         for building in sorted(gains, key=gains.__getitem__, reverse=True):
             least = gains[building] - MIN_LEAD_NATS
-            if least > 0 and all(_gain_nats(view, building, _lower(links.city, building, lower_m))
-                                 < least for lower_m in LOWER_M):
+            lower_m = building_height_sds_m(links.city)[building] * np.array(LOWER)
+            if least > 0 and all(_gain_nats(view, building, _lower(links.city, building, by_m))
+                                 < least for by_m in lower_m.tolist()):
                 return [self.Params(building=building, centre_m=tuple(centres_m[building].tolist()),
                                     exact=True)]
         return []
@@ -147,41 +146,6 @@ def only_blocker(links: LinkData) -> np.ndarray:
         same &= ~links.city.terrain[near]
     alone[rows[same]] = label[near[same]]
     return alone
-
-
-@lru_cache(maxsize=4)
-def buildings(city: CityMap) -> tuple[np.ndarray, np.ndarray]:
-    """Group faces that are connected.
-
-    Args:
-        city: a map with f faces.
-
-    Returns:
-        (f,) index of each face's building, and (buildings, 3) centre x, y and height of each [m];
-        read-only, as they are kept for the next call.
-    """
-    welded = np.round(city.vertices / WELD_M).astype(np.int64)
-    vertex = np.unique(welded, axis=0, return_inverse=True)[1].ravel()
-    faces = vertex[city.faces]
-    ends = faces[:, [0, 1, 1, 2]].reshape(-1, 2)
-    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])),
-                       shape=(vertex.max() + 1,) * 2)
-    component = connected_components(graph, directed=False)[1]
-    label = np.unique(component[faces[:, 0]], return_inverse=True)[1]
-    low_m, high_m = building_extents_m(city, label)
-    centre_m = np.column_stack([0.5 * (low_m + high_m)[:, :2], high_m[:, 2]])
-    label.flags.writeable = centre_m.flags.writeable = False
-    return label, centre_m
-
-
-def building_extents_m(city: CityMap, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least and the greatest x, y and z (buildings, 3) of faces by their label (f,)."""
-    corners_m = city.vertices[city.faces]
-    low_m = np.full((label.max() + 1, 3), np.inf)
-    high_m = -low_m
-    np.minimum.at(low_m, label, corners_m.min(axis=1))
-    np.maximum.at(high_m, label, corners_m.max(axis=1))
-    return low_m, high_m
 
 
 @lru_cache(maxsize=32)

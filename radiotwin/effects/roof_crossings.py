@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from radiotwin.effects.boxes import Box, cross, two_edges_db
-from radiotwin.effects.removed_obstacle import building_extents_m, buildings
+from radiotwin.effects.mapped_buildings import building_extents_m, buildings
 from radiotwin.scene.citymap import CityMap
 
 SAMPLES = 24  # points of a link over the box around a building

@@ -19,17 +19,16 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import city_of, subsample
 from radiotwin.effects.base import GainEffect, Term
+from radiotwin.effects.mapped_buildings import building_height_sds_m, buildings
 from radiotwin.effects.params import QUANTILE_90, EffectParams, Estimate, Length, Metres, Parameter
-from radiotwin.effects.removed_obstacle import buildings
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.effects.roof_crossings import roof_crossings
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkData
 from radiotwin.scene.citymap import CityMap
 
-PRIOR_SD_M = 3.0  # a storey
 WALL_SD_M = 1.0  # where an edge is not known better, neither is how high above it a link passes
-OFFSETS_M = np.arange(-8.0, 8.25, 0.5)  # that are tried
+OFFSETS = np.arange(-16, 17) / 6  # that are tried, in standard deviations of the prior
 LEAST_SHARE = 0.2  # of a roof's height that is left
 TELLING_DB = 1.0  # a link tells of a roof if these change it by more
 MIN_LINKS = 8  # that tell of a roof
@@ -165,21 +164,23 @@ class _Search:
 
     def roofs(self) -> tuple[Roof, ...]:
         """Return every roof that is off."""
-        centres_m = buildings(self._city)[1]
+        centres_m, priors_m = buildings(self._city)[1], building_height_sds_m(self._city)
         pairs = {int(building): np.flatnonzero(self._ways.building == building)
                  for building in np.unique(self._ways.building)}
         found: dict[int, Roof] = {}
         for _ in range(SWEEPS):
             for building, mine in pairs.items():
-                offset_m, sd_m = self._estimate(mine, float(centres_m[building, 2]))
+                offset_m, sd_m = self._estimate(mine, float(centres_m[building, 2]),
+                                                float(priors_m[building]))
                 self._loss_db[mine] = self._ways.loss_db(offset_m, self._wavelength_m, mine)
                 x_m, y_m, height_m = centres_m[building].tolist()
                 found[building] = Roof(building, x_m, y_m, height_m, offset_m, sd_m)
         return tuple(roof for roof in found.values() if abs(roof.offset_m) >= MIN_OFFSET_M)
 
-    def _estimate(self, mine: np.ndarray, height_m: float) -> tuple[float, float]:
+    def _estimate(self, mine: np.ndarray, height_m: float, prior_m: float) -> tuple[float, float]:
         """Return mean and sd of what a roof is off by, from its pairs (q,) [m]; 0 if not told."""
-        offsets_m = OFFSETS_M[OFFSETS_M > (LEAST_SHARE - 1) * height_m]
+        offsets_m = prior_m * OFFSETS
+        offsets_m = offsets_m[offsets_m > (LEAST_SHARE - 1) * height_m]
         link = self._ways.link[mine]
         without_db = self._loss_db.copy()
         without_db[mine] = 0.0
@@ -189,19 +190,19 @@ class _Search:
             for offset_m in offsets_m])
         telling = np.ptp(after_db, axis=0) > TELLING_DB
         if telling.sum() < MIN_LINKS:
-            return 0.0, PRIOR_SD_M
+            return 0.0, prior_m
         change_db = (after_db - self._before_db[link])[:, telling]
         rows = self._rows[link[telling]]
         log = np.array([self._view.gain_nats(rows, each_db).sum() for each_db in change_db])
-        log -= 0.5 * (offsets_m / PRIOR_SD_M) ** 2
+        log -= 0.5 * (offsets_m / prior_m) ** 2
         if log.argmax() == 0:  # it may not be there at all, which is not for this to say
-            return 0.0, PRIOR_SD_M
+            return 0.0, prior_m
         share = np.exp(log - log.max())
         share /= share.sum()
         mean_m = float(share @ offsets_m)
         spread_m = np.sqrt(share @ (offsets_m - mean_m) ** 2 + np.diff(offsets_m)[0] ** 2 / 12)
-        if spread_m > MAX_SD_SHARE * PRIOR_SD_M:
-            return 0.0, PRIOR_SD_M
+        if spread_m > MAX_SD_SHARE * prior_m:
+            return 0.0, prior_m
         slope = float(np.median(self._slope[link[telling]]))
         return mean_m, float(np.hypot(spread_m, WALL_SD_M * slope))
 

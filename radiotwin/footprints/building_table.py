@@ -3,8 +3,10 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
+import numpy as np
 import pandas as pd
 
+from radiotwin.footprints.heights import height_sds_m
 from radiotwin.footprints.solids import Prism
 
 
@@ -20,9 +22,12 @@ def building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str],
     Returns:
         Columns building, shape, x_m, y_m (a point inside), area_m2, on terrain ground_m (the lowest
         ground under the building), bottom_m and top_m (as ground_m above the datum), height_from,
-        unusable (tags that were skipped), material, material_from.
+        height_sd_m (see `height_sds_m`), unusable (tags that were skipped), material and
+        material_from.
     """
-    rows = []
+    rows, heights_sd_m = [], height_sds_m(
+        np.array([prism.height.top_m - prism.ground_m for prism in prisms]),
+        np.array([prism.height.sd_m for prism in prisms]))
     for index, prism in enumerate(prisms):
         inside = prism.area.representative_point()
         rows.append({
@@ -32,6 +37,7 @@ def building_table(prisms: Sequence[Prism], shape_of: Mapping[int, str],
             **({"ground_m": prism.ground_m} if on_terrain else {}),
             "bottom_m": round(prism.height.bottom_m, 3),
             "top_m": round(prism.height.top_m, 3), "height_from": prism.height.source,
+            "height_sd_m": round(float(heights_sd_m[index]), 1),
             "unusable": "; ".join(prism.height.unusable), "material": prism.material.name,
             "material_from": prism.material_from})
     return pd.DataFrame(rows)

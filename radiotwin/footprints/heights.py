@@ -10,8 +10,13 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from radiotwin.footprints.height_columns import KNOWN, LEVEL_M, STOREYS, UNITS_M, HeightColumn
 
+TAG_SD_M, STOREYS_SD_M = 1.5, 3.0  # of a height that is given in metres; counted from storeys
+GUESS_SD_M = 6.0  # of a default, where few heights of the map are known
+MIN_KNOWN = 10  # heights of a map that tell how far a default is off
 MAX_HEIGHT_M = 1000.0  # [m], the tallest building has 828 m
 _METRES = re.compile(r"([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*(?:m|meters?|metres?)?", re.IGNORECASE)
 _FEET = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*(?:'|′|’|ft\.?|feet|foot)\s*"
@@ -50,12 +55,14 @@ class Height:
         source: of the top: a tag or column, as `HeightColumn.label` has it, `model` of a solid that
             the file holds, or `default`.
         unusable: tags that were skipped, as `height=-3`.
+        sd_m: standard deviation of the top [m]; NaN of a default.
     """
 
     bottom_m: float
     top_m: float
     source: str
     unusable: list[str] = field(default_factory=list)
+    sd_m: float = TAG_SD_M
 
 
 def height_of(tags: Mapping[str, str], default_m: float,
@@ -75,13 +82,14 @@ def height_of(tags: Mapping[str, str], default_m: float,
         The extent; impossible values are skipped and listed in its `unusable`.
     """
     unusable: list[str] = []
-    top_m, source = default_m, "default"
+    top_m, source, sd_m = default_m, "default", math.nan
     for column in (*((declared,) if declared else ()), *KNOWN):
         if column.name not in tags or (column.ground and column.ground not in tags):
             continue
         value_m = _top_m(column, tags)
         if 0 < value_m <= MAX_HEIGHT_M:
             top_m, source = value_m, column.label
+            sd_m = STOREYS_SD_M if column.unit == STOREYS else TAG_SD_M
             break
         unusable.append(", ".join(f"{name}={tags[name]}" for name in (column.name, column.ground)
                                   if name))
@@ -93,7 +101,28 @@ def height_of(tags: Mapping[str, str], default_m: float,
                 bottom_m = value_m
                 break
             unusable.append(f"{key}={tags[key]}")
-    return Height(bottom_m, top_m, source, unusable)
+    return Height(bottom_m, top_m, source, unusable, sd_m)
+
+
+def height_sds_m(top_m: np.ndarray, sd_m: np.ndarray) -> np.ndarray:
+    """Return how well the height of each building of a map is known, of defaults, too.
+
+    A default is off as far as heights of the same map that are known lie from it.
+
+    Args:
+        top_m: (n,) tops above the ground [m].
+        sd_m: (n,) standard deviation of each as `Height` has it [m]; NaN of a default.
+
+    Returns:
+        (n,) standard deviations [m]
+    """
+    guessed = np.isnan(sd_m)
+    if guessed.any():
+        spread_m = GUESS_SD_M
+        if (~guessed).sum() >= MIN_KNOWN:
+            spread_m = float(np.sqrt(np.mean((top_m[~guessed] - top_m[guessed][0]) ** 2)))
+        sd_m = np.where(guessed, max(spread_m, STOREYS_SD_M), sd_m)
+    return sd_m
 
 
 def source_text(source: str, declared: HeightColumn | None = None) -> str:

@@ -8,7 +8,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.patheffects import withStroke
 
 from radiotwin.display.style import plain
-from radiotwin.effects.removed_obstacle import buildings
+from radiotwin.effects.mapped_buildings import buildings
 from radiotwin.report.closeloop_data import EffectData
 from radiotwin.report.labels import name_label
 from radiotwin.report.style import FOUND

@@ -6,7 +6,7 @@ Rays are cast with Embree [1], which computes in single precision: distances are
 [1] Wald et al., "Embree: a kernel framework for efficient CPU ray tracing", ACM TOG 33(4), 2014.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -48,6 +48,8 @@ class CityMap:
         material: (f,) row of `materials` of each face; None: all are of the first.
         vegetation: Which no ray meets; None: there is none.
         terrain: (f,) bool, faces of a ground that is not flat; None: the ground is flat, at z = 0.
+        height_sd_m: (f,) standard deviation of the mapped height of the building that each face
+            belongs to [m], NaN where nothing is said; None: nothing is said of any.
     """
 
     never_changes = True
@@ -56,7 +58,8 @@ class CityMap:
                  materials: Sequence[Material] = (CONCRETE,),
                  material: np.ndarray | None = None,
                  vegetation: Vegetation | None = None,
-                 terrain: np.ndarray | None = None) -> None:
+                 terrain: np.ndarray | None = None,
+                 height_sd_m: np.ndarray | None = None) -> None:
         self.vertices = np.asarray(vertices, dtype=float)
         self.faces = np.asarray(faces, dtype=int)
         self.materials = tuple(materials)
@@ -65,6 +68,7 @@ class CityMap:
         self.vegetation = Vegetation.of(()) if vegetation is None else vegetation
         self.terrain = None if terrain is None or not np.any(terrain) else \
             np.asarray(terrain, dtype=bool)
+        self.height_sd_m = None if height_sd_m is None else np.asarray(height_sd_m, dtype=float)
         triangles = self.vertices[self.faces]
         self._scene = _embree_scene(triangles)
         self._normals = np.cross(triangles[:, 1] - triangles[:, 0],
@@ -74,17 +78,19 @@ class CityMap:
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle what the map is made of; Embree's scene is made again."""
         return CityMap, (self.vertices, self.faces, self.materials, self.material, self.vegetation,
-                         self.terrain)
+                         self.terrain, self.height_sd_m)
 
     @classmethod
     def from_xml(cls, xml_path: Path | str, vegetation: Vegetation | None = None,
-                 terrain: str | None = None) -> "CityMap":
+                 terrain: str | None = None,
+                 height_sd_m: Mapping[str, float] | None = None) -> "CityMap":
         """Read the meshes that a scene folder's `city.xml` names, and what they are made of.
 
         Args:
             xml_path: The file.
             vegetation: Of the scene.
             terrain: Name of the shape that is the ground; None: the ground is flat.
+            height_sd_m: Standard deviation of the height of the building(s) of a shape [m].
 
         Raises:
             BadInput: No such file, malformed XML, a mesh that cannot be read, one outside the
@@ -105,7 +111,9 @@ class CityMap:
                    np.concatenate([mesh.faces + start for (mesh, _), start in zip(shapes, starts)]),
                    materials, np.repeat([materials.index(material) for _, material in shapes],
                                         [len(mesh.faces) for mesh, _ in shapes]), vegetation,
-                   of_ground)
+                   of_ground, None if height_sd_m is None else np.repeat(
+                       [height_sd_m.get(name, np.nan) for *_, name in read],
+                       [len(mesh.faces) for mesh, _ in shapes]))
 
     @cached_property
     def ground_material(self) -> Material:
@@ -123,13 +131,15 @@ class CityMap:
 
     def without(self, faces: np.ndarray) -> "CityMap":
         """Return the map without some faces, (f,) bool."""
+        terrain, height_sd_m = (None if each is None else each[~faces]
+                                for each in (self.terrain, self.height_sd_m))
         return CityMap(self.vertices, self.faces[~faces], self.materials, self.material[~faces],
-                       self.vegetation, None if self.terrain is None else self.terrain[~faces])
+                       self.vegetation, terrain, height_sd_m)
 
     def with_vertices(self, vertices: np.ndarray) -> "CityMap":
         """Return the map with its vertices elsewhere, (v, 3) [m]."""
         return CityMap(vertices, self.faces, self.materials, self.material, self.vegetation,
-                       self.terrain)
+                       self.terrain, self.height_sd_m)
 
     def state(self) -> tuple[Any, ...]:
         """Return all that decides the answers of a map, and what paths over it are."""

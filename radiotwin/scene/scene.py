@@ -16,6 +16,7 @@ from radiotwin.errors import BadInput
 from radiotwin.inputs import open_input, read_bytes, require_within
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import DeviceConfig, SceneConfig, UavConfig, read_config
+from radiotwin.scene.height_errors import shape_height_sds_m
 from radiotwin.scene.lattice import Lattice
 from radiotwin.scene.vegetation import Vegetation
 
@@ -184,7 +185,8 @@ class Scene(Summarised):
         """3D map of the city, with its vegetation."""
         terrain = self.config.terrain
         return CityMap.from_xml(self.xml_path, Vegetation.of(self.config.vegetation),
-                                None if terrain is None else terrain.shape)
+                                None if terrain is None else terrain.shape,
+                                shape_height_sds_m(self.folder))
 
     @cached_property
     def lattice(self) -> Lattice:

@@ -9,9 +9,10 @@ import trimesh
 
 from radiotwin.closeloop.corrected_scene import check_corrected_target, write_corrected_scene
 from radiotwin.effects.gain_drift import ReceiverDrift
+from radiotwin.effects.mapped_buildings import buildings
 from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.position_errors import DevicePositionError
-from radiotwin.effects.removed_obstacle import RemovedObstacle, buildings
+from radiotwin.effects.removed_obstacle import RemovedObstacle
 from radiotwin.effects.sector_antenna import SectorAntenna
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene

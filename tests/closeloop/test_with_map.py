@@ -100,7 +100,7 @@ def test_a_building_that_the_map_lacks_is_found_and_goes_into_the_twin(small_sce
 
 @pytest.mark.usefixtures("predicted_by_the_model_alone")
 def test_a_building_that_is_gone_is_named(small_scene):
-    from radiotwin.effects.removed_obstacle import buildings
+    from radiotwin.effects.mapped_buildings import buildings
     from radiotwin.scene.citymap import CityMap
 
     label, centres_m = buildings(small_scene.city)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from radiotwin.effects.removed_obstacle import RemovedObstacle, buildings
+from radiotwin.effects.mapped_buildings import buildings
+from radiotwin.effects.removed_obstacle import RemovedObstacle
 from radiotwin.scene.citymap import CityMap
 from tests.scene.test_citymap import clip_interval
 

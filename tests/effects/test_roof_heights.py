@@ -81,6 +81,17 @@ def test_roofs_that_are_off_are_found_and_explain_the_links(world, seed):
     assert list(named) == [f"true_minus_mapped_height_{roof.building}_m" for roof in sure]
 
 
+@pytest.mark.parametrize(("sd_m", "least_m", "most_m"), [(6.0, 9.0, 13.0), (0.5, 0.0, 2.5)])
+def test_a_roof_is_as_far_off_as_its_map_may_be(world, sd_m, least_m, most_m):
+    links = world(np.add(MAPPED_M, [11.0, 0.0, 0.0, 0.0]), 3)
+    told = links.with_city(CityMap(links.city.vertices, links.city.faces,
+                                   height_sd_m=np.full(len(links.city.faces), sd_m)))
+    model, fit, _ = fitted(links)
+    view = FoldModel.build(told, model.channel, 8.0).view(fit)
+    off_m = [offsets(params.roofs)[0][0] for params in RoofHeights().propose(view)]
+    assert least_m <= (np.nan_to_num(off_m[0]) if off_m else 0.0) <= most_m
+
+
 def test_a_map_that_is_right_stays(world):
     links = world(MAPPED_M, 1)
     model, fit, _ = fitted(links)
@@ -109,7 +120,7 @@ def test_only_links_over_a_roof_change_and_by_no_more_than_both_classes_differ(w
 
 
 def _number(corner_m):
-    from radiotwin.effects.removed_obstacle import buildings
+    from radiotwin.effects.mapped_buildings import buildings
 
     centres_m = buildings(city())[1]
     return int(np.argmin(np.hypot(*(centres_m[:, :2] - np.add(corner_m, 15.0)).T)))

@@ -43,6 +43,20 @@ def test_every_height_has_its_source(table, report):
     assert facts["buildings"] == "15 in 14 blocks"
 
 
+def test_the_map_knows_how_well_it_knows_its_heights(table, report):
+    told = {name: row["height_sd_m"] for name, row in table.iterrows()}
+    assert (told["way/101"], told["way/102"], told["way/105"]) == (1.5, 3.0, 3.0)
+    tops_m = table["top_m"][table["height_from"] != "default"]
+    assert told["way/103"] == pytest.approx(max(np.sqrt(np.mean((tops_m - 10.0) ** 2)), 3.0), abs=0.06)
+    city = Scene.load(report.folder).city
+    for name in ("way/101", "way/103"):
+        x_m, y_m = table.loc[name, ["x_m", "y_m"]]
+        face = city.first_face(np.array([[x_m, y_m, 99.0]]), np.array([[x_m, y_m, 0.0]]))
+        assert city.height_sd_m[face] == pytest.approx(told[name])
+    below = city.first_face(np.array([[-75.2, -8.5, 99.0]]), np.array([[-75.2, -8.5, -1.0]]))
+    assert np.isnan(city.height_sd_m[below]).all()  # the ground has no height
+
+
 def test_defects_are_reported(report):
     said = "\n".join(problem.message for problem in report.problems)
     for part in ("'way/116'", "'way/115'", "no area: left out ('way/107')", "0.3 m wide: left out ('way/118')",

@@ -1,8 +1,10 @@
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from radiotwin.footprints.heights import Height, height_of, parse_length_m
+from radiotwin.footprints.heights import Height, height_of, height_sds_m, parse_length_m
 
 
 @pytest.mark.parametrize(("text", "metres"), [
@@ -33,4 +35,18 @@ def test_invalid_lengths(text):
     ({"height": "20", "min_height": "-1"}, Height(0, 20, "height", ["min_height=-1"])),
 ])
 def test_height_and_its_source(tags, height):
-    assert height_of(tags, 10.0) == height
+    found = height_of(tags, 10.0)
+    assert replace(found, sd_m=0.0) == replace(height, sd_m=0.0)
+    sd_m = {"height": 1.5, "building:levels": 3.0, "default": math.nan}[height.source]
+    assert found.sd_m == pytest.approx(sd_m, nan_ok=True)
+
+
+def test_a_default_is_off_as_far_as_known_heights_of_the_same_map_lie_from_it():
+    known_m = np.array([4.0, 22.0] * 6)  # 6 and 12 m from the default: 9.5 m in the mean of squares
+    top_m, sd_m = np.append(known_m, [10.0, 10.0]), np.append(np.full(12, 1.5), [np.nan] * 2)
+    assert height_sds_m(top_m, sd_m) == pytest.approx([1.5] * 12 + [math.sqrt(90.0)] * 2)
+    near_m = np.append(np.full(12, 10.5), [10.0, 10.0])
+    assert height_sds_m(near_m, sd_m)[-1] == 3.0  # no better than counted storeys
+    assert height_sds_m(top_m[-5:], sd_m[-5:])[-1] == 6.0  # three tell nothing of the others
+    assert height_sds_m(top_m[:12], sd_m[:12]).tolist() == [1.5] * 12
+    assert len(height_sds_m(np.array([]), np.array([]))) == 0

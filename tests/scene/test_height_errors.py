@@ -1,0 +1,59 @@
+"""How well heights are known, from the table of a scene made from a map."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from radiotwin.effects.boxes import Box
+from radiotwin.effects.missing_obstacle import _with_box
+from radiotwin.errors import BadInput
+from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.generator import building_meshes
+from radiotwin.scene.height_errors import shape_height_sds_m
+
+
+def table(folder, *rows, header="building,shape,area_m2,height_sd_m"):
+    (folder / "buildings.csv").write_text("\n".join([header, *rows]) + "\n")
+    return shape_height_sds_m(folder)
+
+
+def test_a_block_has_the_mean_of_its_buildings_by_area(tmp_path):
+    found = table(tmp_path, "way/1,block,300,1.5", "way/2,block,100,5.5", "way/3,alone,50,3")
+    assert found == pytest.approx({"block": 2.5, "alone": 3.0})
+
+
+def test_scenes_without_such_a_table_say_nothing(tmp_path):
+    assert shape_height_sds_m(tmp_path) is None
+    assert table(tmp_path, "way/1,block,300", header="building,shape,area_m2") is None
+
+
+@pytest.mark.parametrize("cell", ["0", "-1", "nan", "", "1e9", "wide"])
+def test_an_impossible_one_is_refused_by_row(tmp_path, cell):
+    with pytest.raises(BadInput, match=r"buildings.csv: row 3, column height_sd_m.*allowed"):
+        table(tmp_path, "way/1,block,300,1.5", f"way/2,block,100,{cell}")
+
+
+def test_a_table_elsewhere_is_not_read(tmp_path):
+    (tmp_path / "secret.csv").write_text("shape,area_m2,height_sd_m\na,1,1\n")
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    (scene / "buildings.csv").symlink_to(tmp_path / "secret.csv")
+    with pytest.raises(BadInput, match="leads out of"):
+        shape_height_sds_m(scene)
+
+
+def test_maps_made_from_a_map_keep_it():
+    shapes = building_meshes(np.array([[0.0, 0.0, 20.0, 20.0, 15.0], [50.0, 0.0, 80.0, 20.0, 25.0]]))
+    vertices = np.vstack([shape.vertices for shape in shapes])
+    starts = np.cumsum([0, *(len(shape.vertices) for shape in shapes)])
+    faces = np.vstack([shape.faces + start for shape, start in zip(shapes, starts)])
+    sd_m = np.repeat([1.5, 6.0], [len(shape.faces) for shape in shapes[-2:]])
+    sd_m = np.concatenate([np.full(len(faces) - len(sd_m), np.nan), sd_m])
+    city = CityMap(vertices, faces, height_sd_m=sd_m)
+    gone = sd_m == 1.5
+    assert city.without(gone).height_sd_m == pytest.approx(sd_m[~gone], nan_ok=True)
+    for same in (city.with_vertices(vertices + 1.0), pickle.loads(pickle.dumps(city))):
+        assert same.height_sd_m == pytest.approx(sd_m, nan_ok=True)
+    more = _with_box(city, Box(100.0, 0.0, 10.0, 10.0, 12.0, 0.0))
+    assert len(more.height_sd_m) == len(more.faces) and np.isnan(more.height_sd_m[len(faces):]).all()
