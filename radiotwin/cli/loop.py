@@ -39,8 +39,8 @@ def close_loop(
         ] = Path("closeloop"),
     write_scene: Annotated[Path | None, typer.Option(
         metavar="DIR", help="Scene folder to write: SCENE with the missing obstacles and the "
-                            "antennas that were found, without the buildings that are gone, and "
-                            "with anchors where they were found.")] = None,
+                            "antennas that were found, without the buildings that are gone, with "
+                            "roofs as high and anchors where they were found.")] = None,
     shift: Shift = None,
     seed: Annotated[int, typer.Option(
         min=0, help="Seed of folds, fits and permutations.")] = 0,
@@ -92,7 +92,7 @@ def close_loop(
     if write_scene is not None and world is not None:
         changes = write_corrected_scene(loop, world, write_scene)
         say(f"wrote {write_scene}: {'; '.join(changes)}" if changes else
-            f"{write_scene} is not written: no building, no anchor and no antenna was found to "
+            f"{write_scene} is not written: no building, roof, anchor or antenna was found to "
             f"be wrong in {scene}")
 
 

@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
+from radiotwin.cells import write_csv
 from radiotwin.closeloop.corrected_antennas import FOLDER as ANTENNAS
 from radiotwin.closeloop.corrected_antennas import with_antennas, write_antenna
+from radiotwin.closeloop.corrected_buildings import corrected_buildings, stretch
 from radiotwin.closeloop.run import Loop
 from radiotwin.effects.boxes import Box
 from radiotwin.effects.mapped_buildings import buildings
@@ -62,7 +64,7 @@ def check_corrected_target(folder: Path, scene: Scene | None, report_folder: Pat
 
 
 def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
-    """Write a copy of the scene with boxes, without buildings, with anchors and antennas as found.
+    """Write a copy of the scene in which buildings, roofs, anchors and antennas are as found.
 
     Args:
         loop: whose accepted effects are the corrections.
@@ -90,12 +92,14 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
              for each in effects if isinstance(each.effect, MissingObstacle)]
     changes = [f"a box of {box.length_m:.0f} x {box.width_m:.0f} m, {box.height_m:.0f} m high, "
                f"stands at ({box.x_m:.0f}, {box.y_m:.0f}) m" for box in boxes]
+    above_m = centres_m[:, 2] - scene.city.ground_height_m(*centres_m[:, :2].T)
     changes += ["the building at ({:.0f}, {:.0f}) m, {:.0f} m high, is taken out".format(
-        *centres_m[building]) for building in gone]
+        *centres_m[building, :2], above_m[building]) for building in gone]
     roofs = [roof for each in effects if isinstance(each.effect, RoofHeights)
              for roof in surely_off(each.params.roofs) if roof.building not in gone]
     changes += [f"the roof at ({roof.x_m:.0f}, {roof.y_m:.0f}) m is "
-                f"{roof.height_m + roof.offset_m:.1f} m high, and {roof.height_m:.1f} m on the map"
+                f"{above_m[roof.building] + roof.offset_m:.1f} m high, and "
+                f"{above_m[roof.building]:.1f} m on the map"
                 for roof in roofs]
     config, antennas, found = with_antennas(config, loop, scene)
     changes += moves + found
@@ -106,7 +110,10 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
     corrected = "; ".join(([earlier] if earlier else []) + changes)
     provenance = config.provenance | {"corrected": corrected}
     with atomic_folder(folder) as temporary:
-        _write_city(scene, temporary, keep, boxes, roofs)
+        shape_of, left = _write_city(scene, temporary, keep, boxes, roofs)
+        table = corrected_buildings(scene, shape_of, left, roofs)
+        if table is not None:
+            write_csv(table, temporary / "buildings.csv")
         scene.copy_antennas(temporary)
         for file, pattern in antennas.items():
             write_antenna(pattern, temporary / file)
@@ -173,12 +180,17 @@ def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
 
 
 def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
-                roofs: list[Roof]) -> None:
-    """Write `city.xml` and `meshes/`: kept faces (f,) of the scene's map, roofs, and boxes."""
+                roofs: list[Roof]) -> tuple[dict[int, str], set[str]]:
+    """Write `city.xml` and `meshes/`: kept faces (f,) of the scene's map, roofs, and boxes.
+
+    Returns the name of the shape of each building, and the names of those that are left.
+    """
     label, shapes, first = buildings(scene.city)[0], [], 0
+    shape_of: dict[int, str] = {}
     for shape in read_city(scene.xml_path):
         part = slice(first, first + len(shape.mesh.faces))
         own, first = keep[part], part.stop
+        shape_of |= dict.fromkeys(np.unique(label[part]).tolist(), shape.name)
         shape = replace(shape, mesh=_with_roofs(shape.mesh, label[part], roofs))
         if own.all():
             shapes.append(shape)
@@ -188,6 +200,7 @@ def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
             shapes.append(replace(shape, mesh=mesh))
     taken = {name.lower() for shape in shapes for name in (shape.name, shape.material.name)}
     write_city(folder, [*shapes, *_box_shapes(scene, boxes, taken)])
+    return shape_of, {shape.name for shape in shapes}
 
 
 def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[Roof]) -> trimesh.Trimesh:
@@ -197,9 +210,8 @@ def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[Roof]) -> 
         mine = np.unique(mesh.faces[label == roof.building])
         if len(mine):
             height_m = vertices_m[mine, 2]
-            base_m = height_m.min()
-            grown = 1.0 + roof.offset_m / max(roof.height_m - base_m, abs(roof.offset_m))
-            vertices_m[mine, 2] = base_m + grown * (height_m - base_m)
+            base_m = float(height_m.min())
+            vertices_m[mine, 2] = base_m + stretch(roof, base_m) * (height_m - base_m)
     return trimesh.Trimesh(vertices_m, mesh.faces, process=False)
 
 

@@ -65,7 +65,7 @@ class RemovedObstacle(GainEffect):
         nats = obstruction_nats(view.residual_db[rows], view.scale_db[rows], RISES_DB)
         label, centres_m = buildings(links.city)
         total = np.full(len(centres_m), -np.inf)
-        for building in range(len(centres_m)):
+        for building in np.unique(label[~links.city.on_ground]).tolist():
             behind = ~links.city.without(label != building).line_of_sight(a_m, b_m)
             if behind.sum() >= MIN_LINKS:
                 total[building] = nats[behind].sum()

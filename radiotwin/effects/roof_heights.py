@@ -19,7 +19,11 @@ from typing_extensions import override
 
 from radiotwin.effects.arrays import city_of, subsample
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.mapped_buildings import building_height_sds_m, buildings
+from radiotwin.effects.mapped_buildings import (
+    building_extents_m,
+    building_height_sds_m,
+    buildings,
+)
 from radiotwin.effects.params import QUANTILE_90, EffectParams, Estimate, Length, Metres, Parameter
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.effects.roof_crossings import roof_crossings
@@ -164,23 +168,25 @@ class _Search:
 
     def roofs(self) -> tuple[Roof, ...]:
         """Return every roof that is off."""
-        centres_m, priors_m = buildings(self._city)[1], building_height_sds_m(self._city)
+        label, centres_m = buildings(self._city)
+        priors_m = building_height_sds_m(self._city)
+        tall_m = centres_m[:, 2] - building_extents_m(self._city, label)[0][:, 2]
         pairs = {int(building): np.flatnonzero(self._ways.building == building)
                  for building in np.unique(self._ways.building)}
         found: dict[int, Roof] = {}
         for _ in range(SWEEPS):
             for building, mine in pairs.items():
-                offset_m, sd_m = self._estimate(mine, float(centres_m[building, 2]),
+                offset_m, sd_m = self._estimate(mine, float(tall_m[building]),
                                                 float(priors_m[building]))
                 self._loss_db[mine] = self._ways.loss_db(offset_m, self._wavelength_m, mine)
                 x_m, y_m, height_m = centres_m[building].tolist()
                 found[building] = Roof(building, x_m, y_m, height_m, offset_m, sd_m)
         return tuple(roof for roof in found.values() if abs(roof.offset_m) >= MIN_OFFSET_M)
 
-    def _estimate(self, mine: np.ndarray, height_m: float, prior_m: float) -> tuple[float, float]:
+    def _estimate(self, mine: np.ndarray, tall_m: float, prior_m: float) -> tuple[float, float]:
         """Return mean and sd of what a roof is off by, from its pairs (q,) [m]; 0 if not told."""
         offsets_m = prior_m * OFFSETS
-        offsets_m = offsets_m[offsets_m > (LEAST_SHARE - 1) * height_m]
+        offsets_m = offsets_m[offsets_m > (LEAST_SHARE - 1) * tall_m]
         link = self._ways.link[mine]
         without_db = self._loss_db.copy()
         without_db[mine] = 0.0

@@ -298,7 +298,7 @@ def test_a_corrected_scene_needs_a_scene_and_something_to_correct(close_loop, sm
     refused(tmp_path, close_loop(links, devices, f"{scene} --write-scene result"), "the report", "another folder")
     done = close_loop(links, devices, f"{scene} --write-scene corrected")
     went_on(tmp_path, done)
-    assert "corrected is not written: no building, no anchor and no antenna was found" in done[1]
+    assert "corrected is not written: no building, roof, anchor or antenna was found" in done[1]
     assert not (tmp_path / "corrected").exists()
 
 

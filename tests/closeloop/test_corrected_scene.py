@@ -1,9 +1,11 @@
 """The scene that `--write-scene` writes: read back by the loader, and traced."""
 
+import json
 import shutil
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 import trimesh
 
@@ -13,9 +15,12 @@ from radiotwin.effects.mapped_buildings import buildings
 from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.position_errors import DevicePositionError
 from radiotwin.effects.removed_obstacle import RemovedObstacle
+from radiotwin.effects.roof_heights import Roof, RoofHeights
 from radiotwin.effects.sector_antenna import SectorAntenna
 from radiotwin.errors import BadInput
+from radiotwin.footprints import MapOptions, build_scene_from_map
 from radiotwin.scene import Scene
+from radiotwin.scene.build import BuildOptions
 from radiotwin.scene.materials import itu_material
 from radiotwin.scene.writer import CityShape, write_city
 from radiotwin.trace import SolverSettings, trace_gains
@@ -71,6 +76,30 @@ def test_a_building_that_is_gone_lets_links_through_and_others_do_not(small_scen
     assert len(list((tmp_path / "new" / "meshes").iterdir())) == len(list(small_scene.folder.glob("meshes/*"))) - 1
     for mesh in (tmp_path / "new" / "meshes").iterdir():
         assert mesh.read_bytes() == (small_scene.folder / "meshes" / mesh.name).read_bytes()
+
+
+def test_roofs_that_are_off_are_raised_and_lowered_and_the_table_follows(tmp_path):
+    (tmp_path / "town.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [
+        {"type": "Feature", "properties": {"height": height}, "geometry": {"type": "Polygon", "coordinates": [
+            [[east, 47.0], [east + 3e-4, 47.0], [east + 3e-4, 47.0002], [east, 47.0002], [east, 47.0]]]}}
+        for east, height in ((8.0, 12), (8.001, 20), (8.002, None))]}))
+    build_scene_from_map(tmp_path / "town.geojson", tmp_path / "scene", MapOptions(default_height_m=9.0), BuildOptions())
+    scene = Scene.load(tmp_path / "scene")
+    centres_m = buildings(scene.city)[1]
+    by_height = {round(height_m): number for number, (_, _, height_m) in enumerate(centres_m)}
+    roofs = tuple(Roof(by_height[height_m], *centres_m[by_height[height_m]].tolist(), offset_m, 0.6)
+                  for height_m, offset_m in ((12, 3.0), (9, -4.0)))
+    gone = {"building": by_height[20], "centre_m": centres_m[by_height[20]].tolist()}
+    loop = loop_of(scene, (RoofHeights, {"roofs": roofs}), (RemovedObstacle, gone))
+    changes = write_corrected_scene(loop, scene, tmp_path / "new")
+    assert any("is 15.0 m high, and 12.0 m on the map" in change for change in changes)
+    corrected = Scene.load(tmp_path / "new")
+    for roof in roofs:
+        assert corrected.city.height_at(roof.x_m, roof.y_m) == pytest.approx(roof.height_m + roof.offset_m, abs=1e-3)
+    table = pd.read_csv(tmp_path / "new" / "buildings.csv")
+    assert sorted(zip(table["top_m"], table["height_from"], table["height_sd_m"])) == [
+        (5.0, "close-loop", 0.6), (15.0, "close-loop", 0.6)]
+    assert set(np.unique(corrected.city.height_sd_m[np.isfinite(corrected.city.height_sd_m)])) == {0.6}
 
 
 def test_one_building_of_a_mesh_that_holds_several(small_scene, tmp_path):
