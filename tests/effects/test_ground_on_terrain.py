@@ -7,7 +7,7 @@ from radiotwin.effects.boxes import Box
 from radiotwin.effects.ground_reflection import bounces_on_terrain, two_ray_db
 from radiotwin.effects.interference import Interference
 from radiotwin.effects.missing_obstacle import _with_box
-from radiotwin.effects.removed_obstacle import only_blocker
+from radiotwin.effects.removed_obstacle import RemovedObstacle, only_blocker
 from tests.terrains import incline, ridge, terrain_map
 
 
@@ -50,9 +50,15 @@ def test_a_box_stands_on_the_slope():
     assert with_box.inside(below_m).all()
 
 
-def test_terrain_is_not_a_building_to_remove(make_links):
-    links = make_links([-200, 0, 13], [[200, y, 30] for y in range(-20, 21, 10)], city=terrain_map(ridge(40.0)))
+def test_terrain_is_not_a_building_to_remove(make_links, view):
+    links = make_links([-200, 0, 13], [[200, y, 30] for y in range(-20, 21, 2)], city=terrain_map(ridge(40.0)))
     assert not links.los.any() and (only_blocker(links) == -1).all()
+
+    def level_at(of, exact=False):
+        return np.where(of.los, 0.0, -20.0)
+
+    as_if_nothing_were_there = make_links([-200, 0, 13], links.receiver_m, city=links.city, level_db=np.zeros(len(links)))
+    assert RemovedObstacle().propose(view(as_if_nothing_were_there, level_at(links), 3.0, level_at)) == []
 
 
 def test_an_emitter_stands_on_the_ground(make_links):
