@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from pydantic import ValidationError
 
 from radiotwin.cells import write_csv
 from radiotwin.closeloop.run import Loop
@@ -55,9 +56,17 @@ def with_antennas(config: SceneConfig, loop: Loop,
                 changes.append(f"{name} has a sector antenna, and is not in the scene: it stands "
                                "outside the extent or in a building")
                 continue
-            device = DeviceConfig(device=name, x_m=round(x_m, 2), y_m=round(y_m, 2),
-                                  z_m=round(z_m, 2), role="anchor")
-        file = f"{FOLDER}/found_{safe_name(name)}.csv"
+            try:
+                device = DeviceConfig(device=name, x_m=round(x_m, 2), y_m=round(y_m, 2),
+                                      z_m=round(z_m, 2), role="anchor")
+            except ValidationError:  # measurements may call and place a device as they like
+                changes.append(f"{name!r} has a sector antenna, and is not in the scene: scene.toml"
+                               " has devices above z = 0, whose names are of letters, digits and "
+                               "_.+-")
+                continue
+        others = {each.antenna.lower() for each in devices.values()
+                  if each.antenna is not None and each.device != name}
+        file = f"{FOLDER}/{_free_name(name, others)}.csv"
         azimuth_deg = round(pattern.azimuth_deg % 360, DECIMALS)
         devices[name] = device.model_copy(update={
             "antenna": file, "azimuth_deg": azimuth_deg, "tilt_deg": None})
@@ -65,6 +74,16 @@ def with_antennas(config: SceneConfig, loop: Loop,
         changes.append(f"{name} has a sector antenna that looks to {azimuth_deg:.0f}° and is "
                        f"{pattern.beamwidth_deg:.0f}° wide")
     return config.model_copy(update={"devices": list(devices.values())}), files, changes
+
+
+def _free_name(device: str, taken: set[str]) -> str:
+    """Return the name of a device's file that is none of those taken, which are in lower case."""
+    wanted = name = f"found_{safe_name(device)}"
+    number = 1
+    while f"{FOLDER}/{name}.csv".lower() in taken:
+        number += 1
+        name = f"{wanted}_{number}"
+    return name
 
 
 def write_antenna(pattern: SectorPattern, path: Path) -> None:

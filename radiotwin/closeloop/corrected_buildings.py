@@ -18,13 +18,13 @@ def stretch(roof: Roof, base_m: float) -> float:
     return 1.0 + roof.offset_m / max(roof.height_m - base_m, abs(roof.offset_m))
 
 
-def corrected_buildings(scene: Scene, shape_of: dict[int, str], left: set[str],
+def corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[str],
                         roofs: list[Roof]) -> pd.DataFrame | None:
     """Return the table of a scene's buildings as they are after the correction.
 
     Args:
         scene: before it.
-        shape_of: the shape in `city.xml` of each building, as `buildings` numbers them.
+        shapes_of: the shapes in `city.xml` of each building, as `buildings` numbers them.
         left: shapes that the corrected scene still has.
         roofs: whose heights are corrected.
 
@@ -47,7 +47,7 @@ def corrected_buildings(scene: Scene, shape_of: dict[int, str], left: set[str],
     base_m = building_extents_m(scene.city, buildings(scene.city)[0])[0][:, 2]
     for roof in roofs:
         own_m = float(base_m[roof.building])
-        for row in np.flatnonzero(table["shape"] == shape_of[roof.building]):
+        for row in np.flatnonzero(table["shape"].isin(shapes_of[roof.building])):
             raised_m = own_m + stretch(roof, own_m) * (top_m[row] - own_m)
             table.loc[row, ["top_m", "height_from", "height_sd_m"]] = [
                 f"{raised_m:.3f}", SOURCE, f"{max(roof.offset_sd_m, MIN_SD_M):.1f}"]

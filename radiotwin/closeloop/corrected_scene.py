@@ -15,7 +15,7 @@ from radiotwin.closeloop.corrected_antennas import with_antennas, write_antenna
 from radiotwin.closeloop.corrected_buildings import corrected_buildings, stretch
 from radiotwin.closeloop.run import Loop
 from radiotwin.effects.boxes import Box
-from radiotwin.effects.mapped_buildings import buildings
+from radiotwin.effects.mapped_buildings import building_extents_m, buildings
 from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.position_errors import DevicePositionError
 from radiotwin.effects.removed_obstacle import RemovedObstacle
@@ -26,7 +26,7 @@ from radiotwin.inputs import is_within
 from radiotwin.links import site_of
 from radiotwin.scene import Scene
 from radiotwin.scene.citymap import CityMap
-from radiotwin.scene.config import SceneConfig, write_config
+from radiotwin.scene.config import DeviceConfig, SceneConfig, write_config
 from radiotwin.scene.folder import SCENE_FILES, check_target
 from radiotwin.scene.materials import itu_material, traceable
 from radiotwin.scene.names import unique_name
@@ -84,7 +84,8 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
     city = scene.city.without(~keep) if keep.any() else None
     config, moves = _moved(loop, scene, city)
     free_m = np.array([*((d.x_m, d.y_m, d.z_m) for d in config.devices),
-                       *((x_m, y_m, uav.altitude_m) for uav in config.uavs
+                       *((x_m, y_m, scene.altitude_m(x_m, y_m, uav.altitude_m))
+                         for uav in config.uavs
                          for x_m, y_m in ((uav.start_x_m, uav.start_y_m),
                                           (uav.terminal_x_m, uav.terminal_y_m)))])
     boxes = [_pulled_back(Box(*each.params.box), free_m.reshape(-1, 3) - [
@@ -110,8 +111,8 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
     corrected = "; ".join(([earlier] if earlier else []) + changes)
     provenance = config.provenance | {"corrected": corrected}
     with atomic_folder(folder) as temporary:
-        shape_of, left = _write_city(scene, temporary, keep, boxes, roofs)
-        table = corrected_buildings(scene, shape_of, left, roofs)
+        shapes_of, left = _write_city(scene, temporary, keep, boxes, roofs)
+        table = corrected_buildings(scene, shapes_of, left, roofs)
         if table is not None:
             write_csv(table, temporary / "buildings.csv")
         scene.copy_antennas(temporary)
@@ -134,29 +135,43 @@ def _moved(loop: Loop, scene: Scene, city: CityMap | None) -> tuple[SceneConfig,
     devices, changes = [], []
     for device in scene.config.devices:
         if device.device in found_m:
-            x_m, y_m = _free_position(found_m[device.device], device.z_m, scene, city)
-            changes.append(f"{device.device} is moved from ({device.x_m:.0f}, {device.y_m:.0f}) to "
-                           f"({x_m:.0f}, {y_m:.0f}) m")
-            device = device.model_copy(update={"x_m": x_m, "y_m": y_m})
+            free_m = _free_position(found_m[device.device], device, scene, city)
+            x_m, y_m = found_m[device.device] if free_m is None else free_m[:2]
+            way = f"from ({device.x_m:.0f}, {device.y_m:.0f}) to ({x_m:.0f}, {y_m:.0f}) m"
+            if free_m is None:
+                changes.append(f"{device.device} is not moved {way}: there is no place outside of "
+                               f"buildings within {MAX_SHIFT_M:.0f} m")
+            else:
+                changes.append(f"{device.device} is moved {way}")
+                device = device.model_copy(update=dict(zip(("x_m", "y_m", "z_m"), free_m,
+                                                           strict=True)))
         devices.append(device)
     return scene.config.model_copy(update={"devices": devices}), changes
 
 
-def _free_position(position_m: np.ndarray, z_m: float, scene: Scene,
-                   city: CityMap | None) -> tuple[float, float]:
-    """Return the position nearest to one (2,) [m], within the extent and outside buildings."""
+def _free_position(position_m: np.ndarray, device: DeviceConfig, scene: Scene,
+                   city: CityMap | None) -> tuple[float, float, float] | None:
+    """Return the position nearest to one (2,) [m], within the extent and outside buildings.
+
+    The device stays as high above the ground as it is. None where no such position is near.
+    """
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     low_m, high_m = (x_min, y_min), (x_max, y_max)
     radius_m, angle = (axis.ravel() for axis in np.meshgrid(
         np.arange(0, MAX_SHIFT_M), np.radians(np.arange(0, 360, 10)), indexing="ij"))
     around_m = radius_m[:, None] * np.column_stack([np.sin(angle), np.cos(angle)])
     tried_m = np.round(np.clip(np.clip(position_m, low_m, high_m) + around_m, low_m, high_m), 2)
-    free = np.ones(len(tried_m), dtype=bool)
+    ground_m = scene.city.ground_height_m
+    above_m = device.z_m - float(ground_m(device.x_m, device.y_m))
+    z_m = np.round(above_m + ground_m(*tried_m.T), 3)
+    free = z_m > 0  # as scene.toml has it
     if city is not None:
         for aside_m in CLEARANCE_M * np.array([(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)]):
-            free &= ~city.inside(np.column_stack([tried_m + aside_m, np.full(len(tried_m), z_m)]))
-    x_m, y_m = tried_m[free.argmax()]  # the first, which is the nearest
-    return float(x_m), float(y_m)
+            free &= ~city.inside(np.column_stack([tried_m + aside_m, z_m]))
+    if not free.any():
+        return None
+    nearest = int(free.argmax())
+    return float(tried_m[nearest, 0]), float(tried_m[nearest, 1]), float(z_m[nearest])
 
 
 def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
@@ -180,18 +195,20 @@ def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
 
 
 def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
-                roofs: list[Roof]) -> tuple[dict[int, str], set[str]]:
+                roofs: list[Roof]) -> tuple[dict[int, set[str]], set[str]]:
     """Write `city.xml` and `meshes/`: kept faces (f,) of the scene's map, roofs, and boxes.
 
-    Returns the name of the shape of each building, and the names of those that are left.
+    Returns the names of the shapes of each building, and of those that are left.
     """
     label, shapes, first = buildings(scene.city)[0], [], 0
-    shape_of: dict[int, str] = {}
+    base_m = building_extents_m(scene.city, label)[0][:, 2]
+    shapes_of: dict[int, set[str]] = {}
     for shape in read_city(scene.xml_path):
         part = slice(first, first + len(shape.mesh.faces))
         own, first = keep[part], part.stop
-        shape_of |= dict.fromkeys(np.unique(label[part]).tolist(), shape.name)
-        shape = replace(shape, mesh=_with_roofs(shape.mesh, label[part], roofs))
+        for building in np.unique(label[part]).tolist():
+            shapes_of.setdefault(building, set()).add(shape.name)
+        shape = replace(shape, mesh=_with_roofs(shape.mesh, label[part], roofs, base_m))
         if own.all():
             shapes.append(shape)
         elif own.any():
@@ -200,18 +217,21 @@ def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
             shapes.append(replace(shape, mesh=mesh))
     taken = {name.lower() for shape in shapes for name in (shape.name, shape.material.name)}
     write_city(folder, [*shapes, *_box_shapes(scene, boxes, taken)])
-    return shape_of, {shape.name for shape in shapes}
+    return shapes_of, {shape.name for shape in shapes}
 
 
-def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[Roof]) -> trimesh.Trimesh:
-    """Return a mesh whose buildings (f,) are stretched to the heights of their roofs."""
+def _with_roofs(mesh: trimesh.Trimesh, label: np.ndarray, roofs: list[Roof],
+                base_m: np.ndarray) -> trimesh.Trimesh:
+    """Return a mesh whose buildings (f,) are stretched to the heights of their roofs.
+
+    They stand on `base_m` (buildings,) [m]; a mesh may hold the roof of one, and not its walls.
+    """
     vertices_m = np.array(mesh.vertices, dtype=float)
     for roof in roofs:
         mine = np.unique(mesh.faces[label == roof.building])
         if len(mine):
-            height_m = vertices_m[mine, 2]
-            base_m = float(height_m.min())
-            vertices_m[mine, 2] = base_m + stretch(roof, base_m) * (height_m - base_m)
+            own_m = float(base_m[roof.building])
+            vertices_m[mine, 2] = own_m + stretch(roof, own_m) * (vertices_m[mine, 2] - own_m)
     return trimesh.Trimesh(vertices_m, mesh.faces, process=False)
 
 

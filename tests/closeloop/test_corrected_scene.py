@@ -9,7 +9,12 @@ import pandas as pd
 import pytest
 import trimesh
 
-from radiotwin.closeloop.corrected_scene import check_corrected_target, write_corrected_scene
+from radiotwin.closeloop.corrected_scene import (
+    _free_position,
+    _moved,
+    check_corrected_target,
+    write_corrected_scene,
+)
 from radiotwin.effects.gain_drift import ReceiverDrift
 from radiotwin.effects.mapped_buildings import buildings
 from radiotwin.effects.missing_obstacle import MissingObstacle
@@ -19,11 +24,14 @@ from radiotwin.effects.roof_heights import Roof, RoofHeights
 from radiotwin.effects.sector_antenna import SectorAntenna
 from radiotwin.errors import BadInput
 from radiotwin.footprints import MapOptions, build_scene_from_map
+from radiotwin.footprints.material_table import STANDARD, with_pairs
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
+from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.materials import itu_material
 from radiotwin.scene.writer import CityShape, write_city
 from radiotwin.trace import SolverSettings, trace_gains
+from tests.terrains import incline, terrain_map
 
 BOX = [130.0, 45.0, 24.0, 14.0, 70.0, 30.0]  # on a street of the small scene
 
@@ -78,12 +86,15 @@ def test_a_building_that_is_gone_lets_links_through_and_others_do_not(small_scen
         assert mesh.read_bytes() == (small_scene.folder / "meshes" / mesh.name).read_bytes()
 
 
-def test_roofs_that_are_off_are_raised_and_lowered_and_the_table_follows(tmp_path):
+@pytest.mark.parametrize("roof", ["default", "metal"])  # in the mesh of the walls, and in one of its own
+def test_roofs_that_are_off_are_raised_and_lowered_and_the_table_follows(tmp_path, roof):
     (tmp_path / "town.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [
         {"type": "Feature", "properties": {"height": height}, "geometry": {"type": "Polygon", "coordinates": [
             [[east, 47.0], [east + 3e-4, 47.0], [east + 3e-4, 47.0002], [east, 47.0002], [east, 47.0]]]}}
         for east, height in ((8.0, 12), (8.001, 20), (8.002, None))]}))
-    build_scene_from_map(tmp_path / "town.geojson", tmp_path / "scene", MapOptions(default_height_m=9.0), BuildOptions())
+    materials = STANDARD if roof == "default" else with_pairs(STANDARD, {"roof": roof})
+    build_scene_from_map(tmp_path / "town.geojson", tmp_path / "scene",
+                         MapOptions(default_height_m=9.0, materials=materials), BuildOptions())
     scene = Scene.load(tmp_path / "scene")
     centres_m = buildings(scene.city)[1]
     by_height = {round(height_m): number for number, (_, _, height_m) in enumerate(centres_m)}
@@ -94,12 +105,31 @@ def test_roofs_that_are_off_are_raised_and_lowered_and_the_table_follows(tmp_pat
     changes = write_corrected_scene(loop, scene, tmp_path / "new")
     assert any("is 15.0 m high, and 12.0 m on the map" in change for change in changes)
     corrected = Scene.load(tmp_path / "new")
-    for roof in roofs:
-        assert corrected.city.height_at(roof.x_m, roof.y_m) == pytest.approx(roof.height_m + roof.offset_m, abs=1e-3)
+    for each in roofs:
+        assert corrected.city.height_at(each.x_m, each.y_m) == pytest.approx(each.height_m + each.offset_m, abs=1e-3)
+    assert sorted(np.round(buildings(corrected.city)[1][:, 2], 3)[-2:]) == [5.0, 15.0]  # walls, too
     table = pd.read_csv(tmp_path / "new" / "buildings.csv")
     assert sorted(zip(table["top_m"], table["height_from"], table["height_sd_m"])) == [
         (5.0, "close-loop", 0.6), (15.0, "close-loop", 0.6)]
-    assert set(np.unique(corrected.city.height_sd_m[np.isfinite(corrected.city.height_sd_m)])) == {0.6}
+    told_m = corrected.city.height_sd_m
+    assert set(told_m[np.isfinite(told_m)]) == {0.6}
+
+
+def test_an_anchor_that_is_moved_stays_as_high_above_a_slope():
+    scene = SimpleNamespace(city=terrain_map(incline(0.2, 0.0)), config=SimpleNamespace(
+        extent=SimpleNamespace(bounds=(-300.0, 300.0, -300.0, 300.0))))
+    ground_m = float(scene.city.ground_height_m(0.0, 0.0))
+    device = SimpleNamespace(x_m=0.0, y_m=0.0, z_m=ground_m + 1.5)
+    x_m, y_m, z_m = _free_position(np.array([40.0, 10.0]), device, scene, scene.city)
+    assert (x_m, y_m) == (40.0, 10.0) and z_m == pytest.approx(ground_m + 8.0 + 1.5, abs=0.02)
+
+
+def test_an_anchor_with_no_free_place_near_stays_and_that_is_said(small_scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(CityMap, "inside", lambda city, points_m: np.ones(len(points_m), dtype=bool))
+    loop = loop_of(small_scene, (DevicePositionError, {"device": 0, "move_m": [0.0, 20.0]}))
+    config, changes = _moved(loop, small_scene, small_scene.city)
+    assert config.devices[0] == small_scene.config.devices[0]
+    assert "d0 is not moved from (80, 40) to (80, 60) m: there is no place" in changes[0]
 
 
 def test_one_building_of_a_mesh_that_holds_several(small_scene, tmp_path):
@@ -159,6 +189,24 @@ def test_an_antenna_that_was_found_is_declared(small_scene, tmp_path):
     again = write_corrected_scene(loop_of(small_scene, (SectorAntenna, {"devices": {1: SECTOR}})), small_scene,
                                   tmp_path / "new")
     assert len(again) == 1 and Scene.load(tmp_path / "new").device_antennas[0] is None
+
+
+def test_devices_whose_names_differ_in_a_dot_have_antennas_of_their_own(small_scene, tmp_path):
+    loop = loop_of(small_scene, (SectorAntenna, {"devices": {0: SECTOR, 1: SECTOR | {"beamwidth_deg": 90.0}}}))
+    loop.after.whole.links.device_names = ["bs.1", "bs_1"]
+    write_corrected_scene(loop, small_scene, tmp_path / "new")
+    first, second = Scene.load(tmp_path / "new").device_antennas[-2:]
+    side = rays(205.0 + 60.0, -8.0)
+    assert second.gain_dbi(side) - first.gain_dbi(side) > 3.0
+
+
+@pytest.mark.parametrize("name", ["LTE 262-1-5-7", "BS@1", "02:1b:44:11:3a:b7"])
+def test_an_anchor_that_no_scene_can_name_is_left_out_and_told(small_scene, tmp_path, name):
+    loop = loop_of(small_scene, (SectorAntenna, {"devices": {0: SECTOR}}))
+    loop.after.whole.links.device_names = [name]
+    [change] = write_corrected_scene(loop, small_scene, tmp_path / "new")
+    assert change.startswith(f"{name!r} has a sector antenna, and is not in the scene")
+    assert len(Scene.load(tmp_path / "new").config.devices) == len(small_scene.config.devices)
 
 
 def test_an_anchor_that_the_scene_lacks_is_declared_with_its_antenna(small_scene, tmp_path):
