@@ -1,5 +1,6 @@
 """Buildings of a map on the terrain of a GeoTIFF: heights on a slope, references and units, and rasters to refuse."""
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -15,6 +16,7 @@ from radiotwin.footprints.terrain_raster import read_heights
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
 from radiotwin.tables import Origin
+from tests.footprints import city_models as made
 from tests.footprints.conftest import Map
 from tests.terrains import LAT_M, LON_M, incline, write_dem
 
@@ -67,6 +69,27 @@ def test_buildings_stand_on_the_slope(slope):
         assert table.loc[part, ["ground_m", "top_m"]].tolist() == pytest.approx([whole_m, whole_m + height_m], abs=0.05)
     bridge_m = SLOPE(0, 90) - datum_m
     assert table.loc["way/5", ["bottom_m", "top_m"]].tolist() == pytest.approx([bridge_m + 5, bridge_m + 9], abs=0.05)
+
+
+def test_parts_of_a_city_model_stand_on_the_ground_of_their_building(tmp_path):
+    """Their heights count from its lowest point: a part 50 m up a slope of 10 % begins 5 m above it."""
+    from pyproj import Transformer
+
+    east, north = Transformer.from_crs(4326, 32634, always_xy=True).transform(20, 10)
+    model = made.cityjson([(0, 0, 500), (50, 0, 505)], "EPSG:32634", at=(round(east), round(north)))
+    objects = model["CityObjects"]
+    objects["B1-0"]["parents"] = ["B0"]
+    objects["B0"]["children"].append("B1-0")
+    del objects["B1"]
+    (tmp_path / "a.city.json").write_text(json.dumps(model))
+    dem = write_dem(tmp_path / "a.tif", incline(0.1, 0, 500))
+    report = build_scene_from_map(tmp_path / "a.city.json", tmp_path / "out", MapOptions(terrain=dem),
+                                  BuildOptions(origin=ORIGIN))
+    low_m = 500 - Scene.load(report.folder).config.terrain.datum_m
+    table = pd.read_csv(report.folder / "buildings.csv").sort_values("x_m")
+    assert table["ground_m"].tolist() == pytest.approx([low_m] * 2, abs=0.1)
+    assert table["bottom_m"].tolist() == pytest.approx([low_m - 1, low_m + 5], abs=0.1)
+    assert table["top_m"].tolist() == pytest.approx([low_m + made.RIDGE_M, low_m + 5 + made.RIDGE_M], abs=0.1)
 
 
 def test_the_scene_knows_its_ground(slope):
