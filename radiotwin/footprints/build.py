@@ -280,7 +280,8 @@ def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> lis
             if x0 <= east and x1 >= west and y0 <= north and y1 >= south]
     for feature in near:
         budget.check(feature.name, feature.area)
-    kept = [feature for feature in near if shapely.make_valid(feature.area).intersects(box)]
+    kept = [feature for feature in near if shapely.intersects(
+        shapely.make_valid(shapely.get_parts(feature.area)), box).any()]
     if not kept:
         west_, south_ = np.nanmin(bounds_deg[:, :2], axis=0)
         east_, north_ = np.nanmax(bounds_deg[:, 2:], axis=0)

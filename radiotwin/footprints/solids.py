@@ -116,6 +116,7 @@ class _Defects:
 
     _KINDS: ClassVar[dict[str, tuple[Severity, str]]] = {
         "invalid": ("fixed", "outline(s) cut or touched themselves: taken apart"),
+        "nested": ("fixed", "outline(s) had parts that overlap or lie in each other: united"),
         "no area": ("warning", "building(s) have no area: left out"),
         "sliver": ("warning", f"sliver(s), under {SLIVER_AREA_M2:g} m² or {SLIVER_WIDTH_M:g} m "
                               "wide: left out"),
@@ -155,7 +156,7 @@ def _clean_one(feature: Feature, area: BaseGeometry,
                defects: _Defects) -> shapely.MultiPolygon | None:
     """Return the valid polygons of an area that are no slivers; None where nothing is left."""
     invalid = not area.is_valid
-    area = _polygons(shapely.make_valid(area))
+    area, shared_m2 = _united(area)
     if area.area < GRID_M**2:
         defects.add("no area", feature.name)
         return None
@@ -167,9 +168,26 @@ def _clean_one(feature: Feature, area: BaseGeometry,
             and 2 * polygon.area / polygon.length >= SLIVER_WIDTH_M]
     if len(kept) < shapely.get_num_geometries(area):
         defects.add("sliver", feature.name)
-    if invalid:
+    if shared_m2 > MIN_OVERLAP_M2:
+        defects.add("nested", feature.name)
+    elif invalid:
         defects.add("invalid", feature.name)
     return shapely.MultiPolygon(kept) if kept else None
+
+
+def _united(area: BaseGeometry) -> tuple[shapely.MultiPolygon, float]:
+    """Return the valid polygons of an area, and the area by which its parts overlap.
+
+    A courtyard is a ring of its polygon [1]: a polygon in another one is built, too.
+
+    [1] OGC 06-103r4, Simple feature access, section 6.1.14 (MultiPolygon).
+    """
+    whole = _polygons(area)
+    if whole.is_valid:
+        return whole, 0.0
+    parts = [shapely.make_valid(polygon) for polygon in whole.geoms]
+    united = _polygons(shapely.union_all(parts) if len(parts) > 1 else parts[0])
+    return united, sum(part.area for part in parts) - united.area
 
 
 def _polygons(area: BaseGeometry) -> shapely.MultiPolygon:

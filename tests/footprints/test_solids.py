@@ -55,6 +55,17 @@ def test_a_courtyard_that_touches_the_outside_wall():
     assert total_volume(blocks) == pytest.approx(10 * 350, rel=0.01)
 
 
+@pytest.mark.parametrize(("parts", "area_m2"), [
+    ([(0, 0, 30, 20), (10, 5, 20, 15)], 600), ([(0, 0, 10, 10), (6, 0, 20, 10)], 200),
+    ([(0, 0, 30, 20), (10, 5, 20, 15), (12, 7, 18, 13)], 600)])
+def test_parts_of_an_outline_that_overlap_are_united(parts, area_m2):
+    """A courtyard is a ring of a polygon; a polygon in another one is no hole."""
+    prisms, problems = prisms_of(feature(shapely.MultiPolygon([shapely.box(*part) for part in parts])))
+    assert sum(prism.area.area for prism in prisms) == pytest.approx(area_m2, rel=1e-3)
+    (problem,) = problems
+    assert problem.severity == "fixed" and "overlap or lie in each other: united ('way/1')" in problem.message
+
+
 @pytest.mark.parametrize(("area", "message"), [
     (shapely.Polygon([(0, 0), (10, 0), (20, 0)]), "no area"),
     (shapely.Polygon([(0, 0), (0, 0), (0, 0), (0, 0)]), "no area"),
