@@ -132,6 +132,23 @@ def test_the_rest_of_an_outline_is_kept_and_reported():
     assert "covered to less than 90%" in problems[0].message
 
 
+@pytest.mark.parametrize("bottoms_m", [(10,), (10, 4), (10, 2.5), (10, 0), (0, 10), ()])
+def test_a_building_that_does_not_reach_the_ground_is_named(bottoms_m):
+    """Parts replace their outline: where one begins at 10 m over all of it, nothing is left below."""
+    prisms, problems = prisms_of(feature(shapely.box(0, 0, 30, 10), height="10"), *(
+        part(shapely.box(0, 0, 30, 10), f"way/{row}", height="40", min_height=str(bottom_m))
+        for row, bottom_m in enumerate(bottoms_m, start=2)))
+    low_m = min(bottoms_m, default=0)
+    assert min(prism.height.bottom_m for prism in prisms) == low_m
+    named = [problem.message for problem in problems if "nothing of them reaches it" in problem.message]
+    assert len(named) == (low_m > 2.5)
+    assert all(text.startswith("1 building(s) begin more than 2.5 m") and "('way/1')" in text for text in named)
+
+
+def test_what_a_lone_part_stands_on_is_not_known():
+    assert not prisms_of(part(shapely.box(0, 0, 30, 10), "way/2", height="40", min_height="10"))[1]
+
+
 def test_a_bottom_above_the_top_is_left_out():
     prisms, problems = prisms_of(feature(shapely.box(0, 0, 9, 9), min_height="10"),
                                  feature(shapely.box(20, 0, 29, 9), "way/2"))
