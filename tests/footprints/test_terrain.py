@@ -112,6 +112,15 @@ def test_the_scene_knows_its_ground(slope):
         dict(report.facts)["ground"]
 
 
+def test_the_ground_is_no_building_of_a_table(slope):
+    """Heights count from the ground below: on the slope of 10 and 5 % those of the map, from the lower corner."""
+    pytest.importorskip("geopandas", reason="the extra geo is not installed")
+    report, _ = slope
+    table = Scene.load(report.folder).to_geodataframe().set_index("building")
+    assert "ground" not in table.index and len(table) == 3
+    assert sorted(table["height_m"]) == pytest.approx([9, 12, 30], abs=0.1)
+
+
 def test_without_a_raster_the_ground_is_flat_and_the_report_says_so(tmp_path):
     report, table = build(tmp_path, hamlet(), None)
     assert dict(report.facts)["ground"].startswith("flat, at z = 0: a map holds no terrain")
