@@ -259,7 +259,7 @@ def _without_height(prisms: list[Prism], features: list[Feature], map_options: M
 
 
 def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> list[Feature]:
-    """Return the features that reach into the box."""
+    """Return the features that reach into the box, of 3D models with all parts of the building."""
     if not features:
         raise BadInput(f"{path} holds no buildings (closed ways or multipolygons with the tag "
                        "building or building:part; of a table polygons)")
@@ -294,7 +294,9 @@ def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> lis
                        f"{south:g},{west:g},{north:g},{east:g}; the file's lie in "
                        f"{south_:.5f},{west_:.5f},{north_:.5f},{east_:.5f} "
                        f"(south,west,north,east){hint}")
-    return kept
+    chosen, models = set(kept), {one.name for one in kept if one.shell is not None}
+    return [one for one in features
+            if one in chosen or (one.shell is not None and one.name in models)]
 
 
 def _origin(features: list[Feature], bbox_deg: Bounds | None) -> Origin:

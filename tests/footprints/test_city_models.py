@@ -228,6 +228,15 @@ def test_a_box_keeps_what_lies_in_it(tmp_path):
     assert dict(report.facts)["buildings"] == "1 in 1 blocks"
 
 
+def test_a_box_keeps_all_parts_of_a_building(tmp_path):
+    """Their heights count from the lowest point of all: the part in the box would else stand in the air."""
+    path = write(tmp_path, made.in_one_building(made.cityjson([(0, 0, 500), (50, 0, 505)])))
+    west, south = Transformer.from_crs("EPSG:28992", "EPSG:4326", always_xy=True).transform(85_040, 445_990)
+    report = build_scene_from_map(path, tmp_path / "out", MapOptions(bbox_deg=(south, west, south + 0.001, west + 0.001)))
+    table = pd.read_csv(report.folder / "buildings.csv")
+    assert table["building"].tolist() == ["B0", "B0"] and sorted(table["bottom_m"]) == [0, 5]
+
+
 def broken(change):
     model = made.cityjson([(0, 0, 0)])
     change(model)

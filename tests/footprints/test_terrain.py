@@ -76,11 +76,8 @@ def test_parts_of_a_city_model_stand_on_the_ground_of_their_building(tmp_path):
     from pyproj import Transformer
 
     east, north = Transformer.from_crs(4326, 32634, always_xy=True).transform(20, 10)
-    model = made.cityjson([(0, 0, 500), (50, 0, 505)], "EPSG:32634", at=(round(east), round(north)))
-    objects = model["CityObjects"]
-    objects["B1-0"]["parents"] = ["B0"]
-    objects["B0"]["children"].append("B1-0")
-    del objects["B1"]
+    model = made.in_one_building(
+        made.cityjson([(0, 0, 500), (50, 0, 505)], "EPSG:32634", at=(round(east), round(north))))
     (tmp_path / "a.city.json").write_text(json.dumps(model))
     dem = write_dem(tmp_path / "a.tif", incline(0.1, 0, 500))
     report = build_scene_from_map(tmp_path / "a.city.json", tmp_path / "out", MapOptions(terrain=dem),
