@@ -5,10 +5,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+EVEN_SHARE = 0.01  # of their mean, by which the steps of even azimuths may differ: files round them
+
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Gain on a regular grid of directions in the antenna's own frame.
+    """Gain on a grid of directions in the antenna's own frame.
 
     Attributes:
         azimuth_deg: (n,) ascending, 0 to less than 360, clockwise from the boresight seen from
@@ -47,8 +49,19 @@ class Pattern:
         return (1 - above) * low + above * high
 
     def heading_mean(self) -> "Pattern":
-        """Average the power over all azimuths, for an antenna on a carrier that turns."""
-        mean_dbi = 10 * np.log10(np.mean(10 ** (self.gain_dbi / 10), axis=1))
+        """Average the power over all azimuths, for an antenna on a carrier that turns.
+
+        Evenly spaced azimuths count alike. Others stand for unequal shares of a turn: then the mean
+        is that of the interpolated pattern.
+        """
+        gaps_deg = np.diff(self.azimuth_deg, append=self.azimuth_deg[0] + 360)
+        power = 10 ** (self.gain_dbi / 10)
+        if np.ptp(gaps_deg) > EVEN_SHARE * gaps_deg.mean():
+            # Between two azimuths a line in dB, whose power has the logarithmic mean of its ends
+            rise = np.diff(self.gain_dbi, append=self.gain_dbi[:, :1]) * np.log(10) / 10
+            level = np.abs(rise) < 1e-9
+            power = power * np.where(level, 1.0, np.expm1(rise) / np.where(level, 1.0, rise))
+        mean_dbi = 10 * np.log10(power @ gaps_deg / 360)
         return Pattern(np.array([0.0]), self.elevation_deg, mean_dbi[:, None])
 
 

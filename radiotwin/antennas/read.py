@@ -13,10 +13,12 @@ from radiotwin.errors import BadInput
 from radiotwin.inputs import read_bytes
 
 MAX_GAIN_DBI = 60.0  # [dBi], about that of a dish of 20 m at 5 GHz; more is taken for an error
+ROUNDED_DB = 0.1  # [dB], by which rows of one direction may differ: files hold a decimal or more
 AZIMUTH_DEG = np.arange(0.0, 360.0)  # grid of the patterns between two cuts
 ELEVATION_DEG = np.arange(-90.0, 91.0)
 _COLUMNS = {"azimuth_deg": (-360, 360), "elevation_deg": (-90, 90),
             "gain_dbi": (-200, MAX_GAIN_DBI)}  # of a CSV file, with the range of their values
+_TOLERANCE_DB = ROUNDED_DB + 1e-9  # decimals are no exact binary numbers
 _GAIN = re.compile(r"([+-]?\d+(?:\.\d*)?)\s*(dbd|dbi)?", re.IGNORECASE)
 
 
@@ -29,6 +31,8 @@ def read_pattern(path: Path | str) -> Pattern:
     `between_cuts`).
     `.csv`: columns azimuth_deg (clockwise from the boresight), elevation_deg (up) and gain_dbi, on
     a full grid.
+    Of rows of one direction, such as 0 and 360 degrees, the first counts; they may differ by
+    `ROUNDED_DB`.
 
     Args:
         path: file to read.
@@ -37,8 +41,8 @@ def read_pattern(path: Path | str) -> Pattern:
         The pattern in the antenna's own frame.
 
     Raises:
-        BadInput: no such file, an unknown format, a missing part, an impossible number, or too
-            large; with file and row.
+        BadInput: no such file, an unknown format, a missing part, an impossible number, rows that
+            contradict each other, or too large; with file and row.
     """
     path = Path(path)
     readers = {".msi": _read_msi, ".pln": _read_msi, ".csv": _read_csv}
@@ -103,7 +107,9 @@ def _read_msi(path: Path, text: bytes) -> Pattern:
             if not (0 <= angle <= 360 and 0 <= attenuation < 200):
                 raise BadInput(f"{path}, row {row}: {line.strip()[:60]!r} is not an angle (0 to "
                                "360) and an attenuation (0 dB or more)")
-            cut[angle % 360] = -attenuation
+            known = cut.setdefault(angle % 360, -attenuation)
+            if abs(known + attenuation) > _TOLERANCE_DB:
+                raise _contradiction(path, row, f"angle {angle:g}", -known, attenuation)
     for key, cut in cuts.items():
         if len(cut) < 2:
             raise BadInput(f"{path}: has no cut {key}; it needs HORIZONTAL and VERTICAL with an "
@@ -112,6 +118,13 @@ def _read_msi(path: Path, text: bytes) -> Pattern:
         raise BadInput(f"{path}: has no GAIN; add a row such as GAIN 15.5 dBi")
     horizontal_db, vertical_db = (_resample(cut) for cut in cuts.values())
     return Pattern(AZIMUTH_DEG, ELEVATION_DEG, gain_dbi + between_cuts(horizontal_db, vertical_db))
+
+
+def _contradiction(path: Path, row: int, direction: str, known_db: float,
+                   given_db: float) -> BadInput:
+    return BadInput(f"{path}, row {row}: {direction} has {given_db:g} dB, an earlier row of this "
+                    f"direction {known_db:g} dB; rows of one direction (0 and 360 degrees are one) "
+                    f"may differ by {ROUNDED_DB:g} dB, remove the wrong one")
 
 
 def _resample(cut: dict[float, float]) -> np.ndarray:
@@ -143,6 +156,13 @@ def _read_csv(path: Path, text: bytes) -> Pattern:
                            f"number from {low} to {high}")
     # A tiny negative angle becomes 360, which is 0
     numbers["azimuth_deg"] = numbers["azimuth_deg"] % 360 % 360
+    first_dbi = numbers.groupby(columns[:2])["gain_dbi"].transform("first")
+    apart = np.flatnonzero((numbers["gain_dbi"] - first_dbi).abs() > _TOLERANCE_DB)
+    if len(apart):
+        row = int(apart[0])
+        azimuth, elevation, gain_dbi = numbers.iloc[row]
+        raise _contradiction(path, row + 2, f"azimuth {azimuth:g}, elevation {elevation:g}",
+                             first_dbi[row], gain_dbi)
     numbers = numbers.drop_duplicates(columns[:2])
     across, up = (numbers[name].nunique() for name in columns[:2])
     if across * up != len(numbers) or up < 2:

@@ -259,7 +259,7 @@ def _without_height(prisms: list[Prism], features: list[Feature], map_options: M
 
 
 def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> list[Feature]:
-    """Return the features that reach into the box."""
+    """Return the features that reach into the box, of 3D models with all parts of the building."""
     if not features:
         raise BadInput(f"{path} holds no buildings (closed ways or multipolygons with the tag "
                        "building or building:part; of a table polygons)")
@@ -280,7 +280,8 @@ def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> lis
             if x0 <= east and x1 >= west and y0 <= north and y1 >= south]
     for feature in near:
         budget.check(feature.name, feature.area)
-    kept = [feature for feature in near if shapely.make_valid(feature.area).intersects(box)]
+    kept = [feature for feature in near if shapely.intersects(
+        shapely.make_valid(shapely.get_parts(feature.area)), box).any()]
     if not kept:
         west_, south_ = np.nanmin(bounds_deg[:, :2], axis=0)
         east_, north_ = np.nanmax(bounds_deg[:, 2:], axis=0)
@@ -293,7 +294,9 @@ def _within(features: list[Feature], bbox_deg: Bounds | None, path: Path) -> lis
                        f"{south:g},{west:g},{north:g},{east:g}; the file's lie in "
                        f"{south_:.5f},{west_:.5f},{north_:.5f},{east_:.5f} "
                        f"(south,west,north,east){hint}")
-    return kept
+    chosen, models = set(kept), {one.name for one in kept if one.shell is not None}
+    return [one for one in features
+            if one in chosen or (one.shell is not None and one.name in models)]
 
 
 def _origin(features: list[Feature], bbox_deg: Bounds | None) -> Origin:

@@ -35,6 +35,7 @@ _SKIPPED = ("Room", "BuildingRoom", "BuildingFurniture", "IntBuildingInstallatio
             "FloorSurface", "ImplicitGeometry", "appearanceMember", "appearance")
 _BOUNDARIES = ("RoofSurface", "WallSurface", "GroundSurface", "ClosureSurface",
                "OuterCeilingSurface", "OuterFloorSurface")
+_ROOF_EDGES = ("lod0RoofEdge", "RoofSurface")  # of CityGML 2.0 and 3.0
 _POLYGONS = ("Polygon", "PolygonPatch", "Triangle", "Rectangle")
 _VALUES = ("stringAttribute", "doubleAttribute", "intAttribute", "measureAttribute")
 _NAME_LENGTH = 200
@@ -63,16 +64,20 @@ def read_citygml(path: Path, crs: str | None = None) -> MapFile:
 
 @dataclass
 class _Surfaces:
-    """Geometries of one object by their level: those of solids, and those beside them."""
+    """Geometries of one object by their level: those of solids, and those beside them.
+
+    An outline (LoD 0) is its footprint, or where it has none the edge of its roof.
+    """
 
     solids: dict[float, Geometry] = field(default_factory=dict)
     others: dict[float, Geometry] = field(default_factory=dict)
+    roof_edges: dict[float, Geometry] = field(default_factory=dict)
     referring: set[float] = field(default_factory=set)  # levels with a solid that names surfaces
 
     def geometries(self) -> list[Geometry]:
-        found = []
-        for lod in sorted({*self.solids, *self.others}):
-            solid, other = self.solids.get(lod), self.others.get(lod)
+        found, others = [], self.roof_edges | self.others
+        for lod in sorted({*self.solids, *others}):
+            solid, other = self.solids.get(lod), others.get(lod)
             if solid is None or other is None:
                 found.append(solid or other or Geometry(lod))
             elif lod in self.referring or not solid.polygons:
@@ -209,9 +214,10 @@ class _Reader:
             if self.rings and self.lod:
                 _, lod, is_solid = self.lod
                 surfaces = self.open[-1][2]
-                kept = (surfaces.solids if is_solid else surfaces.others).setdefault(
-                    lod, Geometry(lod))
-                kept.polygons.append(self.rings)
+                is_edge = lod == 0 and any(tag in _ROOF_EDGES for tag in self.tags)
+                kept = surfaces.solids if is_solid else \
+                    surfaces.roof_edges if is_edge else surfaces.others
+                kept.setdefault(lod, Geometry(lod)).polygons.append(self.rings)
             self.rings = None
 
     def _add_numbers(self, text: str, dimension: int) -> None:

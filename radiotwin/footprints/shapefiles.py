@@ -183,7 +183,7 @@ def _area(shape: Any) -> BaseGeometry | None:
     outlines = [shapely.Polygon(ring) for ring in rings if _turn(ring) <= 0]
     holes = [ring for ring in rings if _turn(ring) > 0]
     if not outlines:
-        return shapely.MultiPolygon([shapely.Polygon(ring) for ring in holes])
+        return _with_courtyards(shapely.MultiPolygon([shapely.Polygon(ring) for ring in holes]))
     held: list[list[np.ndarray]] = [[] for _ in outlines]
     around = shapely.STRtree([shapely.box(*outline.bounds) for outline in outlines])
     for ring in holes:
@@ -191,8 +191,17 @@ def _area(shape: Any) -> BaseGeometry | None:
         if len(inside):
             smallest = min(inside.tolist(), key=lambda index: abs(outlines[index].area))
             held[smallest].append(ring)
-    return shapely.MultiPolygon([(outline.exterior.coords, rings)
-                                 for outline, rings in zip(outlines, held)])
+    return _with_courtyards(shapely.MultiPolygon([(outline.exterior.coords, rings)
+                                                  for outline, rings in zip(outlines, held)]))
+
+
+def _with_courtyards(area: shapely.MultiPolygon) -> BaseGeometry:
+    """Return an area whose polygons in its largest one are holes: writers may turn all alike."""
+    parts = sorted(area.geoms, key=lambda part: -part.area)
+    if area.is_valid or parts[0].bounds != area.bounds:
+        return area
+    rings = shapely.get_rings(parts)
+    return shapely.Polygon(rings[0], rings[1:])
 
 
 def _turn(ring: np.ndarray) -> float:

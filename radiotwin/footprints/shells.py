@@ -6,6 +6,7 @@ its lowest point: where the file has terrain below it, that is left out.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import mapbox_earcut
@@ -13,6 +14,7 @@ import numpy as np
 import shapely
 import trimesh
 from manifold3d import Error, Manifold, Mesh64
+from shapely.geometry.base import BaseGeometry
 
 from radiotwin.budgets import CORNERS, FACES
 from radiotwin.footprints.features import Feature, Shell, problems_of
@@ -64,7 +66,7 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
             unknown.append(f"{feature.name}: {value}")
         height = Height(float(bottom_m), float(top_m), "model")
         prisms.append(Prism(feature.name, area, height, *table.material_of(feature.tags), body))
-    return prisms, [
+    return _with_sites(prisms), [
         *problems_of(no_area, "building(s) have no area seen from above: left out"),
         *problems_of(too_high, f"building(s) are not between 0 and {MAX_HEIGHT_M:g} m tall: left "
                                "out; are their elevations in metres?"),
@@ -73,6 +75,15 @@ def make_shell_prisms(features: Sequence[Feature], origin: Origin, table: Materi
         *problems_of(unknown, "building(s) have a building:material that is not in the table; the "
                               "default was taken. Name it in --material-table or with --material "
                               "NAME=ITU")]
+
+
+def _with_sites(prisms: Sequence[Prism]) -> list[Prism]:
+    """Return prisms that know the area of their whole building: heights count from its ground."""
+    areas: dict[str, list[BaseGeometry]] = {}
+    for prism in prisms:
+        areas.setdefault(prism.name, []).append(prism.area)
+    sites = {name: shapely.union_all(parts) for name, parts in areas.items()}
+    return [replace(prism, site=sites[prism.name]) for prism in prisms]
 
 
 def elevation_fact(features: Sequence[Feature]) -> str:

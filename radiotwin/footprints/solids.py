@@ -26,6 +26,7 @@ _PAIRS_AT_ONCE = 10_000
 SLIVER_AREA_M2 = 1.0  # [m²]
 SLIVER_WIDTH_M = 0.3  # [m], mean width; the thickness of one wall
 MIN_COVERED_SHARE = 0.9  # of an outline that its parts cover for it to be left out
+HEADROOM_M = 2.5  # [m] above the ground: a building that begins higher, with all parts, is named
 
 Area = tuple[Feature, shapely.MultiPolygon]
 
@@ -95,7 +96,8 @@ def make_prisms(
     wholes = [(feature, area) for feature, area in areas if not feature.is_part]
     parts = [(feature, area) for feature, area in areas if feature.is_part]
     prisms = []
-    for feature, area, site in _resolve_parts(wholes, parts, defects):
+    lowest_m: dict[str, float] = {}  # by building
+    for feature, area, (whole, site) in _resolve_parts(wholes, parts, defects):
         height = height_of(feature.tags, default_height_m, height_column)
         if height.unusable:
             defects.add("height", f"{feature.name}: {', '.join(height.unusable)}")
@@ -108,6 +110,11 @@ def make_prisms(
         material, material_from = table.material_of(feature.tags)
         prisms += [Prism(feature.name, polygon, height, material, material_from, site=site)
                    for polygon in shapely.get_parts(area)]
+        if not whole.is_part:  # what a part without its outline stands on is not known
+            lowest_m[whole.name] = min(lowest_m.get(whole.name, np.inf), height.bottom_m)
+    for name, bottom_m in lowest_m.items():
+        if bottom_m > HEADROOM_M:
+            defects.add("floating", name)
     return prisms, defects.problems()
 
 
@@ -116,6 +123,7 @@ class _Defects:
 
     _KINDS: ClassVar[dict[str, tuple[Severity, str]]] = {
         "invalid": ("fixed", "outline(s) cut or touched themselves: taken apart"),
+        "nested": ("fixed", "outline(s) had parts that overlap or lie in each other: united"),
         "no area": ("warning", "building(s) have no area: left out"),
         "sliver": ("warning", f"sliver(s), under {SLIVER_AREA_M2:g} m² or {SLIVER_WIDTH_M:g} m "
                               "wide: left out"),
@@ -128,6 +136,9 @@ class _Defects:
                                 "--material NAME=ITU"),
         "rest": ("warning", f"outline(s) are covered to less than {MIN_COVERED_SHARE:.0%} by their "
                             "parts: the rest keeps the outline's own height"),
+        "floating": ("warning", f"building(s) begin more than {HEADROOM_M:g} m above the ground, "
+                                "with all their parts: nothing of them reaches it. They are built "
+                                "so; where that is wrong, correct min_height or add what is below"),
     }
 
     def __init__(self) -> None:
@@ -155,7 +166,7 @@ def _clean_one(feature: Feature, area: BaseGeometry,
                defects: _Defects) -> shapely.MultiPolygon | None:
     """Return the valid polygons of an area that are no slivers; None where nothing is left."""
     invalid = not area.is_valid
-    area = _polygons(shapely.make_valid(area))
+    area, shared_m2 = _united(area)
     if area.area < GRID_M**2:
         defects.add("no area", feature.name)
         return None
@@ -167,9 +178,26 @@ def _clean_one(feature: Feature, area: BaseGeometry,
             and 2 * polygon.area / polygon.length >= SLIVER_WIDTH_M]
     if len(kept) < shapely.get_num_geometries(area):
         defects.add("sliver", feature.name)
-    if invalid:
+    if shared_m2 > MIN_OVERLAP_M2:
+        defects.add("nested", feature.name)
+    elif invalid:
         defects.add("invalid", feature.name)
     return shapely.MultiPolygon(kept) if kept else None
+
+
+def _united(area: BaseGeometry) -> tuple[shapely.MultiPolygon, float]:
+    """Return the valid polygons of an area, and the area by which its parts overlap.
+
+    A courtyard is a ring of its polygon [1]: a polygon in another one is built, too.
+
+    [1] OGC 06-103r4, Simple feature access, section 6.1.14 (MultiPolygon).
+    """
+    whole = _polygons(area)
+    if whole.is_valid:
+        return whole, 0.0
+    parts = [shapely.make_valid(polygon) for polygon in whole.geoms]
+    united = _polygons(shapely.union_all(parts) if len(parts) > 1 else parts[0])
+    return united, sum(part.area for part in parts) - united.area
 
 
 def _polygons(area: BaseGeometry) -> shapely.MultiPolygon:
@@ -187,10 +215,10 @@ def _touches_itself(polygon: shapely.Polygon) -> bool:
 
 def _resolve_parts(
     wholes: list[Area], parts: list[Area], defects: _Defects
-) -> list[tuple[Feature, shapely.MultiPolygon, shapely.MultiPolygon]]:
+) -> list[tuple[Feature, shapely.MultiPolygon, Area]]:
     """Return parts with inherited tags, and buildings without the areas of their parts.
 
-    With each comes the area of the whole building.
+    With each comes the whole building with its area; a part that lies in none is its own.
     """
     tree, found = shapely.STRtree([area for _, area in wholes]), 0
     whole_m2 = [area.area for _, area in wholes]
@@ -201,14 +229,14 @@ def _resolve_parts(
         owners = [int(index) for index in tree.query(inside, predicate="within")]
         found += len(owners)
         PART_PAIRS.check(found, "the map")
-        site = area
+        whole = feature, area
         if owners:
             owner = min(owners, key=whole_m2.__getitem__)
             parts_of.setdefault(owner, []).append(area)
-            feature, site = _inherit(feature, wholes[owner][0]), wholes[owner][1]
-        resolved.append((feature, area, site))
+            whole = wholes[owner]
+            feature = _inherit(feature, whole[0])
+        resolved.append((feature, area, whole))
     for index, (feature, area) in enumerate(wholes):
-        site = area
         if index in parts_of:
             rest = _polygons(area.difference(shapely.union_all(parts_of[index])))
             if rest.area <= (1 - MIN_COVERED_SHARE) * area.area:
@@ -216,7 +244,7 @@ def _resolve_parts(
             defects.add("rest", feature.name)
             area = shapely.MultiPolygon([polygon for polygon in rest.geoms
                                          if polygon.area >= SLIVER_AREA_M2])
-        resolved.append((feature, area, site))
+        resolved.append((feature, area, wholes[index]))
     return resolved
 
 

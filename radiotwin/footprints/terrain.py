@@ -116,10 +116,12 @@ def stand_on(prisms: Sequence[Prism], ground: Ground) -> list[Prism]:
     """
     if ground.config is None:
         return list(prisms)
-    lowest_m = lowest_ground_m([prism.site or prism.area for prism in prisms], ground)
+    # Parts of a building share its site, of which the ground is looked up once
+    sites = {id(site): site for site in (prism.site or prism.area for prism in prisms)}
+    lowest_m = dict(zip(sites, lowest_ground_m(list(sites.values()), ground).tolist()))
     stood = []
-    for prism, low_m in zip(prisms, lowest_m.tolist()):
-        low_m, height = round(low_m, 3), prism.height
+    for prism in prisms:
+        low_m, height = round(lowest_m[id(prism.site or prism.area)], 3), prism.height
         bottom_m = low_m + height.bottom_m if height.bottom_m > 0 else low_m - SKIRT_M
         body = prism.body
         if body is not None and body.mesh is not None:  # a solid one follows its height

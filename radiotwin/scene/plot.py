@@ -169,14 +169,18 @@ def scene_table(scene: Scene, layer: str) -> GeoDataFrame:
         return geo_data_frame(table, origin, position_m=scene.device_m)
     import shapely
 
+    terrain = scene.config.terrain
     found, outlines = [], []
     for shape in read_city(scene.xml_path):
         corners_m = shape.mesh.vertices[shape.mesh.faces]
-        if corners_m[..., 2].max() < GROUND_M:
+        x_m, y_m, z_m = shape.mesh.vertices[np.unique(shape.mesh.faces)].T
+        ground_m = 0.0 if terrain is None else scene.city.ground_height_m(x_m, y_m)
+        height_m = float((z_m - ground_m).max())
+        if height_m < GROUND_M or terrain is not None and shape.name == terrain.shape:
             continue
         flat = np.asarray(shapely.polygons(corners_m[..., :2]))
         outlines.append(shapely.union_all(flat[shapely.area(flat) > 0], grid_size=1e-3))
-        found.append((shape.name, shape.material.name, float(corners_m[..., 2].max())))
+        found.append((shape.name, shape.material.name, height_m))
     table = pd.DataFrame(found, columns=["building", "material", "height_m"])
     return geo_data_frame(table, origin, geometry=np.array(outlines, dtype=object))
 

@@ -118,7 +118,8 @@ class Scene(Summarised):
         """Return buildings or devices as rows with a geometry, in metres of the local frame.
 
         Args:
-            layer: `buildings` (`building, material, height_m` and their outline) or `devices`.
+            layer: `buildings` (`building, material, height_m` of the highest point above the
+                ground below it, and their outline) or `devices`.
 
         Raises:
             BadInput: GeoPandas is not installed, or another layer.

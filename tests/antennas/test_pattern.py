@@ -27,6 +27,29 @@ def test_mean_over_headings_is_of_power():
     assert ROUND.heading_mean().at(12.0, 45.0) == ROUND.at(200.0, 45.0) == pytest.approx(-4.0)
 
 
+def sparse(azimuth_deg, gain_dbi):
+    return Pattern(np.array(azimuth_deg, dtype=float), np.array([-90.0, 90.0]), np.tile(gain_dbi, (2, 1)))
+
+
+@pytest.mark.parametrize(("azimuth_deg", "gain_dbi"), [
+    ([0, 1, 2, 3, 180], [10.0, 10, 10, 10, -20]), ([10, 50, 200, 210], [3.0, 3, -4, 12]), ([7, 300], [0.0, 0]),
+    (np.r_[0:90, 90:355:5], beam(np.r_[0:90, 90:355:5], 5))])
+def test_mean_over_headings_that_are_not_even(azimuth_deg, gain_dbi):
+    """Azimuths that lie close together do not count more: the mean is that of the interpolated pattern."""
+    pattern = sparse(azimuth_deg, gain_dbi)
+    headings = np.arange(0.005, 360, 0.01)
+    assert pattern.heading_mean().at(0, 0) == pytest.approx(10 * np.log10(np.mean(10 ** (pattern.at(headings, 0) / 10))),
+                                                            abs=1e-3)
+
+
+def test_even_headings_are_even_when_a_file_rounds_them():
+    azimuth_deg, gain_dbi = np.arange(7) * 360 / 7, np.array([12.0, 3, -9, -30, -9, 3, 6])
+    even, rounded = sparse(azimuth_deg, gain_dbi), sparse(azimuth_deg.round(1), gain_dbi)
+    mean_dbi = 10 * np.log10(np.mean(10 ** (gain_dbi / 10)))
+    assert even.heading_mean().at(0, 0) == pytest.approx(mean_dbi, abs=1e-9)
+    assert rounded.heading_mean().at(0, 0) == pytest.approx(mean_dbi, abs=0.01)
+
+
 @pytest.mark.parametrize(("azimuth_deg", "tilt_deg", "ray", "seen"), [
     (0, 0, (0, 1, 0), (0, 0)), (0, 0, (1, 0, 0), (90, 0)), (90, 0, (1, 0, 0), (0, 0)), (90, 0, (0, 1, 0), (-90, 0)),
     (0, 0, (0, 1, 1), (0, 45)), (0, -10, (0, 1, 0), (0, 10)), (0, -10, (0, -1, 0), (180, -10)),

@@ -63,6 +63,7 @@ def test_csv(tmp_path):
     ("a.msi", msi().split("VERTICAL")[0], "has no cut VERTICAL"),
     ("a.csv", "azimuth_deg,gain_dbi\n1,2\n", "column 'elevation_deg' is missing"),
     ("a.csv", "azimuth_deg,elevation_deg,gain_dbi\n0,0,1\n90,45,2\n", "no full grid of 2 elevations and 2 azimuths"),
+    ("a.csv", "azimuth_deg,elevation_deg,gain_dbi\n", "no full grid of 0 elevations"),
     ("a.csv", "azimuth_deg,elevation_deg,gain_dbi\n0,0,x\n", "row 2, column gain_dbi: 'x' is not a number"),
     ("a.csv", "azimuth_deg,elevation_deg,gain_dbi\n0,91,1\n", "row 2, column elevation_deg"),
 ])
@@ -70,6 +71,24 @@ def test_broken_patterns(tmp_path, name, text, message):
     with pytest.raises(BadInput, match=message) as error:
         read_pattern(write(tmp_path, text, name))
     assert str(tmp_path / name) in str(error.value)
+
+
+HEAD = "azimuth_deg,elevation_deg,gain_dbi\n"
+GRID = "0,0,10\n90,0,1\n0,90,0\n90,90,0\n"
+LATER = "HORIZONTAL 1\n360 {}\n"
+
+
+@pytest.mark.parametrize(("name", "text", "same", "other", "message"), [
+    ("a.csv", HEAD + GRID + "360,0,{}\n", 10.1, -20, "row 6: azimuth 0, elevation 0 has -20 dB, an earlier .* 10 dB"),
+    ("a.csv", HEAD + GRID + "-270,0,{}\n", 0.95, 1.2, "row 6: azimuth 90, elevation 0 has 1.2 dB"),
+    ("a.msi", msi() + "0 {}\n", 1.92, 3, "row 729: angle 0 has 3 dB, an earlier row of this direction 1.92 dB"),
+    ("a.msi", msi() + LATER, 0.1, 25, "row 730: angle 360 has 25 dB, an earlier row of this direction 0 dB")])
+def test_rows_of_one_direction_must_agree(tmp_path, name, text, same, other, message):
+    once = read_pattern(write(tmp_path, text.rpartition("\n")[0].rpartition("\n")[0], name))
+    again = read_pattern(write(tmp_path, text.format(same), name))
+    assert (again.gain_dbi == once.gain_dbi).all()
+    with pytest.raises(BadInput, match=message):
+        read_pattern(write(tmp_path, text.format(other), name))
 
 
 def test_no_pattern(tmp_path):

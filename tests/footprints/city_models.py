@@ -31,6 +31,15 @@ def cityjson(houses, system="https://www.opengis.net/def/crs/EPSG/0/7415", lod="
             "transform": {"scale": [0.001] * 3, "translate": [*at, 0.0]}, "CityObjects": objects, "vertices": vertices}
 
 
+def in_one_building(model):
+    """The houses of a model of `cityjson` as parts of its first building."""
+    objects = model["CityObjects"]
+    parts = [name for name in objects if name.endswith("-0")]
+    objects["B0"]["children"] = parts
+    return model | {"CityObjects": {"B0": objects["B0"]} | {name: objects[name] | {"parents": ["B0"]}
+                                                            for name in parts}}
+
+
 def polygon(points, name, dimension=3):
     text = " ".join(f"{value:.3f}" for point in [*points, points[0]] for value in point[:dimension])
     return (f'<gml:Polygon gml:id="{name}"><gml:exterior><gml:LinearRing><gml:posList srsDimension="{dimension}">{text}'

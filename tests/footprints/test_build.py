@@ -92,6 +92,16 @@ def test_meshes_are_watertight_and_face_outwards(report, table):
     assert set(table["shape"]) == {path.stem for path in (report.folder / "meshes").glob("*.ply")} - {"ground"}
 
 
+def test_a_box_within_a_part_that_lies_in_another_part(tmp_path):
+    """The parts of an outline are united: there is a building, and no courtyard."""
+    rings = [[[[x, 47.5 + y] for x, y in ((-a, -a), (a, -a), (a, a), (-a, a), (-a, -a))]] for a in (3e-4, 1.5e-4)]
+    (tmp_path / "a.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [
+        {"type": "Feature", "properties": {"height": 9}, "geometry": {"type": "MultiPolygon", "coordinates": rings}}]}))
+    report = build_scene_from_map(tmp_path / "a.geojson", tmp_path / "out",
+                                  MapOptions(bbox_deg=(47.49995, -5e-5, 47.50005, 5e-5)))
+    assert pd.read_csv(report.folder / "buildings.csv")["area_m2"].tolist() == [pytest.approx(3010, rel=0.01)]
+
+
 def test_a_box_of_degrees(tmp_path):
     box = 47.4998, 8.699, 47.5002, 8.7001
     report = build_scene_from_map(TOWN, tmp_path / "part", MapOptions(bbox_deg=box, default_height_m=4.5))

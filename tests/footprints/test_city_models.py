@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+import shapely
 import trimesh
 from pyproj import Transformer
 
@@ -108,6 +109,32 @@ def test_an_outline_of_citygml(tmp_path):
         assert pd.read_csv(report.folder / "buildings.csv")["top_m"].tolist() == [pytest.approx(top_m, abs=1e-3)], name
 
 
+def outlines_of_citygml(footprint, edge):
+    """Names of the elements around a footprint of 10 x 12 m and a roof edge half a metre beyond it; "": without one."""
+    (x0, y0, _), _, (x1, y1, z), _ = made.corners(691_000, 5_336_000, 500)[:4]
+    found = ""
+    for names, beyond_m in ((footprint, 0.0), (edge, 0.5)):
+        if names:
+            points = [(x, y, z) for x, y in shapely.box(x0 - beyond_m, y0 - beyond_m, x1 + beyond_m, y1 + beyond_m)
+                      .exterior.coords[:-1]]
+            tags = [f"bldg:{name}" for name in names.split()] + ["gml:MultiSurface", "gml:surfaceMember"]
+            found += "".join(f"<{tag}>" for tag in tags) + made.polygon(points, f"p{beyond_m}") + "".join(
+                f"</{tag}>" for tag in reversed(tags))
+    return found
+
+
+@pytest.mark.parametrize(("footprint", "edge", "area_m2"), [
+    ("lod0FootPrint", "lod0RoofEdge", 120), ("", "lod0RoofEdge", 143), ("lod0FootPrint", "", 120),
+    ("boundary GroundSurface lod0MultiSurface", "boundary RoofSurface lod0MultiSurface", 120),
+    ("", "boundary RoofSurface lod0MultiSurface", 143)])
+def test_the_footprint_counts_before_the_edge_of_the_roof(tmp_path, footprint, edge, area_m2):
+    content = made.building(outlines_of_citygml(footprint, edge), "H",
+                            '<bldg:measuredHeight uom="m">12</bldg:measuredHeight>')
+    report = build_scene_from_map(write(tmp_path, made.citygml([content]), "a.gml"), tmp_path / "out")
+    assert pd.read_csv(report.folder / "buildings.csv")["area_m2"].tolist() == [pytest.approx(area_m2, rel=2e-3)]
+    assert not report.problems
+
+
 def test_parts_of_a_building_stand_on_its_ground(tmp_path):
     part = made.house(691_010, 5_336_000, 503, "P").removeprefix("<core:cityObjectMember>").removesuffix(
         "</core:cityObjectMember>").replace("bldg:Building", "bldg:BuildingPart")
@@ -199,6 +226,15 @@ def test_a_box_keeps_what_lies_in_it(tmp_path):
     west, south = Transformer.from_crs("EPSG:28992", "EPSG:4326", always_xy=True).transform(85_030, 445_990)
     report = build_scene_from_map(path, tmp_path / "out", MapOptions(bbox_deg=(south, west, south + 0.001, west + 0.001)))
     assert dict(report.facts)["buildings"] == "1 in 1 blocks"
+
+
+def test_a_box_keeps_all_parts_of_a_building(tmp_path):
+    """Their heights count from the lowest point of all: the part in the box would else stand in the air."""
+    path = write(tmp_path, made.in_one_building(made.cityjson([(0, 0, 500), (50, 0, 505)])))
+    west, south = Transformer.from_crs("EPSG:28992", "EPSG:4326", always_xy=True).transform(85_040, 445_990)
+    report = build_scene_from_map(path, tmp_path / "out", MapOptions(bbox_deg=(south, west, south + 0.001, west + 0.001)))
+    table = pd.read_csv(report.folder / "buildings.csv")
+    assert table["building"].tolist() == ["B0", "B0"] and sorted(table["bottom_m"]) == [0, 5]
 
 
 def broken(change):

@@ -45,6 +45,18 @@ def test_outlines_courtyards_and_columns(town):
     assert first.area.bounds[:2] == pytest.approx((8.7, 47.5), abs=0.02)
 
 
+@pytest.mark.parametrize("turn", [1, -1])
+def test_a_courtyard_that_turns_as_its_outline(tmp_path, turn):
+    shapefile = pytest.importorskip("shapefile")
+    path = write(tmp_path, shapely.Polygon(SQUARE))  # for its .prj
+    with shapefile.Writer(str(tmp_path / "a"), shapeType=shapefile.POLYGON) as writer:
+        writer.field("HOEHE", "N", decimal=1)
+        writer.poly([ring[[0, 3, 2, 1, 0]][::turn].tolist() for ring in (SQUARE, COURTYARD[::-1])])
+        writer.record(12.5)
+    (one,) = read_shapefile(path).features
+    assert area_m2(one) == pytest.approx(300, rel=2e-3) and one.area.is_valid
+
+
 def test_an_archive_holds_the_same(town, tmp_path):
     with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
         for suffix in PARTS:

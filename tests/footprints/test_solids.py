@@ -55,6 +55,17 @@ def test_a_courtyard_that_touches_the_outside_wall():
     assert total_volume(blocks) == pytest.approx(10 * 350, rel=0.01)
 
 
+@pytest.mark.parametrize(("parts", "area_m2"), [
+    ([(0, 0, 30, 20), (10, 5, 20, 15)], 600), ([(0, 0, 10, 10), (6, 0, 20, 10)], 200),
+    ([(0, 0, 30, 20), (10, 5, 20, 15), (12, 7, 18, 13)], 600)])
+def test_parts_of_an_outline_that_overlap_are_united(parts, area_m2):
+    """A courtyard is a ring of a polygon; a polygon in another one is no hole."""
+    prisms, problems = prisms_of(feature(shapely.MultiPolygon([shapely.box(*part) for part in parts])))
+    assert sum(prism.area.area for prism in prisms) == pytest.approx(area_m2, rel=1e-3)
+    (problem,) = problems
+    assert problem.severity == "fixed" and "overlap or lie in each other: united ('way/1')" in problem.message
+
+
 @pytest.mark.parametrize(("area", "message"), [
     (shapely.Polygon([(0, 0), (10, 0), (20, 0)]), "no area"),
     (shapely.Polygon([(0, 0), (0, 0), (0, 0), (0, 0)]), "no area"),
@@ -119,6 +130,23 @@ def test_the_rest_of_an_outline_is_kept_and_reported():
                                  part(shapely.box(0, 0, 10, 10), "way/2", height="20"))
     assert {(prism.name, round(prism.area.area)) for prism in prisms} == {("way/1", 200), ("way/2", 100)}
     assert "covered to less than 90%" in problems[0].message
+
+
+@pytest.mark.parametrize("bottoms_m", [(10,), (10, 4), (10, 2.5), (10, 0), (0, 10), ()])
+def test_a_building_that_does_not_reach_the_ground_is_named(bottoms_m):
+    """Parts replace their outline: where one begins at 10 m over all of it, nothing is left below."""
+    prisms, problems = prisms_of(feature(shapely.box(0, 0, 30, 10), height="10"), *(
+        part(shapely.box(0, 0, 30, 10), f"way/{row}", height="40", min_height=str(bottom_m))
+        for row, bottom_m in enumerate(bottoms_m, start=2)))
+    low_m = min(bottoms_m, default=0)
+    assert min(prism.height.bottom_m for prism in prisms) == low_m
+    named = [problem.message for problem in problems if "nothing of them reaches it" in problem.message]
+    assert len(named) == (low_m > 2.5)
+    assert all(text.startswith("1 building(s) begin more than 2.5 m") and "('way/1')" in text for text in named)
+
+
+def test_what_a_lone_part_stands_on_is_not_known():
+    assert not prisms_of(part(shapely.box(0, 0, 30, 10), "way/2", height="40", min_height="10"))[1]
 
 
 def test_a_bottom_above_the_top_is_left_out():

@@ -1,5 +1,6 @@
 """Buildings of a map on the terrain of a GeoTIFF: heights on a slope, references and units, and rasters to refuse."""
 
+import json
 import os
 import shutil
 from pathlib import Path
@@ -15,6 +16,7 @@ from radiotwin.footprints.terrain_raster import read_heights
 from radiotwin.scene import Scene
 from radiotwin.scene.build import BuildOptions
 from radiotwin.tables import Origin
+from tests.footprints import city_models as made
 from tests.footprints.conftest import Map
 from tests.terrains import LAT_M, LON_M, incline, write_dem
 
@@ -69,6 +71,24 @@ def test_buildings_stand_on_the_slope(slope):
     assert table.loc["way/5", ["bottom_m", "top_m"]].tolist() == pytest.approx([bridge_m + 5, bridge_m + 9], abs=0.05)
 
 
+def test_parts_of_a_city_model_stand_on_the_ground_of_their_building(tmp_path):
+    """Their heights count from its lowest point: a part 50 m up a slope of 10 % begins 5 m above it."""
+    from pyproj import Transformer
+
+    east, north = Transformer.from_crs(4326, 32634, always_xy=True).transform(20, 10)
+    model = made.in_one_building(
+        made.cityjson([(0, 0, 500), (50, 0, 505)], "EPSG:32634", at=(round(east), round(north))))
+    (tmp_path / "a.city.json").write_text(json.dumps(model))
+    dem = write_dem(tmp_path / "a.tif", incline(0.1, 0, 500))
+    report = build_scene_from_map(tmp_path / "a.city.json", tmp_path / "out", MapOptions(terrain=dem),
+                                  BuildOptions(origin=ORIGIN))
+    low_m = 500 - Scene.load(report.folder).config.terrain.datum_m
+    table = pd.read_csv(report.folder / "buildings.csv").sort_values("x_m")
+    assert table["ground_m"].tolist() == pytest.approx([low_m] * 2, abs=0.1)
+    assert table["bottom_m"].tolist() == pytest.approx([low_m - 1, low_m + 5], abs=0.1)
+    assert table["top_m"].tolist() == pytest.approx([low_m + made.RIDGE_M, low_m + 5 + made.RIDGE_M], abs=0.1)
+
+
 def test_the_scene_knows_its_ground(slope):
     report, _ = slope
     scene = Scene.load(report.folder)
@@ -87,6 +107,15 @@ def test_the_scene_knows_its_ground(slope):
     assert above_m == pytest.approx(np.repeat(scene.config.lattice.altitudes_m, above_m.size // 3), abs=0.05)
     assert "terrain from 405.5 to 463.5 m (EGM96 height, above the geoid); z = 0 is at 405 m" in \
         dict(report.facts)["ground"]
+
+
+def test_the_ground_is_no_building_of_a_table(slope):
+    """Heights count from the ground below: on the slope of 10 and 5 % those of the map, from the lower corner."""
+    pytest.importorskip("geopandas", reason="the extra geo is not installed")
+    report, _ = slope
+    table = Scene.load(report.folder).to_geodataframe().set_index("building")
+    assert "ground" not in table.index and len(table) == 3
+    assert sorted(table["height_m"]) == pytest.approx([9, 12, 30], abs=0.1)
 
 
 def test_without_a_raster_the_ground_is_flat_and_the_report_says_so(tmp_path):
