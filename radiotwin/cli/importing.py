@@ -129,7 +129,7 @@ def import_(
         "track": _tracks(track, track_topic), "track_max_gap_s": track_max_gap_s,
         "wide": [parse_columns(text) for text in wide] if wide else None}
     mapping = columns
-    if columns is not None and "=" in columns and not columns.endswith(".toml"):
+    if columns is not None and "=" in columns and not columns.lower().endswith(".toml"):
         given["columns"] = parse_columns(columns)
         mapping = None
     given = {name: value for name, value in given.items() if value is not None}
