@@ -41,7 +41,8 @@ class DisturbedEnvironment(Environment):
             1 - volume_spread, 1 + volume_spread, (flights, frame.data_units.shape[1]))
         self._slot[new], self._failed[new] = 0, rng.integers(0, mission.uavs, flights)
         self._failed_in[new] = np.where(rng.random(flights) < loss,
-                                        rng.integers(1, mission.longest // 2 + 1, flights), -1)
+                                        rng.integers(1, max(mission.longest // 2, 1) + 1, flights),
+                                        -1)
         return frame
 
     @override

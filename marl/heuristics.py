@@ -107,9 +107,9 @@ def _any_of(mask: np.ndarray, rng: np.random.Generator) -> int:
 def greedy_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> np.ndarray:
     """Return (E, U) greedy actions with distinct targets.
 
-    Each UAV, one after the other, claims the nearest device with data that nobody claimed, flies
-    towards it along the larger axis and hovers on top. Where that is not feasible: the other axis,
-    then any feasible action.
+    Each UAV that has not landed, one after the other, claims the nearest device with data that
+    nobody claimed, flies towards it along the larger axis and hovers on top. Where that is not
+    feasible: the other axis, then any feasible action.
     """
     flights, uavs = frame.battery.shape
     devices = len(mission.data_units)
@@ -120,6 +120,9 @@ def greedy_actions(mission: Mission, frame: Frame, rng: np.random.Generator) -> 
     for e in range(flights):
         claimed[:] = False
         for u in range(uavs):
+            if frame.battery[e, u] == 0:  # it has landed: what it claimed nobody would fly to
+                action[e, u] = NO_OP
+                continue
             row, column = frame.cell[e, u, 0], frame.cell[e, u, 1]
             target, nearest = -1, np.inf
             for k in range(devices):

@@ -21,6 +21,7 @@ from marl.sizes import check_sizes
 from marl.threads import keep_memory, limit_threads
 from radiotwin.cells import write_csv
 from radiotwin.console import print_rows
+from radiotwin.content_hash import content_hash
 from radiotwin.cuda import torch_device
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_file, atomic_path, is_temporary
@@ -37,6 +38,7 @@ TRAINED_IN = {"nn": "NN twin", "log-distance": "log-distance twin", "kriging": "
               "raytrace": "ray-traced twin", "path-kriging": "twin of a map that may be wrong",
               "truth": "the truth"}
 BASELINES = ("planner", "greedy", "random")  # in every table
+_REST = "truth besides gain_db"
 
 
 @dataclass(frozen=True)
@@ -99,6 +101,7 @@ class Session:
             except BadInput:
                 raise BadInput(f"{path} is not there or damaged, so there is nothing to resume in "
                                f"{self.out}; start the run without --resume") from None
+            before["world"].setdefault(_REST, world[_REST])  # runs of earlier versions lack it
             for group in config:
                 for name, value in config[group].items():
                     if before[group].get(name) == value:
@@ -180,7 +183,12 @@ def _world(scene: Scene, truth: RadioMap) -> dict[str, str]:
     """Return hashes of what must not change before a run is resumed."""
     declared = hashlib.sha256(read_bytes(scene.folder / "scene.toml")).hexdigest()
     measured = hashlib.sha256(np.ascontiguousarray(truth.gain_db).tobytes()).hexdigest()
-    return {"city": scene.content_hash(), "scene.toml": declared, "truth": measured}
+    rest = {name: values.values if values.dtype.kind in "biuf" else values.values.tolist()
+            for name, values in truth.dataset.variables.items() if name != "gain_db"}
+    rest |= {name: truth.dataset.attrs.get(name)
+             for name in ("shadowing_share", "shadowing_length_m")}
+    return {"city": scene.content_hash(), "scene.toml": declared, "truth": measured,
+            _REST: content_hash(rest)}
 
 
 class _Log:

@@ -2,7 +2,7 @@
 
 import gzip
 from collections.abc import Collection, Iterable
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import IO, Any
 
 import numpy as np
@@ -28,7 +28,7 @@ def read_cells(path: Path, required: Collection[str] = (),
     """Read the cells of a table as they are.
 
     Args:
-        path: `.csv`, `.csv.gz` or `.parquet`.
+        path: `.csv`, `.csv.gz` or `.parquet`, in any case.
         required: columns that it must have.
         optional: other columns that are read; None for all.
 
@@ -42,7 +42,7 @@ def read_cells(path: Path, required: Collection[str] = (),
     """
     check_suffix(path)
     try:
-        read = _read_parquet if path.suffix == ".parquet" else _read_csv
+        read = _read_parquet if path.suffix.lower() == ".parquet" else _read_csv
         return read(path, required, optional)
     except BadInput:
         raise
@@ -67,7 +67,7 @@ def write_csv(table: pd.DataFrame, target: Path | IO[bytes], float_format: str |
         header: whether to write the names of the columns.
     """
     table = with_quotes(table)
-    if not isinstance(target, Path) or target.suffix != ".gz":
+    if not isinstance(target, Path) or target.suffix.lower() != ".gz":
         table.to_csv(target, index=False, float_format=float_format, header=header)
         return
     # Neither a name nor a time in the header: the same table gives the same bytes.
@@ -79,12 +79,13 @@ def check_suffix(path: Path) -> None:
     """Check that a table has one of the formats that are read and written.
 
     Args:
-        path: of the table.
+        path: of the table; its suffix counts in any case.
 
     Raises:
         BadInput: another suffix.
     """
-    if path.suffix not in (".csv", ".parquet") and path.suffixes[-2:] != [".csv", ".gz"]:
+    name = PurePath(path.name.lower())  # some loggers write A.CSV
+    if name.suffix not in (".csv", ".parquet") and name.suffixes[-2:] != [".csv", ".gz"]:
         raise BadInput(f"{path}: unknown format; allowed are .csv, .csv.gz and .parquet")
 
 

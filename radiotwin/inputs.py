@@ -249,7 +249,7 @@ def read_toml(path: Path | str, what: str = "TOML file") -> dict[str, Any]:
 @contextmanager
 def open_gzip(path: Path | str, what: str = "file",
               budget: Budget = FILE_BYTES) -> Iterator[IO[bytes]]:
-    """Open a file for reading; decompress it while it is read if its name ends in `.gz`.
+    """Open a file for reading; decompress it while it is read if its name ends in `.gz`, or `.GZ`.
 
     Args:
         path: of the file.
@@ -263,7 +263,7 @@ def open_gzip(path: Path | str, what: str = "file",
         BadInput: as `open_input`.
     """
     with open_input(path, what, budget) as file:
-        if Path(path).suffix != ".gz":
+        if Path(path).suffix.lower() != ".gz":
             yield file
             return
         with bounded(file, path, True, budget) as content:

@@ -211,12 +211,12 @@ def write_blocks(top: xr.Dataset, dtypes: dict[str, np.dtype], blocks: Iterable[
 
 def is_zarr(path: Path | str) -> bool:
     """Return whether the name of a radio map is that of a Zarr folder."""
-    return Path(path).suffix == ZARR
+    return Path(path).suffix.lower() == ZARR
 
 
 def is_map(path: Path | str) -> bool:
     """Return whether a path has the suffix of a radio map."""
-    return Path(path).suffix in (NETCDF, ZARR)
+    return Path(path).suffix.lower() in (NETCDF, ZARR)
 
 
 def with_cf(dataset: xr.Dataset) -> xr.Dataset:

@@ -182,7 +182,7 @@ class Measurements(Summarised):
             devices = together.enter_context(atomic_path(path.parent / "devices.csv"))
             links = together.enter_context(atomic_path(path))
             write_csv(self.devices, devices)
-            if path.suffix == ".parquet":
+            if path.suffix.lower() == ".parquet":
                 require_pyarrow(path)
                 self.table.to_parquet(links, index=False)
             else:

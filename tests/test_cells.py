@@ -46,6 +46,19 @@ def test_cells_are_read_as_they_are(write, text, cells):
     assert packed.to_numpy().tolist() == cells
 
 
+def test_endings_count_in_any_case(write):
+    table = pd.DataFrame({"a": ["x"], "b": ["1"]})
+    assert read_cells(write(b"a,b\nx,1\n", "T.CSV")).equals(table)
+    assert read_cells(write(gzip.compress(b"a,b\nx,1\n"), "T.Csv.GZ")).equals(table)
+    packed = write(b"", "U.CSV.GZ")
+    write_csv(table, packed)
+    assert gzip.decompress(packed.read_bytes()) == b"a,b\nx,1\n" and read_cells(packed).equals(table)
+    columns = write(b"", "T.PARQUET")
+    pytest.importorskip("pyarrow")
+    table.to_parquet(columns)
+    assert read_cells(columns).astype(str).to_numpy().tolist() == [["x", "1"]]
+
+
 @pytest.mark.parametrize(("data", "message"), [
     (b"a,b\n1,\x002\n", "null characters"), ("a,b\n1,2\n".encode("utf-16-le"), "null characters"),
     (b'a,b\n1,"2\n3,4\n', "cannot be read|fields"), (b"a,b\n1," + b'"' + b"x,\n" * 200_000, "not closed"),

@@ -33,9 +33,9 @@ def test_reads_blank_gains_times_and_heights_as_nan(write):
     np.testing.assert_array_equal(measurements.device_m, [[10, 20, 1.5], [np.nan, np.nan, 1.5]])
 
 
-@pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".parquet"])
+@pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".parquet", ".CSV.GZ", ".PARQUET"])
 def test_written_and_read_again_is_the_same(write, tmp_path, suffix):
-    if suffix == ".parquet":
+    if suffix.lower() == ".parquet":
         pytest.importorskip("pyarrow")
     measurements = read_measurements(write(HEADER + ROWS))
     path = tmp_path / "again" / f"m{suffix}"

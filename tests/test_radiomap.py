@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from radiotwin.cli.options import open_model
 from radiotwin.errors import BadInput
 from radiotwin.map_file import BLOCK_VALUES, MapStream, parts_of, write_blocks
 from radiotwin.radiomap import RadioMap
@@ -25,6 +26,12 @@ def test_a_map_comes_back_from_its_file_as_it_was(tmp_path):
     assert again.devices == ["a", "b"]
     assert again.los.dtype == bool and again.gain_db.dtype == np.float32
     np.testing.assert_array_equal(again.lattice.positions_m, LATTICE.positions_m)
+
+
+def test_a_map_whose_name_is_in_capitals(tmp_path):
+    example().write(tmp_path / "MAP.NC")
+    with open_model(tmp_path / "MAP.NC") as radio_map:
+        assert radio_map.devices == ["a", "b"]
 
 
 def test_values_lie_where_the_lattice_says():

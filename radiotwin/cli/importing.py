@@ -3,13 +3,16 @@
 import math
 import shlex
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from radiotwin.cli.options import parse_origin
 from radiotwin.console import print_rows, say
 from radiotwin.errors import BadInput
+
+if TYPE_CHECKING:
+    from radiotwin.importing.settings import Settings
 
 
 def add_commands(app: typer.Typer) -> None:
@@ -129,7 +132,7 @@ def import_(
         "track": _tracks(track, track_topic), "track_max_gap_s": track_max_gap_s,
         "wide": [parse_columns(text) for text in wide] if wide else None}
     mapping = columns
-    if columns is not None and "=" in columns and not columns.endswith(".toml"):
+    if columns is not None and "=" in columns and not columns.lower().endswith(".toml"):
         given["columns"] = parse_columns(columns)
         mapping = None
     given = {name: value for name, value in given.items() if value is not None}
@@ -140,8 +143,9 @@ def import_(
     say(f"wrote {out}: {report['written']} links, {report['not_detected']} not detected; "
         f"{report['devices']} devices ({report['anchors']} anchors), {report['receivers']} "
         f"receivers, {report['flights']} flights")
-    again = ["radiotwin", "import", *files, "--columns", out / "import.toml", "-o", out]
-    say(f"again: {shlex.join(map(str, [*again, *['--gzip'] * gzip]))}")
+    again = ["radiotwin", "import", *files, "--columns", out / "import.toml", *_tables(settings),
+             "-o", out, *["--gzip"] * gzip]
+    say(f"again: {shlex.join(map(str, again))}")
 
 
 def _print(report: dict[str, Any]) -> None:
@@ -170,6 +174,19 @@ def _print(report: dict[str, Any]) -> None:
             .format(**report["origin"]))
     for text in report["warnings"]:
         say(f"note: {text}")
+
+
+def _tables(settings: "Settings") -> list[str]:
+    """Return the options of all tables of positions, which a file may not name in any folder."""
+    options = [text for name in ("devices", "receivers") if (table := getattr(settings, name))
+               for text in (f"--{name}", table)]
+    tracks, topics = settings.track, {track.topic for track in settings.track}
+    if len(topics) != 1 or any(track.time_offset_s or "=" in track.file for track in tracks):
+        return options  # none, or what only a file can say
+    for track in tracks:
+        options += ["--track", f"{track.receiver}={track.file}" if track.receiver else track.file]
+    topic = topics.pop()
+    return [*options, "--track-topic", topic] if topic else options
 
 
 def _tracks(texts: list[str] | None, topic: str | None) -> list[dict[str, str]] | None:

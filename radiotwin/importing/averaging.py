@@ -12,6 +12,8 @@ import numpy as np
 import pandas as pd
 from scipy.constants import speed_of_light
 
+from radiotwin.importing.tracks.fixes import ANGLES
+
 WAVELENGTHS = (20, 40)  # Lee 1985
 
 
@@ -31,7 +33,7 @@ def average(links: pd.DataFrame, length_m: float,
 
     Returns:
         one row per bin: levels by `method`, means of positions and times, circular means of
-        headings, and the number of readings in `quality`.
+        headings, pitches and rolls (-180 to 180 degrees), and the number of readings in `quality`.
     """
     links = links.reset_index(drop=True)
     track = links.groupby(["receiver", "device", "flight"], sort=False).ngroup().to_numpy()
@@ -40,12 +42,14 @@ def average(links: pd.DataFrame, length_m: float,
     count = np.bincount(bin_index)
     means = {name: _mean(links[name].to_numpy(dtype=float), bin_index, len(count))
              for name in links
-             if links[name].dtype.kind == "f" and name not in ("level_db", "heading_deg")}
-    if "heading_deg" in links:
-        heading_rad = np.radians(links["heading_deg"].to_numpy())
-        east, north = (_mean(part, bin_index, len(count))
-                       for part in (np.sin(heading_rad), np.cos(heading_rad)))
-        means["heading_deg"] = np.degrees(np.arctan2(east, north)) % 360
+             if links[name].dtype.kind == "f" and name not in ("level_db", *ANGLES)}
+    for name in (name for name in ANGLES if name in links):
+        angle_rad = np.radians(links[name].to_numpy(dtype=float))
+        sine, cosine = (_mean(part, bin_index, len(count))
+                        for part in (np.sin(angle_rad), np.cos(angle_rad)))
+        means[name] = np.degrees(np.arctan2(sine, cosine))
+    if "heading_deg" in means:
+        means["heading_deg"] %= 360
     means["level_db"] = _level(links["level_db"].to_numpy(), bin_index, count, method)
     bins = links.iloc[first].reset_index(drop=True)
     return bins.assign(**means, quality=count.astype(float))

@@ -1,6 +1,7 @@
 """The files of an import: named ones, those of a folder, and those in a zip file."""
 
 import os
+import re
 import struct
 import zipfile
 import zlib
@@ -113,7 +114,8 @@ def list_files(paths: Iterable[Path | str],
 
 def flight_names(files: list[LogFile]) -> list[str]:
     """Return a name of each file: its stem, or as much more as makes it unique."""
-    stems = [PurePosixPath(file.name.removesuffix(".gz")).stem for file in files]
+    stems = [PurePosixPath(re.sub(r"\.gz$", "", file.name, flags=re.IGNORECASE)).stem
+             for file in files]
     if len(set(stems)) == len(stems):
         return stems
     names = [file.name for file in files]

@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.budgets import ROWS
-from radiotwin.cells import listed
+from radiotwin.cells import as_numbers, listed
 from radiotwin.errors import BadInput
 from radiotwin.importing.formats import FORMATS, expected, find_format, format_named
 from radiotwin.importing.levels import LEVEL_COLUMN
@@ -164,12 +164,16 @@ def _only(source: Source, settings: Settings) -> tuple[Source, list[tuple[list[i
     """Return the chosen rows, and the indices, the reason and the column of the others."""
     left_out = []
     for spec, values in settings.only.items():
-        allowed = {f"{value:g}" if isinstance(value, float) else str(value) for value in values}
+        texts = [value for value in values if isinstance(value, str)]
+        numbers = [value for value in values if not isinstance(value, str)]
         cells = as_text(source.cells(spec, "only"))
-        bad = ~cells.isin(allowed).to_numpy(dtype=bool)
+        bad = ~cells.isin(texts).to_numpy(dtype=bool)
+        if numbers:  # 868.1 is 868.10, too
+            bad &= ~np.isin(as_numbers(cells), numbers)
         left_out.append((list(source.table.index[bad]), "is not one of only", spec))
         if bad.all():
-            raise BadInput(f"{source.path}: column {spec} never is {' or '.join(sorted(allowed))} "
+            allowed = sorted({str(value).removesuffix(".0") for value in numbers} | set(texts))
+            raise BadInput(f"{source.path}: column {spec} never is {' or '.join(allowed)} "
                            f"(only); it is {', '.join(sorted(set(cells))[:20])}")
         source = Source(source.path, source.table[~bad], source.where, source.notes)
     return source, left_out

@@ -16,7 +16,8 @@ ALLOWED = (f"allowed are {', '.join(EPOCH_S)}, {ISO}, or a strftime format, such
 YEARS = (1900, 2200)  # of plausible times; milliseconds that are read as seconds lie outside
 _ROWS_AT_ONCE = 1_000_000  # of which texts are made
 SECONDS_PER_YEAR = 31_556_952  # Gregorian mean
-UTC_OFFSET = r":\d\d(?:\.\d+)?(?:[Zz]|[+-]\d\d(?::?\d\d)?)$"  # at the end of an ISO 8601 text
+UTC_OFFSET = r"[Tt ]\d\d(?::?\d\d){0,2}(?:\.\d+)? ?(?:[Zz]|[+-]\d\d(?::?\d\d)?)$"
+"""At the end of an ISO 8601 text, extended or basic; from the hour on, as a date ends in -31."""
 
 
 def seconds(source: Source, spec: str, time_format: str | None, zone: str | None) -> np.ndarray:

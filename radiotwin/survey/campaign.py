@@ -3,13 +3,14 @@
 import numpy as np
 import pandas as pd
 
+from radiotwin.budgets import ROWS
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.progress import progress
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.scene.config import UavConfig
-from radiotwin.survey.grid import MOVE_COST, FlightGrid
+from radiotwin.survey.grid import HOVER_COST, MOVE_COST, FlightGrid
 from radiotwin.survey.patterns import PATTERNS
 from radiotwin.survey.truth import read_truth, require_possible
 
@@ -36,8 +37,8 @@ def fly_survey(scene: Scene, truth: RadioMap | str = "traced", *, flights: int =
         The measurements; unknown devices are without x and y.
 
     Raises:
-        BadInput: An unknown pattern, no flight, no UAV, a map of another scene, or one with gains
-            that physics does not allow.
+        BadInput: An unknown pattern, no flight, no UAV, more rows than a table may have, a map of
+            another scene, or one with gains that physics does not allow.
     """
     if isinstance(truth, str):
         truth = read_truth(scene, truth)
@@ -188,5 +189,9 @@ def _check(scene: Scene, truth: RadioMap, flights: int, pattern: str, noise_db: 
         raise BadInput(f"{path}: declares no device; add some, each as a table\n\n"
                        "[[devices]]\ndevice = 'd0'\nx_m = 10.0\ny_m = 20.0\nz_m = 1.5\n"
                        "role = 'anchor'\n\nor build the scene with --devices N")
+    slot_cost = HOVER_COST if pattern == "random-walk" else MOVE_COST  # only that pattern hovers
+    slots = flights * sum(uav.battery // slot_cost + 1 for uav in scene.config.uavs)
+    ROWS.check(slots * len(scene.config.devices), f"{path}: {flights} flights, as far as the "
+               "batteries of its UAVs go")
     scene.check_map(truth)
     require_possible(scene, truth)

@@ -11,6 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from radiotwin.cli.importing import _tables
+from radiotwin.importing.settings import Settings
 from radiotwin.measurements import read_measurements
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "import"
@@ -246,6 +248,38 @@ def test_a_folder_a_zip_file_and_files_are_one_import(run, tmp_path):
     table = read_measurements(tmp_path / "out" / "measurements.csv").table
     assert list(table["flight"]) == ["one", "one", "two", "two"] and list(table["rssi_dbm"]) == [-80, -90, -80.1, -91]
     np.testing.assert_allclose(np.diff(table["receiver_y_m"]) / 111_200, [0.1, 0, 0.1], atol=1e-3)
+
+
+def test_the_command_that_is_printed_repeats_the_import(run, tmp_path):
+    """Tables and tracks lie in none of the folders in which a file of settings may name them."""
+    for name in ("logs", "other", "work"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "logs" / "a.csv").write_text("t,id,who,rssi\n" + "".join(f"{1709287200 + i},b,{who},-80\n" for i, who in enumerate(("x", "roof 1"))))
+    (tmp_path / "other" / "sites.csv").write_text("device,latitude,longitude,height\nb,48.1,11.5,5\n")
+    (tmp_path / "other" / "roofs.csv").write_text("receiver,latitude,longitude,height\nroof 1,48.2,11.5,9\n")
+    (tmp_path / "other" / "flight.csv").write_text("time_s,latitude,longitude\n1709287199,48.1,11.5\n1709287202,48.2,11.5\n")
+    (tmp_path / "other" / "own.toml").write_text('devices = "sites.csv"\nlevel_unit = "dBm"\ntime_format = "epoch s"\nlength_unit = "m"\n'
+                                                 '[columns]\nlevel = "rssi"\ndevice = "id"\ntime = "t"\nreceiver = "who"\n')
+    done = run("import ../logs/a.csv --columns ../other/own.toml --receivers ../other/roofs.csv --track x=../other/flight.csv -o out --gzip",
+               tmp_path / "work")
+    assert done.returncode == 0, done.stderr
+    printed = " ".join((done.stdout + done.stderr).split()).partition("again: radiotwin ")[2]
+    assert printed.startswith("import ../logs/a.csv --columns out/import.toml --devices ../other/sites.csv --receivers ../other/roofs.csv "
+                              "--track x=../other/flight.csv -o out --gzip")
+    first = {path.name: path.read_bytes() for path in (tmp_path / "work" / "out").iterdir()}
+    again = run(printed, tmp_path / "work")
+    assert again.returncode == 0, again.stderr
+    assert first == {path.name: path.read_bytes() for path in (tmp_path / "work" / "out").iterdir()}
+
+
+@pytest.mark.parametrize(("tracks", "options"), [
+    ([{"file": "a.gpx", "time_offset_s": 3600.0}], []), ([{"file": "a=b.gpx"}], []),
+    ([{"file": "a.bag", "topic": "/a"}, {"file": "b.bag", "topic": "/b", "receiver": "x"}], []),
+    ([{"file": "a.bag", "topic": "/a"}, {"file": "b.bag", "topic": "/a", "receiver": "x=y"}],
+     ["--track", "a.bag", "--track", "x=y=b.bag", "--track-topic", "/a"])])
+def test_tracks_that_options_cannot_say_are_left_to_the_file(tracks, options):
+    settings = Settings(track=tracks, devices="d.csv")
+    assert _tables(settings) == ["--devices", "d.csv", *options]
 
 
 def test_a_known_format_needs_no_mapping(run, tmp_path):

@@ -58,5 +58,12 @@ def test_headings_are_averaged_round_the_circle():
     assert result["heading_deg"][0] == pytest.approx(5)
 
 
+def test_rolls_and_pitches_are_averaged_round_the_circle():
+    """A drone upside down, and a logger that counts from 0 to 360."""
+    result = average(track([0, 1, 20], [-80] * 3, roll_deg=[179.0, -177.0, 5.0], pitch_deg=[358.0, 4.0, np.nan]), 10.0, "power")
+    np.testing.assert_allclose(result["roll_deg"], [-179, 5])
+    np.testing.assert_allclose(result["pitch_deg"], [1, np.nan])
+
+
 def test_a_length_in_wavelengths():
     assert in_wavelengths(10.0, 299_792_458.0) == 10

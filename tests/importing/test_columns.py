@@ -70,6 +70,17 @@ def test_rows_are_chosen_before_they_are_read(bring_in):
     assert [(item["column"], item["readings"]) for item in result.report["left_out"]] == [("tech", 1), ("gps", 1)]
 
 
+@pytest.mark.parametrize(("cells", "value"), [(("1234567", "7654321"), 1234567), (("868100000", "868300000"), 868_100_000),
+                                              (("868.10", "868.30"), 868.1), (("868.10", "868.30"), "868.10")])
+def test_rows_are_chosen_by_numbers_of_any_length(bring_in, cells, value):
+    columns = {"x": "x", "y": "y", "device": "d", "level": "l"}
+    text = f"x,y,d,l,c\n0,0,a,-80,{cells[0]}\n1,0,b,-81,{cells[1]}\n2,0,c,-82,\n"
+    result = bring_in(text, length_unit="m", columns=columns, only={"c": [value]})
+    assert list(result.table["device"]) == ["a"]
+    with pytest.raises(BadInput, match="column c never is 1234568 or 1234568.5 or none of them .only.; it is"):
+        bring_in(text, length_unit="m", columns=columns, only={"c": [1234568, 1234568.5, "none of them"]})
+
+
 def test_seconds_with_and_without_decimals(bring_in):
     columns = {"x": "x", "y": "y", "device": "d", "level": "l", "time": "t"}
     text = "x,y,d,l,t\n0,0,a,-80,2024.03.01_10.00.00\n1,0,a,-81,2024.03.01_10.00.01.250\n"

@@ -55,6 +55,18 @@ def test_folder_files_and_zip_give_the_same(logs, tmp_path, bring_all):
         assert sorted(table.to_csv(index=False).split()) == sorted(folder.to_csv(index=False).split())
 
 
+def test_endings_in_capitals(tmp_path, bring_all):
+    """As loggers on FAT write them: by themselves, in a folder, and in a zip file."""
+    folder = tmp_path / "LOGS"
+    folder.mkdir()
+    (folder / "ONE.CSV").write_text(ONE)
+    (folder / "TWO.CSV.GZ").write_bytes(gzip.compress(TWO.encode()))
+    packed = zipped(tmp_path / "LOGS.ZIP", {"ONE.CSV": ONE, "TWO.CSV.GZ": gzip.compress(TWO.encode())})
+    for paths in ([folder], [packed], [folder / "ONE.CSV", folder / "TWO.CSV.GZ"]):
+        table, _ = bring_all(*paths)
+        assert list(table["flight"]) == ["ONE", "ONE", "TWO"] and list(table["device"]) == ["a", "a", "b"]
+
+
 def test_flights_and_receivers_by_file(logs, bring_all):
     table, _ = bring_all(logs, columns=MAPPING | {"flight": "by day", "receiver": "by file"})
     assert set(table["flight"]) == {"1970-01-01"} and set(table["receiver"]) == {"one", "two"}

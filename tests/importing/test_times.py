@@ -34,6 +34,20 @@ def test_all_forms_are_the_same_moment(text, form, zone):
     np.testing.assert_allclose(read([text, "", text], form, zone), [NOON, np.nan, NOON], atol=1e-6)
 
 
+@pytest.mark.parametrize("texts", [
+    ("2024-03-31T00:30:00+01:00", "2024-03-31T03:30:00+02:00"), ("20240331T003000+0100", "20240331T033000.0+0200"),
+    ("20240331T0030+01", "20240331T033000+02"), ("2024-03-31 00:30:00 +0100", "2024-03-31 01:30Z"),
+    ("2024-03-30T23:30:00Z", "2024-03-31T01-00:30")])
+def test_the_offset_changes_within_a_file(texts):
+    first = datetime(2024, 3, 30, 23, 30, tzinfo=UTC).timestamp()
+    assert list(read(texts, "ISO 8601")) == [first, first + 7200]
+
+
+def test_a_date_ends_in_no_offset():
+    midnight = datetime(2024, 3, 31, tzinfo=UTC).timestamp()
+    assert list(read(["2024-03-31", "20240331T01", "2024-03-31T020000"], "ISO 8601", "UTC") - midnight) == [0, 3600, 7200]
+
+
 def test_winter_has_another_offset():
     assert read(["2022-01-06 05:00:00"], "ISO 8601", "America/Denver")[0] == \
         datetime(2022, 1, 6, 5, tzinfo=timezone(timedelta(hours=-7))).timestamp()

@@ -149,6 +149,15 @@ def test_nmea_over_midnight(track):
     np.testing.assert_allclose(after.time_s - day, [86_399, 86_400, 86_401, 86_402])
 
 
+@pytest.mark.parametrize("dated", [lambda time, lat, date: rmc(time, lat, 11.5, date),
+                                   lambda time, _, date: f"GPZDA,{time},{date[:2]},{date[2:4]},2024,00,00"])
+def test_nmea_that_goes_on_another_day_with_gga_first(track, dated):
+    times = [("100000.00", "010324"), ("100001.00", "010324"), ("110000.00", "020324"), ("110001.00", "020324")]
+    sentences = [sentence for time, date in times for sentence in (gga(time, 48.1, 11.5, 500.0), dated(time, 48.1, date))]
+    fixes = read_nmea(track("a.nmea", nmea(*sentences)))
+    np.testing.assert_allclose(fixes.time_s - START, [0, 1, 90_000, 90_001])
+
+
 def test_nmea_without_a_date(track):
     with pytest.raises(BadInput, match="has no date: it needs sentences RMC or ZDA"):
         read_nmea(track("a.nmea", nmea(gga("100000.00", 48.1, 11.5, 500.0), gga("100001.00", 48.1, 11.5, 500.0))))

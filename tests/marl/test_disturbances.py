@@ -51,6 +51,11 @@ def test_a_failed_uav_stays_where_it_is_and_collects_no_more(tiny):
     assert others > 0  # they go on
 
 
+def test_a_battery_of_one_hover_can_fail_too(tiny):
+    flights = flown(tiny(0, uavs=1, battery=(1,)), Disturbance(loss=1.0), 20)
+    assert (flights.length == 1).all()
+
+
 def test_a_failed_uav_does_not_follow_the_guide(tiny):
     mission = tiny(0, uavs=2, battery=(40, 40))
     agent = Agent(observation_size(mission), mission.uavs, 8, torch.Generator().manual_seed(0))

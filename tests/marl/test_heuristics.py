@@ -7,7 +7,7 @@ from marl.environment import Environment
 from marl.features import observe
 from marl.flights import fly
 from marl.heuristics import HeuristicPolicy, greedy_actions, random_actions, waypoint_actions
-from marl.mission import EAST, HOVER, NORTH
+from marl.mission import EAST, HOVER, NO_OP, NORTH
 from marl.planner import PlanPolicy
 
 
@@ -21,6 +21,13 @@ def test_greedy_uavs_claim_different_devices_fly_the_longer_way_first_and_hover_
     assert greedy_actions(mission, environment.frame, rng).tolist() == [[EAST, NORTH]]
     environment.step(np.array([[EAST, NORTH]]))
     assert greedy_actions(mission, environment.frame, rng).tolist() == [[HOVER, NORTH]]
+
+
+def test_greedy_uavs_that_have_landed_claim_no_device(tiny):
+    mission = tiny(0, uavs=2, devices=1, battery=(20, 20), known_m=[[60.0, 40.0]], snr_db=20.0)
+    environment = Environment(mission, 1, np.random.default_rng(0))
+    environment.reset().battery[0, 0] = 0
+    assert greedy_actions(mission, environment.frame, np.random.default_rng(0)).tolist() == [[NO_OP, EAST]]
 
 
 def test_greedy_turns_to_another_device_when_one_is_empty(tiny):

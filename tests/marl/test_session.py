@@ -5,11 +5,13 @@ import os
 
 import pytest
 
-from marl.session import Session
+from marl.session import Session, _world
 from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
+from radiotwin.radiomap import RadioMap
+from radiotwin.survey import segmented_truth
 
-WORLD = {"city": "a", "scene.toml": "b", "truth": "c"}
+WORLD = {"city": "a", "scene.toml": "b", "truth": "c", "truth besides gain_db": "e"}
 
 
 @pytest.fixture
@@ -31,6 +33,33 @@ def test_a_run_is_resumed_in_its_own_folder_only(begun, session):
         session(False)._claim_folder(WORLD)
     with pytest.raises(BadInput, match="truth has changed"):
         begun._claim_folder(WORLD | {"truth": "d"})
+
+
+@pytest.mark.parametrize("change", [lambda truth: truth.assign(sigma_db=3 * truth["sigma_db"]), lambda truth: truth.assign(los=~truth["los"]),
+                                    lambda truth: truth.drop_vars("sigma_db"), lambda truth: truth.assign_coords(x=truth["x"] + 1),
+                                    lambda truth: truth.assign_attrs(shadowing_share=0.5)])
+def test_a_truth_that_differs_besides_its_gains_is_another(session, small_scene, change):
+    truth = segmented_truth(small_scene)
+    session(False)._claim_folder(_world(small_scene, truth))
+    session(True)._claim_folder(_world(small_scene, segmented_truth(small_scene)))
+    with pytest.raises(BadInput, match="the truth besides gain_db has changed since the run in .* was started; put it back"):
+        session(True)._claim_folder(_world(small_scene, RadioMap(change(truth.dataset))))
+
+
+def test_a_run_of_an_earlier_version_is_checked_by_what_it_noted(begun, tmp_path):
+    path = tmp_path / "run" / "config.json"
+    config = json.loads(path.read_text())
+    del config["world"]["truth besides gain_db"]
+    path.write_text(json.dumps(config))
+    begun._claim_folder(WORLD)
+    with pytest.raises(BadInput, match="the truth has changed"):
+        begun._claim_folder(WORLD | {"truth": "d"})
+
+
+def test_a_truth_is_the_same_from_its_file(small_scene, tmp_path):
+    truth = segmented_truth(small_scene)
+    truth.save(tmp_path / "truth.nc")
+    assert _world(small_scene, truth) == _world(small_scene, RadioMap.load(tmp_path / "truth.nc"))
 
 
 def test_a_folder_that_a_killed_run_only_began_is_empty(session, tmp_path):

@@ -7,7 +7,8 @@ import pytest
 
 from radiotwin.errors import BadInput
 from radiotwin.scene import Scene
-from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.survey import campaign, fly_survey, segmented_truth
+from radiotwin.survey.patterns import PATTERNS
 
 
 @pytest.fixture(scope="module")
@@ -89,6 +90,18 @@ def test_heading_is_clockwise_from_north_and_time_goes_on(small_scene, truth):
 def test_options_that_cannot_be(small_scene, truth, options, message):
     with pytest.raises(BadInput, match=message):
         survey(small_scene, truth, **options)
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_rows_are_counted_before_the_first_flight(small_scene, truth, monkeypatch, pattern):
+    slots = sum(uav.battery // (0.5 if pattern == "random-walk" else 1) + 1 for uav in small_scene.config.uavs)
+    most = 3 * int(slots) * len(small_scene.config.devices)
+    monkeypatch.setenv("RADIOTWIN_MAX_ROWS", str(most))
+    assert most / 4 < len(survey(small_scene, truth, flights=3, pattern=pattern).table) <= most
+    monkeypatch.setattr(campaign, "fly", None)
+    monkeypatch.setenv("RADIOTWIN_MAX_ROWS", str(most - 1))
+    with pytest.raises(BadInput, match=f"scene.toml: 3 flights, as far as the batteries of its UAVs go: {most:,} rows; at most {most - 1:,}"):
+        survey(small_scene, truth, flights=3, pattern=pattern)
 
 
 def test_a_map_of_another_scene_is_refused(small_scene, truth):

@@ -40,6 +40,8 @@ def read_nmea(path: Path) -> Fixes:
             try:
                 if kind == "ZDA":
                     day = _day(int(fields[4]), int(fields[3]), int(fields[2]))
+                    if rows and fields[1] and rows[-1][0] == _seconds(fields[1]):
+                        rows[-1][1] = day
                 elif kind == "RMC" and fields[2] == "A":
                     day = _day(_year(int(fields[9][4:6])), int(fields[9][2:4]), int(fields[9][:2]))
                     _add(rows, _seconds(fields[1]), day, fields[3:7], np.nan)
@@ -76,7 +78,7 @@ def _add(rows: list[list[float]], seconds: float, day: float, place: list[str],
     latitude, longitude = _degrees(place[0], place[1]), _degrees(place[2], place[3])
     if rows and rows[-1][0] == seconds:
         row = rows[-1]
-        row[1] = day if np.isnan(row[1]) else row[1]
+        row[1] = day  # GGA before RMC had the date before, maybe of another day
         if np.isnan(row[4]):
             row[2:] = [latitude, longitude, height_m]
         return
