@@ -9,7 +9,8 @@ from scipy.sparse.csgraph import connected_components
 from radiotwin.scene.citymap import CityMap
 
 WELD_M = 0.05  # vertices closer together belong to one building
-HEIGHT_SD_M = 3.0  # a storey; of a map that does not say how well it knows its heights
+HEIGHT_SD_M = 3.0  # a storey; of a map that does not say how well it knows its heights, and the
+# least: what else shades the links beside a roof would be taken for a small error of it
 
 
 @lru_cache(maxsize=4)
@@ -48,7 +49,7 @@ def building_extents_m(city: CityMap, label: np.ndarray) -> tuple[np.ndarray, np
 
 
 def building_height_sds_m(city: CityMap) -> np.ndarray:
-    """Return the standard deviation of the mapped height of each building.
+    """Return the standard deviation of the mapped height of each building, a storey at least.
 
     Args:
         city: a map.
@@ -62,4 +63,4 @@ def building_height_sds_m(city: CityMap) -> np.ndarray:
     told = np.isfinite(city.height_sd_m)
     faces = np.bincount(label[told], minlength=len(centres_m))
     sums = np.bincount(label[told], weights=city.height_sd_m[told], minlength=len(centres_m))
-    return np.where(faces > 0, sums / np.maximum(faces, 1), HEIGHT_SD_M)
+    return np.maximum(sums / np.maximum(faces, 1), HEIGHT_SD_M)

@@ -31,7 +31,9 @@ def test_each_block_is_a_building_with_its_extents(mesh):
 
 
 def test_a_height_is_known_as_well_as_its_map_says(mesh):
-    told = CityMap(mesh.vertices, mesh.faces, height_sd_m=np.repeat([1.5, np.nan], 12))
+    told = CityMap(mesh.vertices, mesh.faces, height_sd_m=np.repeat([6.5, np.nan], 12))
     first = np.argsort(buildings(told)[1][:, 0])
-    assert building_height_sds_m(told)[first].tolist() == [1.5, HEIGHT_SD_M]
+    assert building_height_sds_m(told)[first].tolist() == [6.5, HEIGHT_SD_M]
+    well = CityMap(mesh.vertices, mesh.faces, height_sd_m=np.full(24, 0.5))
+    assert building_height_sds_m(well).tolist() == [HEIGHT_SD_M] * 2
     assert building_height_sds_m(CityMap(mesh.vertices, mesh.faces)).tolist() == [HEIGHT_SD_M] * 2
