@@ -5,6 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
+from radiotwin.content_hash import content_hash
 from radiotwin.effects.boxes import Box
 from radiotwin.effects.missing_obstacle import _with_box
 from radiotwin.errors import BadInput
@@ -57,3 +58,9 @@ def test_maps_made_from_a_map_keep_it():
         assert same.height_sd_m == pytest.approx(sd_m, nan_ok=True)
     more = _with_box(city, Box(100.0, 0.0, 10.0, 10.0, 12.0, 0.0))
     assert len(more.height_sd_m) == len(more.faces) and np.isnan(more.height_sd_m[len(faces):]).all()
+
+
+def test_what_was_fitted_with_other_errors_is_not_taken_for_this():
+    corners_m = np.array([[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [0.0, 10.0, 5.0]])
+    maps = [CityMap(corners_m, np.array([[0, 1, 2]]), height_sd_m=sd_m) for sd_m in (None, np.array([1.5]), np.array([3.0]))]
+    assert len({content_hash(each) for each in maps}) == 3
