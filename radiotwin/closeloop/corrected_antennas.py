@@ -11,7 +11,7 @@ from radiotwin.closeloop.run import Loop
 from radiotwin.effects.sector_antenna import SectorAntenna, SectorPattern, sector_pattern_db
 from radiotwin.scene import Scene
 from radiotwin.scene.config import DeviceConfig, SceneConfig
-from radiotwin.scene.names import safe_name
+from radiotwin.scene.names import safe_name, unique_name
 
 FOLDER = "antennas"
 AZIMUTH_DEG, ELEVATION_DEG = np.arange(0.0, 360.0, 5.0), np.arange(-90.0, 91.0, 2.0)
@@ -64,9 +64,9 @@ def with_antennas(config: SceneConfig, loop: Loop,
                                " has devices above z = 0, whose names are of letters, digits and "
                                "_.+-")
                 continue
-        others = {each.antenna.lower() for each in devices.values()
+        others = {Path(each.antenna).stem.lower() for each in devices.values()
                   if each.antenna is not None and each.device != name}
-        file = f"{FOLDER}/{_free_name(name, others)}.csv"
+        file = f"{FOLDER}/{unique_name(f'found_{safe_name(name)}', others)}.csv"
         azimuth_deg = round(pattern.azimuth_deg % 360, DECIMALS)
         devices[name] = device.model_copy(update={
             "antenna": file, "azimuth_deg": azimuth_deg, "tilt_deg": None})
@@ -74,16 +74,6 @@ def with_antennas(config: SceneConfig, loop: Loop,
         changes.append(f"{name} has a sector antenna that looks to {azimuth_deg:.0f}° and is "
                        f"{pattern.beamwidth_deg:.0f}° wide")
     return config.model_copy(update={"devices": list(devices.values())}), files, changes
-
-
-def _free_name(device: str, taken: set[str]) -> str:
-    """Return the name of a device's file that is none of those taken, which are in lower case."""
-    wanted = name = f"found_{safe_name(device)}"
-    number = 1
-    while f"{FOLDER}/{name}.csv".lower() in taken:
-        number += 1
-        name = f"{wanted}_{number}"
-    return name
 
 
 def write_antenna(pattern: SectorPattern, path: Path) -> None:

@@ -144,9 +144,7 @@ class CityMap:
     def state(self) -> tuple[Any, ...]:
         """Return all that decides the answers of a map, and what paths over it are."""
         known = (self.vertices, self.faces, self.materials, self.material, self.vegetation.state())
-        more = {"terrain": self.terrain, "height_sd_m": self.height_sd_m}
-        return (*known, *(each for name, value in more.items() if value is not None
-                          for each in (name, value)))
+        return (*known, self.terrain, self.height_sd_m)
 
     def line_of_sight(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
         """Return whether no surface lies between points.
