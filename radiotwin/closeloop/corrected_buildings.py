@@ -4,7 +4,6 @@ import numpy as np
 import pandas as pd
 
 from radiotwin.cells import as_numbers, read_cells
-from radiotwin.effects.mapped_buildings import building_extents_m, buildings
 from radiotwin.effects.roof_heights import Roof
 from radiotwin.inputs import require_within
 from radiotwin.scene.scene import Scene
@@ -19,7 +18,7 @@ def stretch(roof: Roof, base_m: float) -> float:
 
 
 def corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[str],
-                        roofs: list[Roof]) -> pd.DataFrame | None:
+                        roofs: list[Roof], base_m: np.ndarray) -> pd.DataFrame | None:
     """Return the table of a scene's buildings as they are after the correction.
 
     Args:
@@ -27,6 +26,7 @@ def corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[
         shapes_of: the shapes in `city.xml` of each building, as `buildings` numbers them.
         left: shapes that the corrected scene still has.
         roofs: whose heights are corrected.
+        base_m: (buildings,) what each stands on, before it [m].
 
     Returns:
         all its columns as texts; None where the scene has no such table.
@@ -44,7 +44,6 @@ def corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[
     if not {"top_m", "height_from", "height_sd_m"} <= set(table.columns):
         return table
     top_m = as_numbers(table["top_m"])
-    base_m = building_extents_m(scene.city, buildings(scene.city)[0])[0][:, 2]
     for roof in roofs:
         own_m = float(base_m[roof.building])
         for row in np.flatnonzero(table["shape"].isin(shapes_of[roof.building])):

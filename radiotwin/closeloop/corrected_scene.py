@@ -111,8 +111,9 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
     corrected = "; ".join(([earlier] if earlier else []) + changes)
     provenance = config.provenance | {"corrected": corrected}
     with atomic_folder(folder) as temporary:
-        shapes_of, left = _write_city(scene, temporary, keep, boxes, roofs)
-        table = corrected_buildings(scene, shapes_of, left, roofs)
+        base_m = building_extents_m(scene.city, label)[0][:, 2]
+        shapes_of, left = _write_city(scene, temporary, keep, boxes, roofs, base_m)
+        table = corrected_buildings(scene, shapes_of, left, roofs, base_m)
         if table is not None:
             write_csv(table, temporary / "buildings.csv")
         scene.copy_antennas(temporary)
@@ -195,13 +196,12 @@ def _pulled_back(box: Box, points_m: np.ndarray) -> Box:
 
 
 def _write_city(scene: Scene, folder: Path, keep: np.ndarray, boxes: list[Box],
-                roofs: list[Roof]) -> tuple[dict[int, set[str]], set[str]]:
+                roofs: list[Roof], base_m: np.ndarray) -> tuple[dict[int, set[str]], set[str]]:
     """Write `city.xml` and `meshes/`: kept faces (f,) of the scene's map, roofs, and boxes.
 
     Returns the names of the shapes of each building, and of those that are left.
     """
     label, shapes, first = buildings(scene.city)[0], [], 0
-    base_m = building_extents_m(scene.city, label)[0][:, 2]
     shapes_of: dict[int, set[str]] = {}
     for shape in read_city(scene.xml_path):
         part = slice(first, first + len(shape.mesh.faces))
