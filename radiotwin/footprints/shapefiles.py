@@ -170,7 +170,10 @@ def _check_records(subject: str, data: bytes) -> int:
 
 
 def _area(shape: Any) -> BaseGeometry | None:
-    """Return the polygons of a shape: rings that run clockwise are outlines, others holes [1]."""
+    """Return the polygons of a shape: rings that run as its largest are outlines, others holes.
+
+    Outlines run clockwise [1]; some writers reverse them.
+    """
     starts = list(shape.parts)
     corners = np.array([point[:2] for point in shape.points], dtype=float).reshape(-1, 2)
     if not np.isfinite(corners).all():
@@ -180,10 +183,11 @@ def _area(shape: Any) -> BaseGeometry | None:
     if len(corners) > OUTLINE_CORNERS.limit:  # refused, unless it lies outside of what is kept
         return shapely.Polygon(corners)
     rings = [ring for ring in np.split(corners, starts[1:]) if len(ring) > 3]
-    outlines = [shapely.Polygon(ring) for ring in rings if _turn(ring) <= 0]
-    holes = [ring for ring in rings if _turn(ring) > 0]
-    if not outlines:
-        return _with_courtyards(shapely.MultiPolygon([shapely.Polygon(ring) for ring in holes]))
+    turns = np.array([_turn(ring) for ring in rings])
+    if turns.max(initial=0.0) > -turns.min(initial=0.0):  # the largest is an outline: all reversed
+        turns = -turns
+    outlines = [shapely.Polygon(ring) for ring, turn in zip(rings, turns) if turn <= 0]
+    holes = [ring for ring, turn in zip(rings, turns) if turn > 0]
     held: list[list[np.ndarray]] = [[] for _ in outlines]
     around = shapely.STRtree([shapely.box(*outline.bounds) for outline in outlines])
     for ring in holes:

@@ -45,13 +45,15 @@ def test_outlines_courtyards_and_columns(town):
     assert first.area.bounds[:2] == pytest.approx((8.7, 47.5), abs=0.02)
 
 
+@pytest.mark.parametrize("courtyard_turn", [1, -1])
 @pytest.mark.parametrize("turn", [1, -1])
-def test_a_courtyard_that_turns_as_its_outline(tmp_path, turn):
+def test_a_courtyard_whichever_way_rings_turn(tmp_path, turn, courtyard_turn):
     shapefile = pytest.importorskip("shapefile")
     path = write(tmp_path, shapely.Polygon(SQUARE))  # for its .prj
     with shapefile.Writer(str(tmp_path / "a"), shapeType=shapefile.POLYGON) as writer:
         writer.field("HOEHE", "N", decimal=1)
-        writer.poly([ring[[0, 3, 2, 1, 0]][::turn].tolist() for ring in (SQUARE, COURTYARD[::-1])])
+        writer.poly([SQUARE[[0, 3, 2, 1, 0]][::turn].tolist(),
+                     COURTYARD[[0, 1, 2, 3, 0]][::courtyard_turn].tolist()])
         writer.record(12.5)
     (one,) = read_shapefile(path).features
     assert area_m2(one) == pytest.approx(300, rel=2e-3) and one.area.is_valid
