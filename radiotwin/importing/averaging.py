@@ -84,11 +84,19 @@ def in_track_order(links: pd.DataFrame, track: np.ndarray) -> tuple[pd.DataFrame
     return links.iloc[order].reset_index(drop=True), track[order]
 
 
+def positions_m(links: pd.DataFrame) -> np.ndarray:
+    """Return where receivers are, (n, 3) [m]: above the datum, else above the ground, else at 0."""
+    position_m = links[["receiver_x_m", "receiver_y_m", "receiver_z_m"]].to_numpy(copy=True)
+    if "receiver_above_ground_m" in links:
+        low = np.isnan(position_m[:, 2])
+        position_m[low, 2] = links["receiver_above_ground_m"].to_numpy()[low]
+    return np.nan_to_num(position_m)
+
+
 def _bins(links: pd.DataFrame, track: np.ndarray,
           length_m: float) -> tuple[np.ndarray, np.ndarray]:
     """Return the bin of each row, (n,) ascending, and the first row of each bin."""
-    columns = ["receiver_x_m", "receiver_y_m", "receiver_z_m"]
-    position_m = links[columns].fillna(0.0).to_numpy()
+    position_m = positions_m(links)
     step_m = np.linalg.norm(np.diff(position_m, axis=0, prepend=position_m[:1]), axis=1)
     starts = np.diff(track, prepend=-1) != 0
     step_m[starts] = 0.0

@@ -11,7 +11,7 @@ from radiotwin.errors import BadInput
 from radiotwin.importing.lengths import in_metres
 from radiotwin.importing.levels import read_levels
 from radiotwin.importing.problems import Problems
-from radiotwin.importing.settings import BY_DAY, BY_FILE, BY_POSITION, POSITION, Settings, Wide
+from radiotwin.importing.settings import BY_DAY, BY_FILE, BY_POSITION, QUANTITIES, Settings, Wide
 from radiotwin.importing.source import ALWAYS, Source, columns_of
 from radiotwin.importing.tally import Tally
 from radiotwin.importing.times import calendar_days, seconds
@@ -51,9 +51,9 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
 
     Returns:
         links in the order of the file, and the number of readings per row of the file. The index is
-        that of the source. Columns: `device, receiver, flight, level_db`; those of `POSITION` and
-        of `device_` + `POSITION` that are given [degrees, m]; and `time_s, heading_deg, pitch_deg,
-        roll_deg, quality, frequency_hz` where given.
+        that of the source. Columns: `device, receiver, flight, level_db`; those of `QUANTITIES` and
+        of `device_` + `QUANTITIES` that are given [degrees, m]; and `time_s, heading_deg,
+        pitch_deg, roll_deg, quality, frequency_hz` where given.
     """
     columns = settings.columns.model_dump(exclude_none=True)
     columns = {name: f"{ALWAYS}{file_name}" if spec == BY_FILE else spec
@@ -89,7 +89,7 @@ def _shared(source: Source, columns: dict[str, str], settings: Settings,
         with problems.noted():
             shared["time_s"] = seconds(source, columns["time"], settings.time_format,
                                        settings.time_zone)
-    quantities = [prefix + name for prefix in ("device_", "") for name in POSITION]
+    quantities = [prefix + name for prefix in ("device_", "") for name in QUANTITIES]
     without_unit = False
     for name in (*quantities, *ANGLES, "quality", "frequency_hz", "snr"):
         if name not in present:
@@ -159,7 +159,7 @@ def _names_a_column(source: Source, level: LevelColumn, spec: str) -> bool:
 
 def _is_length(name: str, settings: Settings) -> bool:
     base = name.removeprefix("device_")
-    return base in POSITION and base not in LIMITS_DEG and not (settings.crs and base in "xy")
+    return base in QUANTITIES and base not in LIMITS_DEG and not (settings.crs and base in "xy")
 
 
 def _quantity(source: Source, name: str, spec: str, settings: Settings) -> np.ndarray:

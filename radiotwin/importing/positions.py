@@ -9,7 +9,7 @@ from radiotwin.errors import BadInput
 from radiotwin.importing.frame import Frame, find_frame, to_geographic
 from radiotwin.importing.places import at_times, place_names
 from radiotwin.importing.position_table import read_positions
-from radiotwin.importing.settings import POSITION, Settings
+from radiotwin.importing.settings import ABOVE_GROUND, POSITION, Settings
 from radiotwin.importing.source import Source
 from radiotwin.importing.tally import Tally
 from radiotwin.measurement_columns import MAX_COORDINATE_M
@@ -23,7 +23,8 @@ class PositionedLinks:
     """Links whose receivers have positions.
 
     Attributes:
-        links: with `receiver_x_m, receiver_y_m, receiver_z_m`.
+        links: with `receiver_x_m, receiver_y_m, receiver_z_m`, and `receiver_above_ground_m` where
+            heights are above the ground.
         devices: as in `devices.csv`: those of the links, in the order of their first ones.
         device_m: position of each link's device [m], (n, 3); NaN where unknown.
         frame: of all positions.
@@ -80,6 +81,9 @@ def add_positions(source: Source, links: pd.DataFrame, settings: Settings,
     _check_near(source, links, receiver_m, "receiver")
     _check_near(source, links, device_m, "device")
     links = links.assign(**{f"receiver_{axis}_m": receiver_m[:, i] for i, axis in enumerate("xyz")})
+    above_m = _above_ground_m(links, "", tables["receiver"], links["receiver"], receiver_m[:, 2])
+    if np.isfinite(above_m).any():
+        links = links.assign(receiver_above_ground_m=above_m)
     unknown = np.isnan(receiver_m[:, :2]).any(axis=1)
     names = links["receiver"][unknown]
     for name, rows in names.groupby(names, sort=False):
@@ -124,6 +128,21 @@ def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, nam
     return positions
 
 
+def _above_ground_m(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, names: pd.Series,
+                    z_m: np.ndarray) -> np.ndarray:
+    """Return heights above the ground (n,) of links (n,) [m]: of the file, else of the table.
+
+    NaN where there is none, or where the height above the datum is known.
+    """
+    above_m = np.full(len(names), np.nan)
+    if table is not None and "above_ground_m" in table:
+        above_m = names.map(table["above_ground_m"]).to_numpy(dtype=float)
+    if prefix + ABOVE_GROUND in links:
+        own_m = links[prefix + ABOVE_GROUND].to_numpy(dtype=float)
+        above_m = np.where(np.isnan(own_m), above_m, own_m)
+    return np.where(np.isnan(z_m), above_m, np.nan)
+
+
 def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
                   table: pd.DataFrame | None, moving_m: float) -> pd.DataFrame:
     """Return the devices of the links as in `devices.csv`."""
@@ -143,6 +162,11 @@ def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
     for name in DEVICE_OPTIONAL:
         if table is not None and name in table:
             devices[name] = table[name].reindex(devices.index)
+    above_m = _above_ground_m(links, "device_", table, links["device"], device_m[:, 2])
+    devices["above_ground_m"] = pd.Series(above_m).groupby(links["device"].to_numpy(),
+                                                           sort=False).median()
+    if devices["above_ground_m"].isna().all():
+        devices = devices.drop(columns="above_ground_m")
     if "frequency_hz" in links:
         own_hz = links.groupby("device", sort=False)["frequency_hz"].median()
         devices["frequency_hz"] = own_hz.fillna(devices["frequency_hz"]) \

@@ -110,7 +110,7 @@ def _position_warnings(measurements: Measurements) -> Iterator[str]:
     if len(z_m):
         if (z_m == 0).all():
             yield ("the height of every receiver is 0; is it not measured? Then leave it out, or "
-                   "give always 1.5")
+                   "give above_ground=always 1.5")
         if z_m.min() > HIGH_M:
             yield (f"the lowest receiver is at {z_m.min():.0f} m; if that is above the sea, give "
                    "the ground's altitude with --origin LATITUDE,LONGITUDE,ALTITUDE")

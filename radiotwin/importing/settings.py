@@ -18,25 +18,28 @@ _NO_TEXTS = ("idna", "punycode", "unicode_escape", "raw_unicode_escape", "undefi
 DELIMITERS = (",", ";", "\t", "|")
 BY_DAY, BY_FILE, BY_POSITION = "by day", "by file", "by position"
 POSITION = ("latitude", "longitude", "altitude", "height", "x", "y", "z")
+ABOVE_GROUND = "above_ground"  # in place of a height of `POSITION`, which no frame can convert
+HEIGHTS = ("altitude", "height", "z", ABOVE_GROUND)
+QUANTITIES = (*POSITION, ABOVE_GROUND)
 
 
 def check_position(given: set[str], prefix: str) -> None:
     """Check that the quantities of a position are consistent.
 
     Args:
-        given: those of `POSITION` that have a column.
+        given: those of `QUANTITIES` that have a column.
         prefix: of their names in the message, `""` or `device_`.
 
     Raises:
-        ValueError: not latitude, longitude or x, y with at most one of altitude, height, z.
+        ValueError: not latitude, longitude or x, y with at most one of `HEIGHTS`.
     """
     for pair in (("latitude", "longitude"), ("x", "y")):
         if len(given & set(pair)) == 1:
             raise ValueError(f"{prefix}{pair[0]} and {prefix}{pair[1]} are given together or not "
                              "at all")
-    if {"latitude", "x"} <= given or len(given & {"altitude", "height", "z"}) > 1:
+    if {"latitude", "x"} <= given or len(given & set(HEIGHTS)) > 1:
         raise ValueError(f"a position is either {prefix}latitude, {prefix}longitude or {prefix}x, "
-                         f"{prefix}y, with one of {prefix}altitude, {prefix}height, {prefix}z; "
+                         f"{prefix}y, with one of {', '.join(prefix + name for name in HEIGHTS)}; "
                          f"given are {', '.join(sorted(given))}")
 
 
@@ -50,13 +53,14 @@ class Position(Table):
     x: Spec | None = None
     y: Spec | None = None
     z: Spec | None = None
+    above_ground: Spec | None = None
 
 
 class Columns(Position):
     """Columns of all quantities; angles in degrees.
 
     `height` and `z` are above the scene's ground datum, `altitude` is above the same zero as the
-    altitude of the origin.
+    altitude of the origin, `above_ground` above the terrain below.
     """
 
     level: Spec | None = None
@@ -71,6 +75,7 @@ class Columns(Position):
     device_x: Spec | None = None
     device_y: Spec | None = None
     device_z: Spec | None = None
+    device_above_ground: Spec | None = None
     frequency_hz: Spec | None = None
     heading: Spec | None = None
     pitch: Spec | None = None
@@ -81,7 +86,7 @@ class Columns(Position):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         for prefix in ("", "device_"):
-            check_position({name for name in POSITION if getattr(self, prefix + name)}, prefix)
+            check_position({name for name in QUANTITIES if getattr(self, prefix + name)}, prefix)
         if self.device == "by position" and not (self.device_latitude or self.device_x):
             raise ValueError('device = "by position" needs the columns of the position: '
                              "device_latitude and device_longitude, or device_x and device_y")
@@ -107,7 +112,7 @@ class Wide(Position):
         if (self.receiver is None) == (self.device is None):
             raise ValueError("needs either receiver or device: the name that belongs to each "
                              'column, such as receiver = "*"')
-        check_position({name for name in POSITION if getattr(self, name)}, "")
+        check_position({name for name in QUANTITIES if getattr(self, name)}, "")
         return self
 
 

@@ -9,7 +9,7 @@ import tomli_w
 from pydantic import BaseModel, ValidationError
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.settings import Columns, Settings, TrackFile, Wide
+from radiotwin.importing.settings import HEIGHTS, Columns, Settings, TrackFile, Wide
 from radiotwin.inputs import is_within, read_toml
 from radiotwin.tables import Origin
 
@@ -80,7 +80,7 @@ def merged(settings: Settings, defaults: Mapping[str, Any]) -> Settings:
     columns = dict(defaults.get("columns", {}))
     declared = set(own.get("columns", {}))
     for prefix in ("", "device_"):
-        for group in (("latitude", "longitude", "x", "y"), ("altitude", "height", "z")):
+        for group in (("latitude", "longitude", "x", "y"), HEIGHTS):
             names = {prefix + name for name in group}
             if declared & names:
                 columns = {name: spec for name, spec in columns.items() if name not in names}

@@ -3,7 +3,7 @@
 import numpy as np
 import pandas as pd
 
-from radiotwin.importing.averaging import in_track_order
+from radiotwin.importing.averaging import in_track_order, positions_m
 
 
 def stay_representatives(links: pd.DataFrame, distance_m: float) -> np.ndarray:
@@ -20,12 +20,11 @@ def stay_representatives(links: pd.DataFrame, distance_m: float) -> np.ndarray:
         (n,) bool, the readings that represent a stay.
     """
     track = links.groupby(["receiver", "device", "flight"], sort=False).ngroup().to_numpy()
-    columns = ["receiver_x_m", "receiver_y_m", "receiver_z_m", "level_db"]
-    ordered = links[[name for name in (*columns, "time_s") if name in links]].assign(
-        row=np.arange(len(links)))
-    ordered, track = in_track_order(ordered.reset_index(drop=True), track)
-    position_m = ordered[columns[:3]].fillna(0.0).to_numpy()
-    stay = _stays(position_m, track, distance_m)
+    rows = pd.DataFrame({"row": np.arange(len(links)), "level_db": links["level_db"].to_numpy()})
+    if "time_s" in links:
+        rows["time_s"] = links["time_s"].to_numpy()
+    ordered, track = in_track_order(rows, track)
+    stay = _stays(positions_m(links)[ordered["row"].to_numpy()], track, distance_m)
     level_db = np.nan_to_num(ordered["level_db"].to_numpy(), nan=-np.inf)
     by_level = np.lexsort((np.arange(len(stay)), level_db, stay))
     count = np.bincount(stay)

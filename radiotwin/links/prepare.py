@@ -104,7 +104,7 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     low_z = np.isnan(receiver_m[:, 2])
     if low_z.any() and scene is not None:
         leave_out(low_z, "their receiver's height is empty, and the 3D map needs it: fill in "
-                  "receiver_z_m, or import the file again with height=always 1.5")
+                  "receiver_z_m, or import the file again with above_ground=always 1.5")
     elif low_z.any():
         notes.append(f"{low_z.sum():,} receiver heights are empty and taken for "
                      f"{ASSUMED_HEIGHT_M} m")
