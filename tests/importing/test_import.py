@@ -158,7 +158,7 @@ def test_implausible_heights_headings_and_swapped_sites(bring_in, tmp_path):
     ({"x": "device"}, "a,0,0,-80\n", {}, "row 2, column device: 'a' is not a number"),
     ({}, "a,0,0,-80\na,east,0,-80\nb,west,0,-80\n", {}, r"row 3, column x: 'east' is not a number \(2 such rows\)"),
     ({}, "a,5,7,-80\n", {"length_unit": None}, "column x: length_unit is not given; allowed are m and ft.*5 to 5"),
-    ({"height": "x", "z": "y"}, "a,0,0,-80\n", {}, "with one of altitude, height, z; given are height, x, y, z"),
+    ({"height": "x", "z": "y"}, "a,0,0,-80\n", {}, "with one of altitude, height, z, above_ground; given are height, x, y, z"),
     ({"z": 1.5}, "a,0,0,-80\n", {}, 'columns.z: 1.5: give the name of a column, or "always 1.5"'),
     ({}, "a,0,0,-80\na,1e9,0,-80\n", {}, "row 3: the receiver lies 1000000 km from the origin .1 such rows"),
     ({}, "a,0,0,-80\n", {"average_m": True}, "average_m: True: Input should be a valid number"),
