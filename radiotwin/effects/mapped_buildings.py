@@ -1,4 +1,4 @@
-"""The buildings of a 3D map: their faces, where they are, and how well their heights are known."""
+"""The buildings of a 3D map: their faces, positions, and standard deviations of their heights."""
 
 from functools import lru_cache
 
@@ -9,8 +9,9 @@ from scipy.sparse.csgraph import connected_components
 from radiotwin.scene.citymap import CityMap
 
 WELD_M = 0.05  # vertices closer together belong to one building
-HEIGHT_SD_M = 3.0  # a storey; of a map that does not say how well it knows its heights, and the
-# least: what else shades the links beside a roof would be taken for a small error of it
+# Standard deviation of a height: the default, and a lower bound. With less, other shadows beside a
+# roof are fitted by small errors of its height.
+HEIGHT_SD_M = 3.0  # one storey
 
 
 @lru_cache(maxsize=4)
@@ -60,7 +61,7 @@ def building_height_sds_m(city: CityMap) -> np.ndarray:
     label, centres_m = buildings(city)
     if city.height_sd_m is None:
         return np.full(len(centres_m), HEIGHT_SD_M)
-    told = np.isfinite(city.height_sd_m)
-    faces = np.bincount(label[told], minlength=len(centres_m))
-    sums = np.bincount(label[told], weights=city.height_sd_m[told], minlength=len(centres_m))
+    known = np.isfinite(city.height_sd_m)
+    faces = np.bincount(label[known], minlength=len(centres_m))
+    sums = np.bincount(label[known], weights=city.height_sd_m[known], minlength=len(centres_m))
     return np.maximum(sums / np.maximum(faces, 1), HEIGHT_SD_M)

@@ -34,8 +34,8 @@ from radiotwin.scene.citymap import CityMap
 WALL_SD_M = 1.0  # where an edge is not known better, neither is how high above it a link passes
 OFFSETS = np.arange(-16, 17) / 6  # that are tried, in standard deviations of the prior
 LEAST_SHARE = 0.2  # of a roof's height that is left
-TELLING_DB = 1.0  # a link tells of a roof if these change it by more
-MIN_LINKS = 8  # that tell of a roof
+TELLING_DB = 1.0  # least change of a link over the offsets, to be evidence
+MIN_LINKS = 8  # that are evidence of a roof
 MAX_SD_SHARE = 0.5  # of the prior's that may be left of a roof's uncertainty: one bit is learnt
 MIN_OFFSET_M = 0.25  # smaller ones are none
 SWEEPS = 3  # over all roofs, each beside the others as they are
@@ -184,7 +184,7 @@ class _Search:
         return tuple(roof for roof in found.values() if abs(roof.offset_m) >= MIN_OFFSET_M)
 
     def _estimate(self, mine: np.ndarray, tall_m: float, prior_m: float) -> tuple[float, float]:
-        """Return mean and sd of what a roof is off by, from its pairs (q,) [m]; 0 if not told."""
+        """Return mean and sd of a roof's offset from its pairs (q,) [m]; 0 if undetermined."""
         offsets_m = prior_m * OFFSETS
         offsets_m = offsets_m[offsets_m > (LEAST_SHARE - 1) * tall_m]
         link = self._ways.link[mine]

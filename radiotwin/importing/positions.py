@@ -160,13 +160,12 @@ def _device_table(source: Source, links: pd.DataFrame, device_m: np.ndarray,
     devices["role"] = np.where(devices[["x_m", "y_m"]].notna().all(axis=1), "anchor", "unknown")
     devices.loc[devices["role"] == "unknown", ["x_m", "y_m"]] = np.nan
     for name in DEVICE_OPTIONAL:
-        if table is not None and name in table:
+        if table is not None and name in table and name != "above_ground_m":
             devices[name] = table[name].reindex(devices.index)
     above_m = _above_ground_m(links, "device_", table, links["device"], device_m[:, 2])
-    devices["above_ground_m"] = pd.Series(above_m).groupby(links["device"].to_numpy(),
-                                                           sort=False).median()
-    if devices["above_ground_m"].isna().all():
-        devices = devices.drop(columns="above_ground_m")
+    if np.isfinite(above_m).any():
+        devices["above_ground_m"] = pd.Series(above_m).groupby(links["device"].to_numpy(),
+                                                               sort=False).median()
     if "frequency_hz" in links:
         own_hz = links.groupby("device", sort=False)["frequency_hz"].median()
         devices["frequency_hz"] = own_hz.fillna(devices["frequency_hz"]) \

@@ -34,7 +34,7 @@ QUANTILE_90 = 1.645  # of the normal distribution
 MIN_OFF_DB = 0.5  # a declared limit that is off by less is right
 MIN_BELOW, BELOW_SHARE = 3, 0.002  # readings below a declared limit that contradict it
 FAR_DB = 20.0  # below every reading, from which on a declared limit says nothing
-DIFFER_DB = 3.0  # between receivers, from which on it is told
+DIFFER_DB = 3.0  # between receivers, above which a note reports it
 DEAF_DB, DEAF_SDS = 6.0, 4.5  # above the usual limit: a receiver that stands out
 MAX_NAMED = 5
 

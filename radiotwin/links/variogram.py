@@ -1,13 +1,13 @@
-"""The variogram of a residual, and that of a field with a correlation length, less the same trends.
+"""Correlation length of a detrended residual, from its variogram.
 
-The robust variogram (Cressie and Hawkins 1980, 'Robust estimation of the variogram', Math. Geology
-12) within each pair of ends and flight. The level of each flight and trends of each pair of ends
-are taken away before; they take long shadows with them, and a model that knew nothing of it would
-be too short, by half where a flight is some lengths long. So what is fitted to the variogram, by
-weighted least squares (Cressie 1985, Math. Geology 17), is what an exponential field with a nugget
-(Gudmundson 1991, 'Correlation model for shadow fading in mobile radio systems') has left of it
-after the same projection: that of generalised increments (Kitanidis 1983, 'Statistical estimation
-of polynomial generalized covariance functions', Water Resources Research 19).
+The empirical variogram is the robust one (Cressie and Hawkins 1980, 'Robust estimation of the
+variogram', Math. Geology 12), within each pair of ends and flight, after the level of each flight
+and the trends of each pair of ends are removed. Detrending removes long shadows, too, so that a
+model variogram that ignored it would be biased to short lengths, by half for flights of a few
+lengths. So the model is an exponential field with a nugget (Gudmundson 1991, 'Correlation model for
+shadow fading in mobile radio systems') after the same projection, that of generalised increments
+(Kitanidis 1983, 'Statistical estimation of polynomial generalized covariance functions', Water
+Resources Research 19), fitted by weighted least squares (Cressie 1985, Math. Geology 17).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def pairs_of_links(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return rows (p,) and rows (p,) of pairs of links of one series: neighbours, and along tracks.
 
     Args:
-        place: (n, d) of both ends; the last column tells series apart.
+        place: (n, d) of both ends; the last column separates series.
     """
     n = len(place)
     every = np.arange(n) if n <= MAX_LINKS else np.sort(
@@ -57,10 +57,10 @@ def pairs_of_links(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """What links of a pair of ends have in common, which says nothing of how far shadows reach.
+    """Trends of a pair of ends, which are removed before correlation is estimated.
 
-    A slope over distance that the base lacks, or an antenna's pattern over azimuth, is alike over
-    the whole campaign; so is the level of a flight over that flight.
+    A level for each flight, a slope over log-distance, and two harmonics of azimuth: errors of the
+    base and of antennas that are common to the whole campaign, and no shadows.
 
     Attributes:
         rows: (m,) of the links, ascending.
@@ -83,13 +83,13 @@ class Trend:
         return cls(rows, left[:, singular > MIN_SINGULAR * singular[0]])
 
     def taken_from(self, z: np.ndarray) -> np.ndarray:
-        """Return what (m,) is left of residuals (n,) at its rows."""
+        """Return the detrended residuals (m,) at its rows, of all residuals (n,)."""
         own = z[self.rows]
         return own - self.basis @ (self.basis.T @ own)
 
     def left_of(self, position_m: np.ndarray, i: np.ndarray, j: np.ndarray,
                 lengths_m: np.ndarray) -> np.ndarray:
-        """Return the semivariance that fields of unit variance have after it is taken away.
+        """Return the semivariance of fields of unit variance after detrending.
 
         Args:
             position_m: (n, d) of the links [m].
@@ -152,7 +152,7 @@ def fitted_length_m(z: np.ndarray, position_m: np.ndarray, trends: list[Trend], 
 
 def _fields(position_m: np.ndarray, trends: list[Trend], first: np.ndarray, second: np.ndarray,
             index: np.ndarray, lengths_m: np.ndarray) -> np.ndarray:
-    """Return what `Trend.left_of` fields in the mean of each bin; NaN where no pair stands for it.
+    """Return the mean semivariance of detrended fields in each bin; NaN without a sampled pair.
 
     Arguments as of `fitted_length_m`, and the bin (p,) of each pair.
 
