@@ -28,14 +28,15 @@ PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest --numprocesses 2 --dist load
 CAN_APT := command -v apt-get > /dev/null && $(SUDO) true 2> /dev/null
 APT_INSTALL := $(SUDO) env DEBIAN_FRONTEND=noninteractive apt-get -o DPkg::Lock::Timeout=120 install -y -q
 
-.PHONY: help demo test test-all test-flower check docs bench llvm clean
+.PHONY: help demo test test-all test-flower lint check docs bench llvm clean
 
 help:
 	@echo "make demo    set up, then the whole chain on a small city"
 	@echo "make test     set up, then every test but the slow ones (a quarter of an hour on two cores)"
 	@echo "make test-all every test: statistics over many seeds, real data where it is, long chains"
 	@echo "make test-flower the tests of federation over Flower, in an environment of their own"
-	@echo "make check    ruff, mypy and the fast tests (a few minutes)"
+	@echo "make lint     ruff and mypy"
+	@echo "make check    these and the fast tests (a few minutes)"
 	@echo "make docs    the site, in site/; runs the examples"
 	@echo "make bench   what takes how long; \`python -m studies --list\` lists all studies"
 	@echo "make llvm    set up only: the package and a libLLVM for tracing"
@@ -58,9 +59,11 @@ test-flower:
 		$(VENV)-flower/.installed
 	OMP_NUM_THREADS=1 $(VENV)-flower/bin/python -m pytest --numprocesses 0 tests/marl/test_flower.py tests/marl/test_client.py
 
-check: $(INSTALLED)
+lint: $(INSTALLED)
 	$(BIN)/ruff check
 	$(BIN)/mypy
+
+check: lint
 	$(PYTEST) -m "not slow and not llvm and not whole_loop" $(FAST_TESTS)
 
 # In a folder of its own, where the examples leave what they make.

@@ -1,6 +1,8 @@
 """Sequences of interactions that are tried from one device."""
 
+from collections import OrderedDict
 from functools import lru_cache
+from threading import Lock
 
 import numpy as np
 
@@ -15,6 +17,7 @@ from radiotwin.paths.ways import open_ways, with_facets_after
 from radiotwin.scene.citymap import CityMap
 
 EDGE_CHUNK = 500  # edges at once whose surroundings are searched: about 100 MB
+MAX_REMEMBERED_BYTES = 2**25  # of one search, so 400 MB of all that `candidate_search` keeps
 
 
 @lru_cache(maxsize=12)  # a map and those with errors that stand beside it
@@ -24,7 +27,7 @@ def candidate_search(city: CityMap, depth: int) -> "CandidateSearch":
 
 
 class CandidateSearch:
-    """Search for the candidates of devices in one city.
+    """Search for the candidates of devices in one city; several threads may ask it.
 
     Args:
         city: 3D map.
@@ -50,6 +53,8 @@ class CandidateSearch:
         self._city, self._depth = city, depth
         self._after = np.empty((0, depth - 1), dtype=int)
         self._first_after, self._end_after = np.full((2, len(self.edges)), -1)
+        self._remembered: OrderedDict[bytes, Candidates] = OrderedDict()
+        self._one_at_a_time = Lock()
         facet = self.edges.facet.ravel()
         edge = np.repeat(np.arange(len(self.edges)), 2)
         order = np.lexsort((edge, facet))
@@ -57,7 +62,7 @@ class CandidateSearch:
             facet[order], np.arange(len(self.facets) + 2)))
 
     def candidates(self, device_m: np.ndarray) -> Candidates:
-        """Find the sequences from a device, those without an edge first.
+        """Find the sequences from a device, those without an edge first, and remember them.
 
         Args:
             device_m: (3,) position [m].
@@ -65,6 +70,19 @@ class CandidateSearch:
         Returns:
             All sequences of up to `depth` interactions that are worth trying.
         """
+        key = np.asarray(device_m, dtype=float).tobytes()
+        with self._one_at_a_time:
+            known = self._remembered.pop(key, None)
+        found = self._find(device_m) if known is None else known
+        with self._one_at_a_time:
+            self._remembered[key] = found
+            while len(self._remembered) > 1 and sum(
+                    each.nbytes for of_device in self._remembered.values()
+                    for each in of_device) > MAX_REMEMBERED_BYTES:
+                self._remembered.popitem(last=False)
+        return found
+
+    def _find(self, device_m: np.ndarray) -> Candidates:
         normal, offset_m = self.surfaces.planes[:, :3], self.surfaces.planes[:, OFFSET]
         sequences = device_sequences(self._city, self.facets, normal, device_m, self._depth)
         facing = np.flatnonzero(normal @ device_m > offset_m)
@@ -73,13 +91,15 @@ class CandidateSearch:
         reflections = np.unique(np.concatenate([sequences.facets[sequences.order > 0], single]),
                                 axis=0)
         ways = open_ways(self._city, self.surfaces, *self._to_edges(sequences, facing), device_m)
-        self._look_around(np.unique(ways.edge[self._first_after[ways.edge] < 0]))
+        with self._one_at_a_time:
+            self._look_around(np.unique(ways.edge[self._first_after[ways.edge] < 0]))
+            after = self._after  # others replace it, its rows stay
         way, row = with_facets_after(self.surfaces, ways, self._first_after, self._end_after,
-                                     self._after, self._depth)
+                                     after, self._depth)
         none = np.full((len(reflections), self._depth), -1)
         return Candidates(np.concatenate([reflections, ways.before[way]]),
                           np.concatenate([none[:, 0], ways.edge[way]]),
-                          np.concatenate([none[:, 1:], self._after[row]]))
+                          np.concatenate([none[:, 1:], after[row]]))
 
     def _to_edges(
         self, sequences: FacetSequences, facing: np.ndarray
