@@ -9,7 +9,7 @@ from radiotwin.errors import BadInput
 from radiotwin.importing.frame import Frame, find_frame, to_geographic
 from radiotwin.importing.places import at_times, place_names
 from radiotwin.importing.position_table import read_positions
-from radiotwin.importing.settings import ABOVE_GROUND, POSITION, Settings
+from radiotwin.importing.settings import ABOVE_GROUND, HEIGHTS, POSITION, Settings
 from radiotwin.importing.source import Source
 from radiotwin.importing.tally import Tally
 from radiotwin.measurement_columns import MAX_COORDINATE_M
@@ -106,25 +106,23 @@ def _check_near(source: Source, links: pd.DataFrame, position_m: np.ndarray, end
 
 def _positions(links: pd.DataFrame, prefix: str, table: pd.DataFrame | None, names: pd.Series,
                crs: str | None) -> pd.DataFrame:
-    """Return columns of `POSITION`: from the file, else from the table."""
+    """Return columns of `POSITION`: place and height each from the file, else from the table."""
     own = {name: links[prefix + name] for name in POSITION if prefix + name in links}
     positions = to_geographic(pd.DataFrame(own, index=links.index), crs)
     if table is None:
         return positions
-    unknown = np.ones(len(links), dtype=bool)
-    for name in ("latitude", "x"):
-        if name in positions:
-            unknown &= positions[name].isna().to_numpy()
-    row = table.index.get_indexer(names[unknown])
+    no_place = positions.reindex(columns=["latitude", "x"]).isna().all(axis=1)
+    heights = positions.reindex(columns=list(HEIGHTS)).assign(
+        **{ABOVE_GROUND: links.get(prefix + ABOVE_GROUND)})
+    no_height = heights.isna().all(axis=1)
+    row = table.index.get_indexer(names)
     for name in POSITION:
         if name not in table:
             continue
-        values = (positions[name].to_numpy(dtype=float, copy=True) if name in positions
+        values = (positions[name].to_numpy(dtype=float) if name in positions
                   else np.full(len(links), np.nan))
         declared = np.append(table[name].to_numpy(dtype=float), np.nan)[row]  # -1: not in it
-        own_values = values[unknown]
-        values[unknown] = np.where(np.isnan(own_values), declared, own_values)
-        positions[name] = values
+        positions[name] = np.where(no_height if name in HEIGHTS else no_place, declared, values)
     return positions
 
 

@@ -49,3 +49,16 @@ def test_a_climb_is_a_way(bring_in, setting, rows):
     log = "time,x,y,h,d,l\n0,0,0,5,a,-80\n1,0,0,6,a,-81\n2,0,0,9.5,a,-82\n"
     result = bring_in(log, **columns(above_ground="h", time="time"), time_format="epoch s", **setting)
     assert len(result.table) == rows
+
+
+def test_a_place_of_the_file_has_the_height_of_the_table(bring_in, tmp_path):
+    """A height of the file, above whatever, comes before it; so does none at all where the table has none."""
+    (tmp_path / "masts.csv").write_text("device,x_m,y_m,z_m\na,0,0,25\nb,9,9,30\nc,1,1,\n")
+    log = "x,y,dx,dy,dh,d,l\n0,0,1,1,,a,-80\n0,0,2,2,7,b,-81\n0,0,3,3,,c,-82\n0,0,,,,c,-83\n"
+    with pytest.raises(BadInput, match="'c' has positions"):
+        bring_in(log, devices=str(tmp_path / "masts.csv"), **columns(device_x="dx", device_y="dy"))
+    result = bring_in(log.rsplit("\n", 2)[0], devices=str(tmp_path / "masts.csv"),
+                      **columns(device_x="dx", device_y="dy", device_above_ground="dh"))
+    assert result.devices[["x_m", "y_m"]].to_numpy().tolist() == [[1, 1], [2, 2], [3, 3]]
+    assert result.devices["z_m"].tolist() == pytest.approx([25, np.nan, np.nan], nan_ok=True)
+    assert result.devices["above_ground_m"].tolist() == pytest.approx([np.nan, 7, np.nan], nan_ok=True)
