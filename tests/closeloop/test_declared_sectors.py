@@ -139,6 +139,7 @@ def test_a_sector_that_is_only_planned_is_predicted_by_the_stored_twin(tmp_path)
     assert expected.sd_db.mean() > 4.0  # its level is another than the others'
 
 
+@pytest.mark.slow
 def test_of_a_sector_that_nothing_tells_the_twin_knows_that_it_knows_little(tmp_path):
     """The others have antennas of their own: another one's level is theirs in the mean, and as far off as they are."""
     everything = network(7, points=200)
