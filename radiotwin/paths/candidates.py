@@ -72,8 +72,10 @@ class CandidateSearch:
         """
         key = np.asarray(device_m, dtype=float).tobytes()
         with self._one_at_a_time:
-            known = self._remembered.pop(key, None)
-        found = self._find(device_m) if known is None else known
+            if key in self._remembered:
+                self._remembered.move_to_end(key)
+                return self._remembered[key]
+        found = self._find(device_m)
         with self._one_at_a_time:
             self._remembered[key] = found
             while len(self._remembered) > 1 and sum(
