@@ -32,7 +32,8 @@ MODULES = {"models": "models", "curve": "learning", "federation": "learning", "t
            "away": "campus_learning", "terms": "campus_terms",
            "workers": "execution", "scheduler": "execution", "regions": "regions",
            "nested": "nested",
-           "maps": "wrong_maps", "foreign": "foreign", "calibration": "calibration"}
+           "maps": "wrong_maps", "foreign": "foreign", "calibration": "calibration",
+           "sizes": "told_sizes"}
 """Name of a study -> its module in this package."""
 Run = Callable[[int, dict], dict]
 Todo = list[tuple[str, int, dict]]

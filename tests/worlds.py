@@ -59,7 +59,7 @@ def measured(world, **columns):
     return Measurements(table, devices)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def open_ground():
     """`fly(seed)` makes a world over open ground, `measured(world)` its measurements."""
     return SimpleNamespace(fly=fly, measured=measured)

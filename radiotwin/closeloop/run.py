@@ -130,7 +130,9 @@ class Loop(Summarised):
         left = self.selection.looked_at
         if left is None:
             return []
-        return detectable(left[1], self.criteria, left[0].whole.effect_names)
+        model, hypotheses = left
+        return detectable(model.whole.view(model.fits[0]), hypotheses, self.criteria,
+                          model.whole.effect_names)
 
     @cached_property
     def parameters(self) -> list[dict[str, Parameter]]:

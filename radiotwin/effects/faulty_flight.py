@@ -47,9 +47,10 @@ MIN_OFFSET_DB = 2.0  # a smaller one changes no decision
 FAR_SD, MIN_USUAL_SD_DB = 4.0, 0.5  # of flights' levels, robust: what is farther is no usual one
 MIN_SCATTER = 1.5  # times the others'
 MIN_SCATTER_DB = 1e-3
-# Of flights' log scatters and log roughnesses, before any is seen, and the flights that it counts
-# for (Smyth 2004, 'Linear models and empirical Bayes methods', Stat. Appl. Genet. Mol. Biol. 3).
-PRIOR_LOG_SD, PRIOR_FREEDOM = (0.35, 0.25), 3
+# Of flights' levels, log scatters and log roughnesses, before any is seen, and the flights that it
+# counts for (Smyth 2004, 'Linear models and empirical Bayes methods', Stat. Appl. Genet. Mol. Biol.
+# 3): of three flights, two do not tell how much flights differ.
+PRIOR_LEVEL_SD_DB, PRIOR_LOG_SD, PRIOR_FREEDOM = 1.0, (0.35, 0.25), 3
 STATISTICS = 4  # that are tested
 MAX_P_VALUE = 0.02  # corrected for the number of flights
 PRIOR_SD_DB = 15.0
@@ -215,7 +216,7 @@ def _disagreement(flight: _Flight, flights: list[_Flight], links: LinkData) -> t
              for kind, (own, prior_sd) in enumerate(zip(flight.log_scatters, PRIOR_LOG_SD,
                                                         strict=True))]
     p_value, added_db = min(noisy)
-    if not _is_first_or_last(flight, links):
+    if not is_first_or_last(flight.receiver, flight.flight, links):
         p_value = min(p_value, *(_offset_p_value(flight, others, kind, links)
                                   for kind in range(2)))
     return min(STATISTICS * p_value, 1.0), min(added_db, 50.0)
@@ -250,16 +251,16 @@ def _offset_p_value(flight: _Flight, others: list[_Flight], kind: int, links: Li
     # A first or last flight that is far off is a step in time, and says nothing of how much the
     # others differ: one of 20 dB would hide a fault of 15.
     far = np.abs(level_db) > FAR_SD * max(robust_sd(level_db), MIN_USUAL_SD_DB)
-    usual = ~far | [not _is_first_or_last(each, links) for each in known]
-    freedom = max(int(usual.sum()) - len(np.unique(receiver[usual])), 1)
-    sd_db = max(float(np.sqrt((level_db[usual]**2).sum() / freedom)), 0.1)
-    return float(2 * t.sf(abs(own_db) / sd_db, freedom))
+    usual = ~far | [not is_first_or_last(each.receiver, each.flight, links) for each in known]
+    freedom = max(int(usual.sum()) - len(np.unique(receiver[usual])), 0) + PRIOR_FREEDOM
+    sum_of_squares = (level_db[usual]**2).sum() + PRIOR_FREEDOM * PRIOR_LEVEL_SD_DB**2
+    return float(2 * t.sf(abs(own_db) / np.sqrt(sum_of_squares / freedom), freedom))
 
 
-def _is_first_or_last(flight: _Flight, links: LinkData) -> bool:
+def is_first_or_last(receiver: int, flight: int, links: LinkData) -> bool:
     """Return whether a level that is off may as well be a step in time, before or after it."""
-    times = {number: time_s[0] for (receiver, number), (time_s, _) in links.tracks.items()
-             if receiver == flight.receiver}
-    if links.time_restarts or flight.flight not in times:
+    times = {number: time_s[0] for (each, number), (time_s, _) in links.tracks.items()
+             if each == receiver}
+    if links.time_restarts or flight not in times:
         return False
-    return times[flight.flight] in (min(times.values()), max(times.values()))
+    return times[flight] in (min(times.values()), max(times.values()))

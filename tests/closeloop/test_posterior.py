@@ -1,4 +1,4 @@
-"""Probabilities of causes, and what would have been seen."""
+"""Probabilities of causes."""
 
 from dataclasses import replace
 
@@ -12,13 +12,12 @@ from radiotwin.closeloop.cross_validation import cross_validate, training_parts
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.closeloop.hypotheses import Hypotheses
 from radiotwin.closeloop.posterior import NONE, OTHER, features, judge, probability_of
-from radiotwin.closeloop.result_file import _for_json
 from radiotwin.closeloop.scoring import CandidateScore
-from radiotwin.closeloop.sensitivity import detectable, median_azimuth_deg, needed_nats
+from radiotwin.closeloop.sensitivity import needed_nats
 from radiotwin.effects.clock_offset import ReceiverClockOffset
 from radiotwin.effects.fitting import add_effect
 from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
-from radiotwin.effects.position_errors import MIN_MOVE_M, DevicePositionError
+from radiotwin.effects.position_errors import DevicePositionError
 from radiotwin.inference.correlated_evidence import Columns
 from radiotwin.links import prepare_links
 
@@ -159,39 +158,3 @@ def test_beside_an_effect_of_another_kind_the_same_evidence_is_worth_less():
     alone, beside = (probability_of("foliage", features((40.0,) * 3, 0.1, 1.0, there)) for there in (False, True))
     assert beside < 0.8 * alone
     assert needed_nats("foliage", 0.5, 1.0, True) > needed_nats("foliage", 0.5, 1.0)
-
-
-def test_an_effect_of_the_size_that_would_have_been_seen_has_the_evidence_for_it(open_ground):
-    _, hypotheses = looked_at(open_ground, 6)
-    sizes = {each.name: each.size for each in detectable(hypotheses, CRITERIA)}
-    assert {"receiver_gain_offset", "device_gain_offset", "excess_attenuation"} <= set(sizes)
-    assert all(size > 0 for size in sizes.values())
-    assert needed_nats("foliage", 0.5, 1.0) <= needed_nats("foliage", 0.9, 1.0) <= needed_nats("foliage", 0.9, 4.0)
-
-
-def test_where_no_size_would_be_seen_there_is_none(open_ground):
-    assert needed_nats("foliage", 1.0, 1.0) == np.inf
-    _, hypotheses = looked_at(open_ground, 6)
-    sizes = [each.size for each in detectable(hypotheses, replace(CRITERIA, min_probability=1.0))]
-    assert set(sizes) == {np.inf} and set(_for_json(sizes)) == {None}
-
-
-def test_only_what_was_looked_for_and_sizes_that_an_effect_may_have_would_have_been_seen(open_ground):
-    _, hypotheses = looked_at(open_ground, 6)
-    assert hypotheses.links.city is None and np.isfinite(hypotheses.links.frequency_hz)
-    sizes = {each.name: each.size for each in detectable(hypotheses, CRITERIA)}
-    assert "removed_obstacle" not in sizes and "foliage" in sizes
-    assert sizes["excess_attenuation"] == np.inf  # rain takes a few dB/km at most
-    assert sizes["device_position_error"] >= MIN_MOVE_M
-    unknown = replace(hypotheses, links=replace(hypotheses.links, frequency_hz=np.nan))
-    without = {each.name: each.size for each in detectable(unknown, CRITERIA)}
-    assert "missing_obstacle" not in without and 10 < without["excess_attenuation"] < np.inf
-    late = hypotheses.links.flight * 1e6 + hypotheses.links.time_s
-    apart = replace(hypotheses, links=replace(hypotheses.links, time_s=late))
-    assert {each.name: each.size for each in detectable(apart, CRITERIA)}["episode"] < np.inf
-
-
-@pytest.mark.parametrize("turn_deg", [0.0, 90.0, 180.0, 270.0])
-def test_the_median_direction_turns_with_all(turn_deg):
-    azimuth_deg = np.array([-40.0, -20.0, 5.0, 8.0, 30.0])
-    assert median_azimuth_deg((azimuth_deg + turn_deg) % 360) == pytest.approx((5.0 + turn_deg) % 360)
