@@ -39,7 +39,7 @@ def put_in_again(seed: int, settings: dict) -> dict:
     kind, _, number = settings["case"].partition(":")
     case = open_case(int(number)) if number else foreign_case(kind)
     told, named = _close(case.measurements, case.scene, seed)
-    found = []
+    found: list[list] = []
     for family, size in told.items():
         if family not in HIDE or not np.isfinite(size) or (family in BY_SIGHT and case.scene):
             continue
