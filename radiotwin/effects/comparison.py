@@ -4,6 +4,8 @@ What a map or a channel gets wrong at a place, it gets wrong on every flight ove
 after the comparison belongs to the flight, the receiver or the time.
 """
 
+from functools import lru_cache
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -16,11 +18,13 @@ NEIGHBOURS = 24  # nearest links that are looked at, of which some are of other 
 MIN_OTHERS = 2  # links of other flights, for a comparison
 MIN_STEPS = 2.0  # between positions, that still count as one place
 MAX_REACH_M = 60.0
+VIEWS = 8  # whose comparison is remembered
 MAX_Z, MIN_SD_DB = 4.0, 0.3  # of a value, over the scatter of its class; of that scatter
 
 
+@lru_cache(maxsize=VIEWS)
 def compared_db(view: ResidualView) -> np.ndarray:
-    """Return residuals (n,) minus the median of other flights at the same place [dB].
+    """Return residuals (n,) minus the median of other flights at the same place [dB]; read-only.
 
     The same place: the same device (of devices that move: the same receiver) within the
     correlation length of the residual. NaN where no other flight was.
@@ -36,6 +40,7 @@ def compared_db(view: ResidualView) -> np.ndarray:
         if len(rows) > MIN_OTHERS:
             result[rows] = view.residual_db[rows] - _elsewhen_db(
                 end_m[rows], links.flight[rows], view.residual_db[rows], reach_m)
+    result.setflags(write=False)  # kept for the next effect that asks
     return result
 
 

@@ -8,7 +8,7 @@ all use it.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -26,6 +26,8 @@ from radiotwin.inference.censored_regression import (
 )
 from radiotwin.inference.student import NO_LOSSES, Losses
 from radiotwin.links import LinkData
+
+VIEWS = 8  # that are remembered: of a model and its folds, which every candidate asks for
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,11 +172,8 @@ class FoldModel:
         return self.regression().predict(result)
 
     def view(self, result: FitResult) -> ResidualView:
-        """Return the training links as an effect sees them."""
-        predicted = self.training.predict(result)
-        return ResidualView(self.links.select(self.train), self.training.residual_db(result),
-                            predicted.scale_db, predicted.mean_db, self.level_at,
-                            tuple((each.effect.name, each.params) for each in self.effects))
+        """Return the training links as an effect sees them; the same object if asked again."""
+        return _view(self, result)
 
     @property
     def coefficient_slices(self) -> list[slice]:
@@ -241,3 +240,11 @@ def response(effects: list[AppliedEffect], stage: str, rows: np.ndarray | slice)
             slope = slope * own
         return level_db, slope
     return chained
+
+
+@lru_cache(maxsize=VIEWS)
+def _view(model: FoldModel, result: FitResult) -> ResidualView:
+    predicted = model.training.predict(result)
+    return ResidualView(model.links.select(model.train), model.training.residual_db(result),
+                        predicted.scale_db, predicted.mean_db, model.level_at,
+                        tuple((each.effect.name, each.params) for each in model.effects))

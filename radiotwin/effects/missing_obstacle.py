@@ -11,6 +11,7 @@ the map with the box in it.
 from collections.abc import Iterable
 from functools import lru_cache
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
 from pydantic import Field
@@ -64,6 +65,8 @@ LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)  # of an obstructed link, equall
 MAX_LOSS_DB = 50.0  # that a box causes
 HEIGHT_SCALE_M = 20.0  # of Rayleigh distributed heights: dense urban, ITU-R P.1410-6, Table 1
 
+T = TypeVar("T")
+
 
 class MissingObstacle(GainEffect):
     """A box that obstructs links; one step finds one."""
@@ -105,7 +108,7 @@ class MissingObstacle(GainEffect):
         centres_m, total = back_project(*ends_above_ground(links, rows), nats)
         found = [self._best_shape(view, rows, centre_m, height, by_class)
                  for centre_m, height, gain in best_cells(centres_m, total, MAX_PROPOSALS)
-                 if gain > MIN_NATS for by_class in (False, True)]
+                 if gain > MIN_NATS for by_class in _ways(links, (False, True))]
         return [each for each in found if each is not None]
 
     @override
@@ -127,14 +130,16 @@ class MissingObstacle(GainEffect):
         mine = links.select(rows)
 
         gains: dict[tuple[Box, float], float] = {}
+        scattered_db = _ways(links, SCATTERED_DB)
 
         def params(box: Box, scattered_db: float) -> MissingObstacle.Params:
             return self.Params(box=box, scattered_db=scattered_db, by_class=by_class)
 
         def best(boxes: Iterable[Box]) -> Box:
-            for tried in product(boxes, SCATTERED_DB):
-                changed_db = self.term(mine, params(*tried), view.level_at).offset_db
-                gains[tried] = float(view.gain_nats(rows, changed_db).sum())
+            for box in boxes:
+                changes_db = self._offsets_db(mine, box, scattered_db, by_class, view.level_at)
+                for each_db, changed_db in zip(scattered_db, changes_db, strict=True):
+                    gains[box, each_db] = float(view.gain_nats(rows, changed_db).sum())
             return max(gains, key=gains.__getitem__)[0]
 
         tops_m = HEIGHTS_M[max(height - 1, 0):height + 2]
@@ -158,18 +163,24 @@ class MissingObstacle(GainEffect):
             with_box = mine.with_city(_with_box(city, params.box))
             offset_db[rows] = level_at(with_box, True) - level_at(mine, True)
             return Term.of_offset(offset_db)
-        rows = np.flatnonzero(links.los)
-        crossing = cross(params.box, *ends_above(links, params.box[:2], rows))
+        return Term.of_offset(self._offsets_db(links, params.box, (params.scattered_db,),
+                                               params.by_class, level_at)[0])
+
+    def _offsets_db(self, links: LinkData, box: Box, scattered_db: tuple[float, ...],
+                    by_class: bool, level_at: LevelAt) -> np.ndarray:
+        """Return what a box adds to links (n,), by each of k powers in its shadow (k, n) [dB]."""
+        offset_db, rows = np.zeros((len(scattered_db), len(links))), np.flatnonzero(links.los)
+        crossing = cross(box, *ends_above(links, box[:2], rows))
         crosses = np.isfinite(crossing.left_m)
         if crosses.any():
             rows = rows[crosses]
             scattered: np.ndarray | float = 0.0
             if links.city is not None:
-                shadow_db = self._shadow_db(links, level_at, params.by_class)[rows]
-                scattered = 10 ** (np.minimum(shadow_db + params.scattered_db, 0) / 10)
-            offset_db[rows] = _gain_db(Crossing(*(value[crosses] for value in crossing)), scattered,
-                                       speed_of_light / links.frequency_hz)
-        return Term.of_offset(offset_db)
+                shadow_db = self._shadow_db(links, level_at, by_class)[rows]
+                scattered = 10 ** (np.minimum(shadow_db + np.array(scattered_db)[:, None], 0) / 10)
+            offset_db[:, rows] = _gain_db(Crossing(*(value[crosses] for value in crossing)),
+                                          scattered, speed_of_light / links.frequency_hz)
+        return offset_db
 
     def _shadow_db(self, links: LinkData, level_at: LevelAt, by_class: bool) -> np.ndarray:
         """Return what links (n,) lose if something hides the other end [dB]; see `Params`."""
@@ -239,9 +250,14 @@ class MissingObstacle(GainEffect):
         return params.model_copy(update={"box": params.box.like(other.box)})
 
 
+def _ways(links: LinkData, ways: tuple[T, ...]) -> tuple[T, ...]:
+    """Return the ways in which power reaches a shadow; without a map there is one, past the box."""
+    return ways if links.city is not None else ways[:1]
+
+
 def _gain_db(crossing: Crossing, scattered: np.ndarray | float,
              wavelength_m: float) -> np.ndarray:
-    """Return what a box adds to links (n,) that cross it; `scattered` power is relative to them."""
+    """Return what a box adds to links that cross it (n,), or (k, n) as the `scattered` power has."""
     over_db = two_edges_db(crossing.enter_over_m, crossing.leave_over_m, crossing.before_m,
                            crossing.between_m, crossing.behind_m, wavelength_m)
     first_m = crossing.before_m + crossing.between_m / 2

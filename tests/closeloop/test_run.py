@@ -7,7 +7,7 @@ from radiotwin.closeloop.result_file import make_report
 from radiotwin.closeloop.run import close_loop
 from radiotwin.errors import BadInput
 
-pytestmark = pytest.mark.usefixtures("predicted_by_the_model_alone")
+pytestmark = pytest.mark.usefixtures("short_report")
 
 
 def run(measurements, seed=0):

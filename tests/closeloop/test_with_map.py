@@ -70,7 +70,7 @@ def error_db(radio_map, scene, blocked):
     return float(np.sqrt(np.nanmean(error**2)))
 
 
-@pytest.mark.usefixtures("predicted_by_the_model_alone")
+@pytest.mark.usefixtures("short_report")
 def test_a_correct_map_is_left_alone(small_scene):
     report = run(survey(small_scene, 0, lambda a, b: ~small_scene.city.line_of_sight(a, b)), small_scene)
     assert report["verdict"] == "none", [effect["name"] for effect in report["effects"]]
@@ -98,7 +98,7 @@ def test_a_building_that_the_map_lacks_is_found_and_goes_into_the_twin(small_sce
     assert error_db(corrected.radio_map(small_scene), small_scene, blocked) < 0.75 * before
 
 
-@pytest.mark.usefixtures("predicted_by_the_model_alone")
+@pytest.mark.usefixtures("short_report")
 def test_a_building_that_is_gone_is_named(small_scene):
     from radiotwin.effects.mapped_buildings import buildings
     from radiotwin.scene.citymap import CityMap

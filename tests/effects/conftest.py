@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import radiotwin as rt
+from radiotwin.closeloop.result_file import scores
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
 from tests.worlds import open_ground
@@ -46,8 +47,8 @@ def view():
 def loop():
     """Close the loop over measurements without a map: names of the effects found, and the first one's parameters."""
     def run(measurements):
-        report = rt.make_report(rt.close_loop(measurements, base="log-distance"))
-        parameters = report["effects"][0]["parameters"] if report["effects"] else {}
-        return SimpleNamespace(report=report, names=[effect["name"] for effect in report["effects"]],
-                               first={name: SimpleNamespace(**parameter) for name, parameter in parameters.items()})
+        closed = rt.close_loop(measurements, base="log-distance")
+        return SimpleNamespace(error={"before": scores(closed.before), "after": scores(closed.after)},
+                               names=[each.effect.name for each in closed.after.whole.effects],
+                               first=(closed.parameters or [{}])[0])
     return run

@@ -130,5 +130,5 @@ def test_a_world_of_two_rays_is_named(open_ground, loop):
     assert found.names == ["ground_reflection"]
     assert found.first["ground_m"].value == pytest.approx(0.05, abs=0.02)
     assert 0.6 < found.first["strength"].value < 1.1 and found.first["roughness_m"].value < 0.02
-    error = found.report["error"]
+    error = found.error
     assert error["after"]["rmse_db"] < 1.06 * 2.0 < 0.92 * error["before"]["rmse_db"]

@@ -51,7 +51,7 @@ def test_an_emitter_is_found_at_its_position(open_ground, loop):
     assert found.names == ["interference"]
     off_m = np.hypot(found.first["x_m"].value - 330, found.first["y_m"].value - 140)
     assert off_m < 20 and found.first["level_at_100_m"].value == pytest.approx(-99, abs=1)
-    assert found.report["error"]["after"]["nll"] < found.report["error"]["before"]["nll"] - 0.1
+    assert found.error["after"]["nll"] < found.error["before"]["nll"] - 0.1
 
 
 @pytest.mark.whole_loop

@@ -80,4 +80,4 @@ def test_links_lost_at_random_are_named_and_counted(open_ground, loop):
     assert found.names == ["lock_loss"] and set(found.first) == {"lost_share[r1]"}
     share = found.first["lost_share[r1]"]
     assert share.low < 0.05 < share.high and share.high - share.low < 0.03
-    assert found.report["error"]["after"]["nll"] < found.report["error"]["before"]["nll"] - 0.02
+    assert found.error["after"]["nll"] < found.error["before"]["nll"] - 0.02
