@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 import pandas as pd
 
-from radiotwin import Measurements, close_loop
+from radiotwin import Loop, Measurements, close_loop
 from radiotwin.scene import Scene
 from studies.runner import Study
 from studies.tables import markdown, number
@@ -38,7 +38,8 @@ def put_in_again(seed: int, settings: dict) -> dict:
     """Close the loop on a campaign, and on the same one with effects of the sizes it tells."""
     kind, _, number = settings["case"].partition(":")
     case = open_case(int(number)) if number else foreign_case(kind)
-    told, named = _close(case.measurements, case.scene, seed)
+    loop = _close(case.measurements, case.scene, seed)
+    told = {each.name: each.size for each in loop.detectable}
     found: list[list] = []
     for family, size in told.items():
         if family not in HIDE or not np.isfinite(size) or (family in BY_SIGHT and case.scene):
@@ -47,20 +48,21 @@ def put_in_again(seed: int, settings: dict) -> dict:
             rng = np.random.default_rng([seed, len(found)])
             changed = HIDE[family](case.measurements, times * size, rng)
             if changed is not None:
-                found.append([family, round(size, 2), times, _close(changed, case.scene, seed)[1]])
-    return {"named": named, "told": {name: round(size, 2) for name, size in told.items()
+                again = _close(changed, case.scene, seed)
+                found.append([family, round(size, 2), times, _named(again)])
+    return {"named": _named(loop), "told": {name: round(size, 2) for name, size in told.items()
                                      if np.isfinite(size)}, "again": found}
 
 
-def _close(measured: Measurements, scene: Scene | None,
-           seed: int) -> tuple[dict[str, float], list[str]]:
-    """Return the sizes that would have been named by family, and the names that were given."""
+def _close(measured: Measurements, scene: Scene | None, seed: int) -> Loop:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        loop = close_loop(measured, scene, seed=seed)
-    named = [each.effect.name for each in loop.after.whole.effects
-             if each.effect.is_cause and not each.effect.is_declared]
-    return {each.name: each.size for each in loop.detectable}, named
+        return close_loop(measured, scene, seed=seed)
+
+
+def _named(loop: Loop) -> list[str]:
+    return [each.effect.name for each in loop.after.whole.effects
+            if each.effect.is_cause and not each.effect.is_declared]
 
 
 def _louder(measured: Measurements, change_db: np.ndarray) -> Measurements:

@@ -37,7 +37,7 @@ from radiotwin.effects.vegetation import max_loss_db
 from radiotwin.links import LinkData
 
 MAX_NATS = 1e4  # more are not looked for
-LARGER, MAX_TRIALS = 1.5, 6  # times the size before, where a search does not find it
+LARGER, MAX_TRIALS = 2.0, 5  # times the size before, where a search does not find it
 EXPLAINED = 0.3  # of what the true pattern explains; what is found so is refined later
 MAX_SIZE = 1e3  # in any unit
 

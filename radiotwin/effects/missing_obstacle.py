@@ -257,7 +257,7 @@ def _ways(links: LinkData, ways: tuple[T, ...]) -> tuple[T, ...]:
 
 def _gain_db(crossing: Crossing, scattered: np.ndarray | float,
              wavelength_m: float) -> np.ndarray:
-    """Return what a box adds to links that cross it (n,), or (k, n) as the `scattered` power has."""
+    """Return what a box adds to links that cross it, (n,) or (k, n) as `scattered` power is."""
     over_db = two_edges_db(crossing.enter_over_m, crossing.leave_over_m, crossing.before_m,
                            crossing.between_m, crossing.behind_m, wavelength_m)
     first_m = crossing.before_m + crossing.between_m / 2
