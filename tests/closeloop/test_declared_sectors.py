@@ -108,6 +108,7 @@ def test_where_no_azimuth_is_declared_nothing_is_said_of_it():
     assert (found.variants, found.scores, found.note) == ([], [], "")
 
 
+@pytest.mark.usefixtures("short_report")
 def test_the_loop_begins_with_what_is_declared_and_calls_it_no_cause():
     loop = rt.close_loop(network(0, points=150), base="log-distance", hold_out="device")
     report = rt.make_report(loop)

@@ -64,6 +64,7 @@ def found():
     return rt.close_loop(campaign(0), base="log-distance", hold_out="flight")
 
 
+@pytest.mark.usefixtures("short_report")
 def test_an_episode_is_as_well_known_as_the_flight_it_was_on_tells(found):
     [episode] = [each for each in rt.make_report(found)["effects"] if each["name"] == "episode"]
     loss, start, end = (episode["parameters"][f"{name}[all]"] for name in ("loss_db", "start_s", "end_s"))
@@ -81,6 +82,7 @@ def test_nobody_knew_the_episode_before_its_flight_and_nothing_else_is_judged_by
     assert "time_s" not in {each.variable for each in found.remaining}
 
 
+@pytest.mark.usefixtures("short_report")
 def test_a_faulty_flight_is_no_less_one_because_another_receiver_has_changed():
     report = rt.make_report(rt.close_loop(campaign(1, loss_db=0.0, fault_db=8.0, step_db=15.0), base="log-distance",
                                           hold_out="flight"))

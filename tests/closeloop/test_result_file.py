@@ -60,6 +60,7 @@ def test_a_report_of_version_0_1_is_read_with_new_names_and_the_bias_turned(old)
     assert upgrade_report(new) == new
 
 
+@pytest.mark.usefixtures("short_report")
 def test_each_effect_has_its_own_name_and_a_score_that_was_kept(open_ground, monkeypatch):
     monkeypatch.setattr("radiotwin.closeloop.run.catalogue", lambda: (ReceiverGainOffset,))  # the others take long
     world = open_ground.fly(21)

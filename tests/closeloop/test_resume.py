@@ -42,7 +42,8 @@ def searches(monkeypatch):
 
 
 @pytest.fixture
-def measured(open_ground):
+def measured(open_ground, monkeypatch):
+    monkeypatch.setattr("radiotwin.closeloop.run.detectable", lambda *_: [])  # keeps no parts
     world = open_ground.fly(2)
     world.gain_db[world.receiver == 1] += 5.0
     world.gain_db[(world.receiver == 0) & (world.time_s > 530)] -= 6.0

@@ -40,7 +40,9 @@ def nothing_hidden(seen):
 
 @pytest.fixture
 def sizes(monkeypatch):
-    """`sizes(view, hypotheses, *names)`: of those families only, as buildings take their time."""
+    """`sizes(view, hypotheses, *names)`: of those families only, and of two members, as searches take their time."""
+    monkeypatch.setattr("radiotwin.closeloop.typical_patterns.MAX_MEMBERS", 2)
+
     def make(view, hypotheses, *names, criteria=CRITERIA):
         monkeypatch.setattr("radiotwin.closeloop.sensitivity.typical_patterns", lambda view: (
             each for each in typical_patterns(view) if each.effect.name in names))
