@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from radiotwin.closeloop.baselines import grow_trees
 from radiotwin.closeloop.predictor import CombinedPrediction
 from radiotwin.measurements import Measurements
 from radiotwin.radiomap import RadioMap
@@ -74,6 +75,17 @@ def short_report(monkeypatch):
                                   {"log_distance": mean_db})
     monkeypatch.setattr("radiotwin.closeloop.run.combined_prediction", alone)
     monkeypatch.setattr("radiotwin.closeloop.run.detectable", lambda *_: [])
+
+
+@pytest.fixture
+def quick_report(monkeypatch):
+    """A report as ever, from forests of five trees and a few patterns: they take two thirds of the time of a small loop."""
+    def grown(kind, features, target, seed, *_):
+        return grow_trees(kind, features, target, seed, 5)
+    for module in ("baselines", "predictor"):
+        monkeypatch.setattr(f"radiotwin.closeloop.{module}.grow_trees", grown)
+    for most in ("MAX_MEMBERS", "MAX_PLACES"):
+        monkeypatch.setattr(f"radiotwin.closeloop.typical_patterns.{most}", 1)
 
 
 @pytest.fixture(scope="session")

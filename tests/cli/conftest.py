@@ -6,8 +6,9 @@ import pytest
 
 from tests.cli.strangers import FIT, MAP, SECRET, SURVEY
 from tests.command_line import run, run_installed
+from tests.worlds import quick_report
 
-__all__ = ["run", "run_installed"]
+__all__ = ["quick_report", "run", "run_installed"]
 
 
 @pytest.fixture(scope="session")

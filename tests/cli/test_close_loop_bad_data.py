@@ -33,7 +33,7 @@ def survey(device_m, blocked=None, seed=0):
 
 
 @pytest.fixture
-def close_loop(run, tmp_path, monkeypatch):
+def close_loop(run, tmp_path, monkeypatch, quick_report):
     """Run the command on tables: exit status, standard output and error. Pictures are drawn coarsely, and without the
     search for room between their parts, which would take longer than all else."""
     monkeypatch.setattr("radiotwin.report.style.DPI", 30)

@@ -73,6 +73,7 @@ def test_each_effect_has_its_own_name_and_a_score_that_was_kept(open_ground, mon
         make_report(replace(loop, selection=replace(loop.selection, scores=scores)))
 
 
+@pytest.mark.usefixtures("quick_report")
 def test_it_has_what_a_new_report_has(old, open_ground, tmp_path):
     world = open_ground.fly(21)
     world.gain_db[world.receiver == 1] += 6.0

@@ -42,7 +42,7 @@ def cases():
     return st.sampled_from([target for target in TARGETS if not target.slow]).flatmap(of)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True, database=None, phases=(Phase.generate, Phase.shrink),
+@settings(max_examples=100, deadline=None, derandomize=True, database=None, phases=(Phase.generate, Phase.shrink),
           suppress_health_check=list(HealthCheck))
 @given(case=cases())
 def test_damaged_files_keep_the_rule(run, case):

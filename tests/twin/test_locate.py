@@ -49,6 +49,7 @@ def test_a_device_is_found_by_three_packets_of_each_gateway_and_by_the_silence_o
     assert np.hypot(found["x_m"][0] - there_m[0], found["y_m"][0] - there_m[1]) < 100
 
 
+@pytest.mark.usefixtures("quick_report")
 def test_the_command_finds_an_unknown_device_and_says_how_far_off_it_is(run, tmp_path, open_ground):
     world = open_ground.fly(12)
     world.gain_db[world.receiver == 0] -= 6.0
