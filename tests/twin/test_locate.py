@@ -73,7 +73,7 @@ def test_the_command_finds_an_unknown_device_and_says_how_far_off_it_is(run, tmp
 
 @pytest.mark.parametrize("role, twin, message", [
     ("anchor", "loop/twin", "role unknown"), ("unknown", "nowhere", "not a twin")])
-def test_bad_input_is_one_message(run, tmp_path, open_ground, role, twin, message, monkeypatch):
+def test_bad_input_is_one_message(run, tmp_path, open_ground, role, twin, message, monkeypatch, quick_report):
     data = open_ground.measured(open_ground.fly(13))
     data.write(tmp_path / "flight" / "measurements.csv")
     if role == "anchor":
