@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.effects.comparison import by_precision, mean_by_precision
+from radiotwin.effects.comparison import by_precision, compared_db, mean_by_precision
 from radiotwin.effects.episode import Episode, _is_same, _Window
 from radiotwin.effects.faulty_flight import FaultyFlight
 
@@ -61,6 +61,28 @@ def test_a_step_of_another_receiver_does_not_hide_a_faulty_flight(flown, seed):
     (params,) = FaultyFlight().propose(flown(seed, lambda links, rng: FAULTS["offset"](links, rng) - 25.0 * (
         (links.receiver == 0) & (links.flight == FLIGHTS - 1))))
     assert (params.receiver, params.flight) == (1, "f3")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_of_three_flights_the_one_between_is_found_if_it_is_far_off_and_neither_of_the_others(flown, seed):
+    """Two others do not tell how much flights usually differ: other campaigns do."""
+    def few(change):
+        given = flown(seed, change)
+        rows = (given.links.receiver == 1) & np.isin(given.links.flight, [0, 3, FLIGHTS - 1])
+        return given.__class__(given.links.select(rows), given.residual_db[rows], given.scale_db[rows],
+                               given.mean_db[rows], given.level_at)
+
+    (params,) = FaultyFlight().propose(few(lambda links, rng: np.where(on_flight(links), -12.0, 0.0)))
+    assert params.flight == "f3"
+    assert FaultyFlight().propose(few(lambda links, rng: np.where(on_flight(links), -2.5, 0.0))) == []
+    assert FaultyFlight().propose(few(lambda links, rng: np.where(links.flight == FLIGHTS - 1, -12.0, 0.0))) == []
+
+
+def test_what_is_compared_once_is_remembered_and_cannot_be_changed(flown):
+    given = flown(0)
+    assert compared_db(given) is compared_db(given)
+    with pytest.raises(ValueError, match="read-only"):
+        compared_db(given)[0] = 0.0
 
 
 def test_its_term_acts_on_that_flight_only(flown):
