@@ -245,6 +245,8 @@ def response(effects: list[AppliedEffect], stage: str, rows: np.ndarray | slice)
 @lru_cache(maxsize=VIEWS)
 def _view(model: FoldModel, result: FitResult) -> ResidualView:
     predicted = model.training.predict(result)
-    return ResidualView(model.links.select(model.train), model.training.residual_db(result),
+    # All links stay the same object, of which things are remembered.
+    links = model.links if model.train.all() else model.links.select(model.train)
+    return ResidualView(links, model.training.residual_db(result),
                         predicted.scale_db, predicted.mean_db, model.level_at,
                         tuple((each.effect.name, each.params) for each in model.effects))

@@ -4,12 +4,14 @@ From the variogram over the positions of the end that moves, within each pair of
 that what a device or a receiver has in common does not count (`radiotwin.links.variogram`).
 """
 
+from functools import lru_cache
+
 import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
 from radiotwin.links.link_data import LinkData
-from radiotwin.links.variogram import MIN_PAIRS, Trend, fitted_length_m, pairs_of_links
+from radiotwin.links.variogram import MIN_PAIRS, Trend, Variogram, pairs_of_links
 
 MIN_SERIES = 3  # mean readings of a device by a receiver on a flight, to be a series
 MAX_STEPS = 5_000  # places whose nearest one is looked up
@@ -17,6 +19,7 @@ MAX_Z = 4.0  # outliers count as this many scales
 LENGTHS = 24  # tried, evenly on a logarithmic scale
 EXTENT_SHARE = 0.25  # of the extent: a longer correlation looks like a trend
 MIN_STEP_M = 0.1
+REMEMBERED = 8  # sets of links: of a model and its folds
 
 
 def devices_move(links: LinkData) -> bool:
@@ -68,21 +71,34 @@ def correlation_length_m(links: LinkData, z: np.ndarray) -> float:
         links: n links.
         z: (n,) residuals over their scale; those of blank links do not count.
     """
+    seen = np.isfinite(links.level_db) & np.isfinite(z)
+    least_m, rows, variogram = _variogram(links, seen.tobytes())
+    return least_m if variogram is None else variogram.length_m(np.clip(z[rows], -MAX_Z, MAX_Z))
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _variogram(links: LinkData, seen: bytes) -> tuple[float, np.ndarray, Variogram | None]:
+    """Return the least length [m], rows (m,) of the links that were seen, and what they allow.
+
+    Every effect and every step asks for the same links, of which this is the slow part.
+    """
     least_m, most_m = step_m(links), EXTENT_SHARE * extent_m(moving_end_m(links))
-    seen = np.flatnonzero(np.isfinite(links.level_db) & np.isfinite(z))
-    if least_m <= 0 or most_m <= least_m or len(seen) < MIN_PAIRS:
-        return least_m
-    part, z = links.select(seen), z[seen]
+    rows = np.flatnonzero(np.frombuffer(seen, dtype=bool))
+    if least_m <= 0 or most_m <= least_m or len(rows) < MIN_PAIRS:
+        return least_m, rows, None
+    part = links.select(rows)
     pair = pair_of_ends(part)
-    order = np.lexsort((np.arange(len(seen)), part.time_s, part.flight, pair))
-    part, pair, z = part.select(order), pair[order], np.clip(z[order], -MAX_Z, MAX_Z)
+    order = np.lexsort((np.arange(len(rows)), part.time_s, part.flight, pair))
+    part, pair = part.select(order), pair[order]
     series = pd.factorize(pair * (part.flight.max() + 2) + part.flight)[0]
     place, borders = _apart(part, series)[0], np.flatnonzero(np.diff(pair)) + 1
-    trends = [Trend.of(part, rows, series) for rows in np.split(np.arange(len(pair)), borders)]
+    trends = [Trend.of(part, each, series)
+              for each in np.split(np.arange(len(pair)), borders)]
     first, second = pairs_of_links(place)
     near = np.linalg.norm(place[first] - place[second], axis=1) < 2 * most_m  # the rest is trends
-    return fitted_length_m(z, place[:, :-1], trends, first[near], second[near],
-                           np.geomspace(least_m, most_m, LENGTHS))
+    return least_m, rows[order], Variogram.of(
+        place[:, :-1], trends, first[near], second[near],
+        np.geomspace(least_m, most_m, LENGTHS))
 
 
 def _apart(links: LinkData, label: np.ndarray) -> tuple[np.ndarray, float]:

@@ -118,43 +118,72 @@ class Trend:
         return np.array(left)
 
 
-def fitted_length_m(z: np.ndarray, position_m: np.ndarray, trends: list[Trend], first: np.ndarray,
-                    second: np.ndarray, lengths_m: np.ndarray) -> float:
-    """Return the correlation length whose field, with a nugget, is nearest to a residual's.
+@dataclass(frozen=True, eq=False)
+class Variogram:
+    """What residuals of some links are compared with: all that depends on where links are only.
 
-    Args:
-        z: (n,) residuals over their scale.
-        position_m: (n, d) of both ends [m].
-        trends: of each pair of ends; each link belongs to one.
+    Attributes:
+        trends: of each pair of ends; each of n links belongs to one.
         first: (p,) rows of first links.
         second: (p,) of second ones, of the same pair of ends and flight.
+        index: (p,) bin of each pair's distance.
+        fields: (1 + k, bins) semivariances of detrended white noise, and of a field of each length;
+            NaN in a bin without a sampled pair.
         lengths_m: (k,) that are tried, ascending [m].
-
-    Returns:
-        one of these; the first where the residual is not correlated, or says too little.
     """
-    rest = np.empty(len(z))
-    for trend in trends:
-        rest[trend.rows] = trend.taken_from(z)
-    distance_m, least_m = _apart_m(position_m, first, second), float(lengths_m[0])
-    edges = np.geomspace(least_m, max(float(distance_m.max(initial=0)), 2 * least_m), BINS)
-    index = np.searchsorted(edges, distance_m)
-    pairs = np.bincount(index, minlength=BINS + 1)
-    root = np.sqrt(np.abs(rest[first] - rest[second]))
-    mean = np.bincount(index, weights=root, minlength=BINS + 1) / np.maximum(pairs, 1)
-    gamma = 0.5 * mean**4 / (0.457 + 0.494 / np.maximum(pairs, 1))  # Eq. 2.14
-    fields = _fields(position_m, trends, first, second, index, lengths_m)
-    used = (pairs >= MIN_PAIRS) & np.isfinite(fields).all(axis=0)
-    if used.sum() < MIN_BINS:
-        return least_m
-    return _nearest(gamma[used], pairs[used], fields[:, used], lengths_m)
+
+    trends: list[Trend]
+    first: np.ndarray
+    second: np.ndarray
+    index: np.ndarray
+    fields: np.ndarray
+    lengths_m: np.ndarray
+
+    @classmethod
+    def of(cls, position_m: np.ndarray, trends: list[Trend], first: np.ndarray, second: np.ndarray,
+           lengths_m: np.ndarray) -> Variogram:
+        """Return that of n links.
+
+        Args:
+            position_m: (n, d) of both ends [m].
+            trends: as of the class.
+            first: as of the class.
+            second: as of the class.
+            lengths_m: as of the class.
+        """
+        distance_m, least_m = _apart_m(position_m, first, second), float(lengths_m[0])
+        edges = np.geomspace(least_m, max(float(distance_m.max(initial=0)), 2 * least_m), BINS)
+        index = np.searchsorted(edges, distance_m)
+        return cls(trends, first, second, index,
+                   _fields(position_m, trends, first, second, index, lengths_m), lengths_m)
+
+    def length_m(self, z: np.ndarray) -> float:
+        """Return the correlation length whose field, with a nugget, is nearest to a residual's.
+
+        Args:
+            z: (n,) residuals over their scale.
+
+        Returns:
+            one of `lengths_m`; the first where the residual is not correlated, or says too little.
+        """
+        rest = np.empty(len(z))
+        for trend in self.trends:
+            rest[trend.rows] = trend.taken_from(z)
+        pairs = np.bincount(self.index, minlength=BINS + 1)
+        root = np.sqrt(np.abs(rest[self.first] - rest[self.second]))
+        mean = np.bincount(self.index, weights=root, minlength=BINS + 1) / np.maximum(pairs, 1)
+        gamma = 0.5 * mean**4 / (0.457 + 0.494 / np.maximum(pairs, 1))  # Eq. 2.14
+        used = (pairs >= MIN_PAIRS) & np.isfinite(self.fields).all(axis=0)
+        if used.sum() < MIN_BINS:
+            return float(self.lengths_m[0])
+        return _nearest(gamma[used], pairs[used], self.fields[:, used], self.lengths_m)
 
 
 def _fields(position_m: np.ndarray, trends: list[Trend], first: np.ndarray, second: np.ndarray,
             index: np.ndarray, lengths_m: np.ndarray) -> np.ndarray:
     """Return the mean semivariance of detrended fields in each bin; NaN without a sampled pair.
 
-    Arguments as of `fitted_length_m`, and the bin (p,) of each pair.
+    Arguments as of `Variogram`, and the positions (n, d) of both ends [m].
 
     Returns:
         (1 + k, bins)

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from radiotwin.links import variogram
-from radiotwin.links.variogram import Trend, fitted_length_m, pairs_of_links
+from radiotwin.links.variogram import Trend, Variogram, pairs_of_links
 
 
 def tracks(seed, flights=4, slots=80, side_m=400.0):
@@ -63,15 +63,14 @@ def test_a_length_that_trends_take_much_of_is_recovered(length_m, within):
         all_series = np.tile(series, 5) + np.repeat(np.arange(5), len(series)) * 10
         trends = [Trend.of(many, each, all_series) for each in rows]
         place = np.column_stack([np.tile(place_m, (5, 1)), 1e5 * all_series])
-        found.append(fitted_length_m(fields.T.ravel(), place[:, :2], trends, *pairs_of_links(place),
-                                     np.geomspace(3.0, 140.0, 24)))
+        measured = Variogram.of(place[:, :2], trends, *pairs_of_links(place), np.geomspace(3.0, 140.0, 24))
+        found.append(measured.length_m(fields.T.ravel()))
     assert length_m / within < np.exp(np.mean(np.log(found))) < within * length_m
 
 
 def test_white_noise_has_the_least_length():
     place_m, links, series = tracks(3)
     place = np.column_stack([place_m, 1e5 * series])
-    found = fitted_length_m(np.random.default_rng(0).normal(size=len(series)), place_m,
-                            [Trend.of(links, np.arange(len(series)), series)], *pairs_of_links(place),
+    measured = Variogram.of(place_m, [Trend.of(links, np.arange(len(series)), series)], *pairs_of_links(place),
                             np.geomspace(3.0, 140.0, 24))
-    assert found < 6.0
+    assert measured.length_m(np.random.default_rng(0).normal(size=len(series))) < 6.0
