@@ -92,7 +92,7 @@ def closeloop_context(report: dict, folder: Path) -> dict[str, Any]:
         "errors_by_member": _error_table(report, ("device", "receiver", "flight")),
         "detectable": Table(
             ("effect", "would have been named from", "what its size is"),
-            [[name_label(each["name"]), f"{words.number(each['size'])} {each['unit']}",
+            [[name_label(each["name"]), f"{words.about(each['size'])} {each['unit']}",
               each["pattern"]] for each in report["detectable"] if each["size"] is not None]),
         "undetectable": words.undetectable(report),
         "side_by_side": words.side_by_side(report),

@@ -128,6 +128,11 @@ def number(value: float | None) -> str:
     return text.replace("-", "−")
 
 
+def about(value: float) -> str:
+    """Return a number of which two digits are known: 110 for 106.2."""
+    return f"{float(f'{value:.2g}'):,.10g}"
+
+
 def probability(value: float | None) -> str:
     """Return a probability as a page shows it; none is ever 0 or 1."""
     if value is None:

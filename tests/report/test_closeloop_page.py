@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from radiotwin.cli import loop
 from radiotwin.errors import BadInput
 from radiotwin.report.closeloop_page import write_closeloop_page
-from radiotwin.report.closeloop_words import closeloop_summary, drivers, rivals
+from radiotwin.report.closeloop_words import about, closeloop_summary, drivers, rivals
 from radiotwin.report.labels import join_names, parameter_label, variable_label
 
 SCORES = {"n": 900, "bias_db": 0.04, "std_db": 3.0, "correlation": 0.9, "rmse_db": 3.0, "mae_db": 2.2, "nll": 2.5}
@@ -129,7 +129,7 @@ def test_how_probable_it_is_and_what_would_have_been_seen_is_said(tmp_path):
     assert "What else it may be: receiver gain offset (the data cannot tell them apart), nothing is missing 0.28 and antenna " \
         "pattern 0.12." in text  # 0.4 are left
     assert "by 4.00 dB (RMS; 90 % interval 3.00 to 5.00)" in text
-    assert "would have been named from" in text and "4.20 dB/km" in text
+    assert "would have been named from" in text and "4.2 dB/km" in text
     assert "belong to places" in closeloop_summary(report("none"))
 
 
@@ -301,3 +301,7 @@ def test_the_page_tells_how_far_intervals_can_be_trusted(tmp_path):
     assert "<span>all that was learnt together, RMSE</span><b>1.90 dB</b>" in text
     error["combined"] = SCORES  # of a file that was written before
     assert "in its 90 % intervals" not in page(report(prediction=prediction, error=error), tmp_path)
+
+
+def test_a_size_that_searches_found_by_doubling_has_two_digits():
+    assert [about(size) for size in (106.2, 9.24, 0.0123, 1060.0)] == ["110", "9.2", "0.012", "1,100"]
