@@ -3,7 +3,7 @@
 Campaigns in which nothing is hidden, over open ground and in cities whose maps are wrong: the loop
 says from which sizes on it would have named what it did not. Effects of that size and of one and a
 half times it are then put into the levels, by formulas of this module, and the loop is closed
-again. `python -m studies sizes --resume`: an hour and more on one core.
+again. `python -m studies sizes --resume`: hours on one core.
 """
 
 import warnings

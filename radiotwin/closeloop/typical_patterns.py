@@ -1,4 +1,4 @@
-"""What a typical effect of each family would change, over the links that were measured."""
+"""Changes that a typical effect of each family makes, over the links that were measured."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PLACES, SHARES = 40, (0.1, 0.3, 0.5, 0.7, 0.9)  # links that it may stand on, an
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """What an effect of each size changes.
+    """A change of levels, as an effect of each size makes it.
 
     Attributes:
         effect: whose it is.

@@ -120,7 +120,7 @@ class Trend:
 
 @dataclass(frozen=True, eq=False)
 class Variogram:
-    """What residuals of some links are compared with: all that depends on where links are only.
+    """Model variograms of some links: all that depends on nothing but where they are.
 
     Attributes:
         trends: of each pair of ends; each of n links belongs to one.

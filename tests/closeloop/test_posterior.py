@@ -6,11 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from radiotwin.closeloop.bases import LogDistanceBase
 from radiotwin.closeloop.criteria import SelectionCriteria
-from radiotwin.closeloop.cross_validation import cross_validate, training_parts
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.hypotheses import Hypotheses
 from radiotwin.closeloop.posterior import NONE, OTHER, features, judge, probability_of
 from radiotwin.closeloop.scoring import CandidateScore
 from radiotwin.closeloop.sensitivity import needed_nats
@@ -19,19 +15,9 @@ from radiotwin.effects.fitting import add_effect
 from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
 from radiotwin.effects.position_errors import DevicePositionError
 from radiotwin.inference.correlated_evidence import Columns
-from radiotwin.links import prepare_links
+from tests.closeloop.looking import looked_at
 
 CRITERIA = SelectionCriteria()
-
-
-def looked_at(open_ground, seed, change=lambda world: None):
-    """Return the model without effects, and the hypotheses about what it lacks."""
-    world = open_ground.fly(seed)
-    change(world)
-    links = prepare_links(open_ground.measured(world), None)
-    folds = make_folds(links, 0)
-    model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
-    return model, Hypotheses.of(model.whole, model.fits[0], 0)
 
 
 def test_evidence_for_an_offset_that_is_there_and_none_for_one_that_is_not(open_ground):

@@ -5,17 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from radiotwin.closeloop.bases import LogDistanceBase
 from radiotwin.closeloop.criteria import SelectionCriteria
-from radiotwin.closeloop.cross_validation import cross_validate, training_parts
-from radiotwin.closeloop.folds import make_folds
-from radiotwin.closeloop.hypotheses import Hypotheses
 from radiotwin.closeloop.result_file import _for_json
 from radiotwin.closeloop.sensitivity import detectable, needed_nats
 from radiotwin.closeloop.typical_patterns import MIN_LINKS, median_azimuth_deg, typical_patterns
 from radiotwin.effects.faulty_flight import FaultyFlight
 from radiotwin.effects.position_errors import MIN_MOVE_M
-from radiotwin.links import prepare_links
+from tests.closeloop.looking import looked_at
 
 CRITERIA = SelectionCriteria()
 
@@ -24,12 +20,8 @@ CRITERIA = SelectionCriteria()
 def seen(open_ground):
     """`seen(seed, change)`: view of a world's residual, and the hypotheses about it."""
     def make(seed, change=lambda world: None):
-        world = open_ground.fly(seed)
-        change(world)
-        links = prepare_links(open_ground.measured(world), None)
-        folds = make_folds(links, 0)
-        model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
-        return model.whole.view(model.fits[0]), Hypotheses.of(model.whole, model.fits[0], 0)
+        model, hypotheses = looked_at(open_ground, seed, change)
+        return model.whole.view(model.fits[0]), hypotheses
     return make
 
 

@@ -1,0 +1,17 @@
+"""Evidence in a world over open ground."""
+
+from radiotwin.closeloop.bases import LogDistanceBase
+from radiotwin.closeloop.cross_validation import cross_validate, training_parts
+from radiotwin.closeloop.folds import make_folds
+from radiotwin.closeloop.hypotheses import Hypotheses
+from radiotwin.links import prepare_links
+
+
+def looked_at(open_ground, seed, change=lambda world: None):
+    """Return the model without effects, and the hypotheses about what it lacks."""
+    world = open_ground.fly(seed)
+    change(world)
+    links = prepare_links(open_ground.measured(world), None)
+    folds = make_folds(links, 0)
+    model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
+    return model, Hypotheses.of(model.whole, model.fits[0], 0)
