@@ -32,12 +32,13 @@ from radiotwin.closeloop.scoring import (
 )
 from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.base import DetectionEffect, Effect
-from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.fold_model import AppliedEffect, FoldModel
 from radiotwin.effects.gain_drift import DeviceDrift, ReceiverDrift
+from radiotwin.inference.censored_regression import FitResult
 from radiotwin.links import LinkData, evidence_blocks
 from radiotwin.links.correlation import devices_move
 
-MIN_SHARED = 0.5  # of a fault's links, on which what is held against it must act, too
+MIN_SHARED = 0.5  # of a fault's links, on which what is held against it, or the same, acts
 MIN_DEVICES = 4  # of known position, to hold some of them out
 
 
@@ -126,7 +127,8 @@ def drop_idle_faults(result: SelectionResult) -> None:
     Faults and steps in time come first, and are held against no other effect.
 
     Args:
-        result: is changed where one gains nothing any more on the links that it is fitted to.
+        result: is changed where one gains nothing any more on the links that it is fitted to, or
+            where its search would not find it beside the others.
     """
     for number in reversed(range(len(result.model.whole.effects))):
         whole, applied = result.model.whole, result.model.whole.effects[number]
@@ -137,7 +139,7 @@ def drop_idle_faults(result: SelectionResult) -> None:
         alone = whole.with_effects([each for each in whole.effects if each is not applied])
         fit = alone.fit()
         gain = fit.objective - result.model.fits[0].objective
-        if gain >= result.criteria.min_training_gain_nats:
+        if gain >= result.criteria.min_training_gain_nats and _is_found(applied, alone, fit):
             continue
         folds = [_without(each, same_effects(whole, each)[number]) for each in result.model.folds]
         fits = [fit, *(each.fit() for each in folds)]
@@ -146,6 +148,19 @@ def drop_idle_faults(result: SelectionResult) -> None:
         result.scores[kept] = replace(result.scores[kept], kept=False,
                                       reason="what was found later explains it")
         del result.rivals[number]
+
+
+def _is_found(applied: AppliedEffect, model: FoldModel, fit: FitResult) -> bool:
+    """Return whether the search of a fault finds it in what a model without it leaves.
+
+    Steps in time have no search of their own.
+    """
+    effect = applied.effect
+    if not effect.within_flights:
+        return True
+    again = [model.apply(effect, params).acts for params in effect.propose(model.view(fit))]
+    return any((applied.acts & acts).sum() >= MIN_SHARED * (applied.acts | acts).sum()
+               for acts in again)
 
 
 def _without(model: FoldModel, place: int | None) -> FoldModel:

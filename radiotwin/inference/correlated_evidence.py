@@ -27,7 +27,7 @@ MIN_POINTS = 3  # of a part that says anything
 # Of correlation [m]: shadowing decorrelates within 10 to 50 m (3GPP TR 38.901, Table 7.5-6). Longer
 # ones would explain whatever an antenna or a wrong position does to a device's levels.
 LENGTHS_M = (5.0, 12.0, 30.0)
-EVALUATIONS = 100  # of the likelihood at most, for the two variances; 40 are common
+PRECISION = {"maxfun": 60, "ftol": 1e-7, "gtol": 0.05}  # about 0.001 nats; 8 evaluations are common
 START = np.array([0.0, -1.0])  # logarithms: noise variance, field over noise
 BOUNDS = np.array([[-6.0, -7.0], [6.0, 7.0]])
 
@@ -125,29 +125,41 @@ class CorrelatedEvidence:
         if not len(z):
             return 0.0, START
 
-        def negative(theta: np.ndarray) -> float:
-            inside = np.clip(theta, *BOUNDS)
-            outside = float(np.abs(theta - inside).sum())
-            return outside - self.at(z, columns, prior_sd, inside)
+        # In units in which the likelihood is about as curved along either variance.
+        share = 1.0 - 1.0 / (1.0 + np.exp(start[1]) * self.spectrum)
+        unit = 1.0 / np.sqrt(0.5 * np.array([len(z), max(float(share @ share), 1.0)]))
 
-        simplex = np.vstack([start, start + [0.5, 0.0], start + [0.0, 1.0]])
-        options = {"initial_simplex": simplex, "maxfev": EVALUATIONS, "xatol": 0.01, "fatol": 0.02}
-        found = minimize(negative, start, method="Nelder-Mead", options=options)
-        return -float(found.fun), np.clip(found.x, *BOUNDS)
+        def negative(scaled: np.ndarray) -> tuple[float, np.ndarray]:
+            value, slope = self.at(z, columns, prior_sd, scaled * unit)
+            return -value, -slope * unit
+
+        found = minimize(negative, start / unit, jac=True, method="L-BFGS-B",
+                         bounds=list(zip(*(BOUNDS / unit), strict=True)), options=PRECISION)
+        return -float(found.fun), found.x * unit
 
     def at(self, z: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
-           theta: np.ndarray) -> float:
-        """Return the log marginal likelihood of rotated values at given variances [nats]."""
+           theta: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return the log marginal likelihood of rotated values at given variances [nats].
+
+        And its derivatives (2,) by the logarithms of the variances.
+        """
         variance = np.exp(theta[0]) * (1.0 + np.exp(theta[1]) * self.spectrum)
-        value = np.log(variance).sum() + (z * z / variance).sum()
+        share = 1.0 - np.exp(theta[0]) / variance  # of the field
+        value, left, freedom = np.log(variance).sum() + (z * z / variance).sum(), z, np.zeros(2)
         if columns.shape[1]:
             weighted = columns.T / variance
-            inner = weighted @ columns + np.diag(1.0 / np.square(prior_sd))
+            inner = weighted @ columns
+            factor = cho_factor(inner + np.diag(1.0 / np.square(prior_sd)), lower=True)
             moments = weighted @ z
-            factor = cho_factor(inner, lower=True)
+            best = cho_solve(factor, moments)
             value += 2 * np.log(np.diag(factor[0])).sum() + 2 * np.log(prior_sd).sum()
-            value -= moments @ cho_solve(factor, moments)
-        return -0.5 * float(value) - 0.5 * len(z) * np.log(2 * np.pi)
+            value -= moments @ best
+            left = z - columns @ best
+            of_field = (weighted * share) @ columns
+            freedom = np.array([np.trace(cho_solve(factor, each)) for each in (inner, of_field)])
+        excess = 1.0 - left * left / variance
+        slope = np.array([excess.sum(), share @ excess]) - freedom
+        return -0.5 * float(value) - 0.5 * len(z) * np.log(2 * np.pi), -0.5 * slope
 
     def information(self, pattern: np.ndarray, columns: np.ndarray, prior_sd: np.ndarray,
                     theta: np.ndarray) -> float:

@@ -26,15 +26,16 @@ def clear_paths(
     Returns:
         (m,) rows of the buffer, ascending.
     """
-    points_m = np.empty((found, *buffer.points_m.shape[1:]))
-    _move_off_surfaces(surfaces, candidates, buffer, SKIN_M, points_m)
     legs = buffer.count[:found] - 1
+    points_m = np.empty((int(legs.max(initial=0)) + 1, found, 3))
+    _move_off_surfaces(surfaces, candidates, buffer, SKIN_M, points_m)
     rows = np.arange(found)
-    for leg in range(int(legs.max()) if found else 0):
+    for leg in range(len(points_m) - 1):
         used = np.flatnonzero(legs[rows] > leg)
         tested = rows[used]
         clear = np.ones(len(rows), dtype=bool)
-        clear[used] = city.line_of_sight(points_m[tested, leg], points_m[tested, leg + 1])
+        clear[used] = city.line_of_sight(points_m[leg].take(tested, 0),
+                                         points_m[leg + 1].take(tested, 0))
         rows = rows[clear]
     return rows
 
@@ -45,7 +46,7 @@ def _move_off_surfaces(
     points_m: np.ndarray,
 ) -> None:
     planes, edges = surfaces.planes, surfaces.edges
-    for path in range(len(points_m)):
+    for path in range(points_m.shape[1]):
         row, last = buffer.candidate[path], buffer.count[path] - 1
         before = sequence_length(candidates.before, row)
         for k in range(last + 1):
@@ -64,6 +65,6 @@ def _move_off_surfaces(
                     else candidates.after[row, k - before - 2]
                 x, y, z = planes[facet, NORMAL], planes[facet, NORMAL + 1], \
                     planes[facet, NORMAL + 2]
-            points_m[path, k, 0] = buffer.points_m[path, k, 0] + skin_m * x
-            points_m[path, k, 1] = buffer.points_m[path, k, 1] + skin_m * y
-            points_m[path, k, 2] = buffer.points_m[path, k, 2] + skin_m * z
+            points_m[k, path, 0] = buffer.points_m[path, k, 0] + skin_m * x
+            points_m[k, path, 1] = buffer.points_m[path, k, 1] + skin_m * y
+            points_m[k, path, 2] = buffer.points_m[path, k, 2] + skin_m * z

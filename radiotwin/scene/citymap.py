@@ -318,26 +318,38 @@ class CityMap:
             times normal, negative where the ray enters a solid.
         """
         a_m, b_m = np.asarray(a_m, dtype=float), np.asarray(b_m, dtype=float)
-        n = len(a_m)
+        direction, length = _rays(a_m, b_m)
+        return self._hits(a_m, direction, np.full(len(a_m), np.inf) if infinite else length)
+
+    def first_hits_towards(self, start_m: np.ndarray, direction: np.ndarray
+                           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Find the first surface in some directions, however far; returns those of `first_hits`.
+
+        Args:
+            start_m: (n, 3) [m].
+            direction: (n, 3) unit vectors.
+        """
+        return self._hits(start_m, direction, np.full(len(start_m), np.inf))
+
+    def _hits(self, start_m: np.ndarray, direction: np.ndarray, length_m: np.ndarray
+              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        n = len(start_m)
         distance, face, cosine = np.full(n, np.inf), np.full(n, -1), np.zeros(n)
         for start in range(0, n, CHUNK):
             part = slice(start, start + CHUNK)
-            origin, direction, length = _rays(a_m[part], b_m[part])
-            if infinite:
-                length[:] = np.inf
-            found = self._scene.run(origin, direction, length, query="INTERSECT", output=True)
-            face[part] = found["primID"]
-            hit = face[part] >= 0
-            distance[part] = np.where(hit, found["tfar"], np.inf)
-            normal = self._normals[np.maximum(face[part], 0)]
-            cosine[part] = np.where(hit, np.einsum("ij,ij->i", direction, normal), 0.0)
+            towards = np.ascontiguousarray(direction[part], dtype=np.float32)
+            found = self._scene.run(np.ascontiguousarray(start_m[part], dtype=np.float32), towards,
+                                    length_m[part].astype(np.float32), query="INTERSECT",
+                                    output=True)
+            hit = np.flatnonzero(found["primID"] >= 0)
+            face[start + hit] = faces = found["primID"][hit]
+            distance[start + hit] = found["tfar"][hit]
+            cosine[start + hit] = np.einsum("ij,ij->i", towards[hit], self._normals[faces])
         return distance, face, cosine
 
 
-def _rays(a_m: np.ndarray, b_m: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return origins, unit directions and lengths of segments in single precision."""
+def _rays(a_m: np.ndarray, b_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return unit directions (n, 3) and lengths (n,) of segments."""
     offset = b_m - a_m
     length = np.linalg.norm(offset, axis=1)
-    direction = offset / np.maximum(length, 1e-12)[:, None]
-    return (np.ascontiguousarray(a_m, dtype=np.float32),
-            np.ascontiguousarray(direction, dtype=np.float32), length.astype(np.float32))
+    return offset / np.maximum(length, 1e-12)[:, None], length

@@ -147,6 +147,24 @@ def test_a_step_that_other_effects_explain_is_taken_back(step_db):
     assert [len(fold.effects) for fold in result.model.folds] == [stays] * 5
 
 
+@pytest.mark.parametrize("always", [False, True])
+def test_a_fault_that_its_own_search_would_not_find_beside_the_others_is_taken_back(always):
+    measurements = campaign(4, loss_db=0.0)
+    table = measurements.table
+    lower = (table["receiver"] == "u0") & (always | table["time_s"].between(BEGIN_S, END_S))
+    table.loc[lower, "gain_db"] -= 5.0
+    links = prepare_links(measurements, None)
+    folds = make_folds(links, 0, "flight")
+    model = cross_validate(links, make_bases(None, 0)["log-distance"], folds, training_parts(links, folds))
+    episode = Episode.Params(receiver=0, flight=None, start_s=BEGIN_S, end_s=END_S, start_within_s=(BEGIN_S - 1, BEGIN_S),
+                             end_within_s=(END_S, END_S + 1), form="loss", frequency_hz=2.4e9)
+    result = SelectionResult(model)
+    result.keep(CandidateScore("episode", step=0), with_effect(model, Episode(), episode))
+    assert model.fits[0].objective - result.model.fits[0].objective > result.criteria.min_training_gain_nats
+    drop_idle_faults(result)
+    assert len(result.model.whole.effects) == result.scores[0].kept == (not always)
+
+
 def test_what_there_is_one_of_is_the_same_wherever_a_fold_finds_it():
     effect = Episode()
     assert same_effects(model_of(on_links(effect, 0, 10)), model_of(on_links(effect, 50, 60))) == [0]

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import approx_fprime
 from scipy.spatial.distance import cdist
 from scipy.stats import multivariate_normal
 
@@ -32,8 +33,25 @@ def test_the_marginal_likelihood_is_that_of_the_normal_distribution():
     correlation = np.exp(-cdist(position_m[rows], position_m[rows]) / evidence.length_m)
     covariance = np.exp(0.3) * (np.eye(240) + np.exp(0.7) * correlation * (label[rows][:, None] == label[rows]))
     covariance += columns.values[rows] * columns.prior_sd**2 @ columns.values[rows].T
-    found = evidence.at(evidence.rotated(z), evidence.rotated(columns.values), columns.prior_sd, theta)
+    own = evidence.rotated(z), evidence.rotated(columns.values), columns.prior_sd
+    found, slope = evidence.at(*own, theta)
     assert found == pytest.approx(multivariate_normal.logpdf(z[rows], cov=covariance), abs=1e-6)
+    numerical = approx_fprime(theta, lambda each: evidence.at(*own, each)[0], 1e-6)
+    np.testing.assert_allclose(slope, numerical, rtol=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_variances_are_the_likeliest(seed):
+    rng = np.random.default_rng(seed)
+    label, position_m, z = field(rng, 10 ** rng.uniform(-1.5, 1.0), 60.0)
+    evidence = CorrelatedEvidence.fit(label, position_m, 3 * z, NOTHING, 0)
+    columns = evidence.rotated(rng.normal(size=(240, 5)))
+    own = evidence.rotated(3 * z), columns, np.ones(5)
+    found, theta = evidence.of_rotated(*own)
+    scan = [evidence.at(*own, np.array([noise, field]))[0] for noise in np.linspace(-3, 4, 36)
+            for field in np.linspace(-7, 7, 29)]
+    assert found == pytest.approx(evidence.at(*own, theta)[0], abs=1e-6)
+    assert max(scan) < found + 0.05
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -67,7 +85,7 @@ def test_information_is_twice_the_expected_log_likelihood_ratio():
     for seed in range(40):
         _, _, z = field(np.random.default_rng(seed), 1.0, evidence.length_m)
         without, exact = evidence.rotated(z + 0.4 * pattern), evidence.rotated(z)
-        gains.append(evidence.at(exact, none, np.zeros(0), theta) - evidence.at(without, none, np.zeros(0), theta))
+        gains.append(evidence.at(exact, none, np.zeros(0), theta)[0] - evidence.at(without, none, np.zeros(0), theta)[0])
     assert np.mean(gains) == pytest.approx(0.5 * 0.4**2 * information, rel=0.25)
 
 
