@@ -9,6 +9,7 @@ folds are held out in turn (nested cross-validation).
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 
@@ -42,6 +43,7 @@ from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.stacking import combine, convex_weights
 from radiotwin.inference.student import mean_if_detected
 from radiotwin.links import LinkData
+from radiotwin.threads import in_threads
 
 HALF_M = 50.0  # distance to the nearest measurement at which near and far count the same
 PULL = 0.01  # towards the best single member, see `convex_weights`: 2 % of the RMSE
@@ -154,28 +156,31 @@ def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: S
     laws = [kind.name for kind in laws_for(links, criteria) if kind is not LogDistance]
     rest_too = [REST] if with_rest or model.shadowing else []
     names = [NAMED, *FORESTS, *TREES_ALONE, *rest_too, *laws]
-    members, share = np.full((len(links), len(names)), np.nan), np.ones(len(links))
-    mean_db = np.full(len(links), np.nan)
-    learnt: _Learnt | None = None
-    for number, (fold, fit, part) in enumerate(zip(model.folds, model.fits[1:], parts,
-                                                   strict=True)):
-        rest = None
+
+    def of_fold(number: int) -> tuple[_Learnt, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Return what is learnt outside a fold; its rows (m,), members, shares and prediction."""
+        fold, fit, part, rest = model.folds[number], model.fits[number + 1], parts[number], None
         if REST in names:
             rest = model.shadowing[number + 1] if model.shadowing else CorrelatedShadowing.fit(
                 fold, fit, seed)
         learnt = _Learnt(fold, fit, rest, kriging[number] if kriging else None, part, names)
         test = np.flatnonzero((model.index == number) & fold.usable)
-        share[test] = shares_of(part.links, fold.train, test)
-        members[test] = np.column_stack([
-            physics_db(fold, fit, rest, part, test, seed),
-            *(baselines[name][test] for name in laws)])
+        share = shares_of(part.links, fold.train, test)
+        members = np.column_stack([physics_db(fold, fit, rest, part, test, seed),
+                                   *(baselines[name][test] for name in laws)])
         others = [(number + step) % count for step in range(1, count)][:INNER_FOLDS]
-        mean_db[test] = combine(members[test], share[test], _weights(
-            *learnt.held_out(model.index, others, seed)[:2], names))
+        weights = _weights(*learnt.held_out(model.index, others, seed)[:2], names)
+        return learnt, test, members, share, combine(members, share, weights)
+
+    members, share = np.full((len(links), len(names)), np.nan), np.ones(len(links))
+    mean_db = np.full(len(links), np.nan)
+    with warnings.catch_warnings():  # whose filters threads leave as another one had them
+        folds = in_threads(of_fold, range(count))
+    for _, test, *found in folds:
+        members[test], share[test], mean_db[test] = found
+    far_db, far_share, far_scale_db, far_rows = folds[-1][0].held_out(
+        _quadrant(links), [0, 1, 2, 3], seed)
     error_db = links.level_db[:, None] - members
-    far_db, far_share, far_scale_db, far_rows = learnt.held_out(
-        _quadrant(links), [0, 1, 2, 3], seed) if learnt else (
-        error_db[:0], share[:0], share[:0], model.index[:0])
     weights = _weights(np.vstack([error_db, far_db]), np.concatenate([share, far_share]), names)
     away = np.column_stack([combine(far_db, far_share, weights) / far_scale_db, far_share,
                             model.index[far_rows]])

@@ -107,11 +107,13 @@ class Trend:
         weight = count / len(nodes)
         turn = self.basis[i] - self.basis[j]
         left = [1 - 0.5 * (turn * turn).sum(axis=1)]
-        to_nodes_m, between_m = (cdist(each, own_m[nodes]) for each in (own_m[used], own_m[nodes]))
-        apart_m = _apart_m(own_m, i, j)
-        for length_m in lengths_m:
-            common = np.exp(-to_nodes_m / length_m) @ self.basis[nodes] * weight
-            both = self.basis[nodes].T @ np.exp(-between_m / length_m) @ self.basis[nodes]
+        # In single precision, which is good to a few millionths here and takes a third of the time.
+        to_nodes_m, between_m = (cdist(each, own_m[nodes]).astype(np.float32)
+                                 for each in (own_m[used], own_m[nodes]))
+        basis, apart_m = self.basis[nodes].astype(np.float32), _apart_m(own_m, i, j)
+        for length_m in lengths_m.astype(np.float32):
+            common = np.exp(to_nodes_m / -length_m) @ basis * weight
+            both = basis.T @ np.exp(between_m / -length_m) @ basis
             left.append(1 - np.exp(-apart_m / length_m)
                         - (turn * (common[a] - common[b])).sum(axis=1)
                         + 0.5 * weight**2 * ((turn @ both) * turn).sum(axis=1))

@@ -41,6 +41,7 @@ FOLLOWED_SHARE, MIN_FOLLOWED, MAX_FOLLOWED = 0.12, 16, 40  # of the cells
 DESCENTS, DESCENTS_APART_M = 2, 15.0
 STEPS_M = (4.0, 2.0, 1.0, 0.5)
 AROUND_M = (14.0, 7.0)  # rings about where a descent has ended, in case it was a local minimum
+RAYS = 10_000  # from each position, 2 degrees apart: ten times as many find the same places
 DOF = 4.0
 MAX_MISFIT = 4.0  # square of how many times the errors of other devices
 CREDIBLE = 0.9
@@ -169,7 +170,7 @@ class Relocation:
         if missing:
             new_m = ends_m[list(missing.values())]
             followed = path_powers(city, np.array([position_m]), new_m,
-                                   np.zeros(len(new_m), int), frequency_hz, "vertical")
+                                   np.zeros(len(new_m), int), frequency_hz, "vertical", rays=RAYS)
             known.update(zip(missing, followed.total.tolist(), strict=True))
         return np.array([known[key] for key in hashes])
 

@@ -9,7 +9,12 @@ import numpy as np
 from radiotwin.paths.edges import extract_edges
 from radiotwin.paths.facets import extract_facets
 from radiotwin.paths.images import Candidates
-from radiotwin.paths.shooting import FacetSequences, device_sequences, edge_sequences
+from radiotwin.paths.shooting import (
+    DEVICE_RAYS,
+    FacetSequences,
+    device_sequences,
+    edge_sequences,
+)
 from radiotwin.paths.surfaces import OFFSET, pack
 from radiotwin.paths.topology import build_topology, expand
 from radiotwin.paths.two_edges import FacetEdges
@@ -53,7 +58,7 @@ class CandidateSearch:
         self._city, self._depth = city, depth
         self._after = np.empty((0, depth - 1), dtype=int)
         self._first_after, self._end_after = np.full((2, len(self.edges)), -1)
-        self._remembered: OrderedDict[bytes, Candidates] = OrderedDict()
+        self._remembered: OrderedDict[tuple[bytes, int], Candidates] = OrderedDict()
         self._one_at_a_time = Lock()
         facet = self.edges.facet.ravel()
         edge = np.repeat(np.arange(len(self.edges)), 2)
@@ -61,21 +66,22 @@ class CandidateSearch:
         self.facet_edges = FacetEdges(self.facets.of_face, edge[order], np.searchsorted(
             facet[order], np.arange(len(self.facets) + 2)))
 
-    def candidates(self, device_m: np.ndarray) -> Candidates:
+    def candidates(self, device_m: np.ndarray, rays: int = DEVICE_RAYS) -> Candidates:
         """Find the sequences from a device, those without an edge first, and remember them.
 
         Args:
             device_m: (3,) position [m].
+            rays: that are shot from it.
 
         Returns:
             All sequences of up to `depth` interactions that are worth trying.
         """
-        key = np.asarray(device_m, dtype=float).tobytes()
+        key = np.asarray(device_m, dtype=float).tobytes(), rays
         with self._one_at_a_time:
             if key in self._remembered:
                 self._remembered.move_to_end(key)
                 return self._remembered[key]
-        found = self._find(device_m)
+        found = self._find(device_m, rays)
         with self._one_at_a_time:
             self._remembered[key] = found
             while len(self._remembered) > 1 and sum(
@@ -84,9 +90,10 @@ class CandidateSearch:
                 self._remembered.popitem(last=False)
         return found
 
-    def _find(self, device_m: np.ndarray) -> Candidates:
+    def _find(self, device_m: np.ndarray, rays: int) -> Candidates:
         normal, offset_m = self.surfaces.planes[:, :3], self.surfaces.planes[:, OFFSET]
-        sequences = device_sequences(self._city, self.facets, normal, device_m, self._depth)
+        sequences = device_sequences(self._city, self.facets, normal, device_m, self._depth,
+                                     rays)
         facing = np.flatnonzero(normal @ device_m > offset_m)
         single = np.full((len(facing), self._depth), -1)
         single[:, 0] = facing

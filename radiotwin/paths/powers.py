@@ -11,6 +11,7 @@ from radiotwin.paths.clearance import clear_paths
 from radiotwin.paths.coefficients import slabs_of
 from radiotwin.paths.fields import AVERAGE, VERTICAL, path_gains
 from radiotwin.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, find_paths
+from radiotwin.paths.shooting import DEVICE_RAYS
 from radiotwin.paths.two_edges import paths_over_two_edges, two_edge_gains
 from radiotwin.paths.wedges import LUEBBERS, SIONNA
 from radiotwin.progress import progress
@@ -69,7 +70,7 @@ COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-2]
 def path_powers(
     city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray,
     frequency_hz: float, polarisation: str = "average", depth: int = 4,
-    wedge: str = "sionna",
+    wedge: str = "sionna", rays: int = DEVICE_RAYS,
 ) -> PathPowers:
     """Follow the paths from devices to receivers and add up their powers.
 
@@ -88,6 +89,7 @@ def path_powers(
         depth: maximum number of interactions of a path, 1 to 6.
         wedge: coefficient of diffraction: `luebbers`, reciprocal and exact for conductors; or
             `sionna`, that of Sionna RT. See `radiotwin.paths.coefficients`.
+        rays: shot from each device to find what paths of several interactions visit.
 
     Returns:
         The powers of the n links.
@@ -99,7 +101,7 @@ def path_powers(
     device_m = np.asarray(device_m, dtype=float)
     receiver_m = np.ascontiguousarray(receiver_m, dtype=float)
     device = np.asarray(device)
-    _check(device_m, receiver_m, device, frequency_hz, polarisation, depth, wedge)
+    _check(device_m, receiver_m, device, frequency_hz, polarisation, depth, wedge, rays)
     wave_number = 2 * np.pi * frequency_hz / speed_of_light
     powers = np.zeros((len(COMPONENTS), len(receiver_m)))
     powers[0] = _direct(city, device_m[device], receiver_m, wave_number)
@@ -114,7 +116,7 @@ def path_powers(
     with progress("following paths", total=len(rows)) as advance:
         for row in rows:
             links = np.flatnonzero(device == row)
-            candidates = search.candidates(device_m[row])
+            candidates = search.candidates(device_m[row], rays)
             kind = _kinds(candidates, search.is_ground)
             cursor, ends_m = 0, receiver_m[links]
             while cursor < len(candidates.edge) * len(links):
@@ -176,7 +178,7 @@ def _kinds(candidates: Candidates, is_ground: np.ndarray) -> np.ndarray:
 
 def _check(
     device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray, frequency_hz: float,
-    polarisation: str, depth: int, wedge: str,
+    polarisation: str, depth: int, wedge: str, rays: int,
 ) -> None:
     for name, points_m in (("device_m", device_m), ("receiver_m", receiver_m)):
         if points_m.ndim != 2 or points_m.shape[1] != 3 or not np.isfinite(points_m).all():
@@ -196,3 +198,5 @@ def _check(
         raise BadInput(f"wedge is {wedge!r}; allowed are {', '.join(WEDGES)}")
     if not 1 <= depth <= MAX_INTERACTIONS:
         raise BadInput(f"depth is {depth}; allowed are 1 to {MAX_INTERACTIONS}")
+    if rays < 1:
+        raise BadInput(f"rays is {rays}; it must be 1 or more")

@@ -40,7 +40,7 @@ class FacetSequences:
     next_facets: np.ndarray
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def sphere(count: int) -> np.ndarray:
     """Return (count, 3) unit vectors of a Fibonacci lattice (Gonzalez, Math. Geosci. 42, 2010)."""
     z = 1 - (2 * np.arange(count) + 1) / count
@@ -52,7 +52,8 @@ def sphere(count: int) -> np.ndarray:
 
 
 def device_sequences(
-    city: CityMap, facets: Facets, normal: np.ndarray, device_m: np.ndarray, depth: int
+    city: CityMap, facets: Facets, normal: np.ndarray, device_m: np.ndarray, depth: int,
+    rays: int = DEVICE_RAYS,
 ) -> FacetSequences:
     """Find the sequences of facets that rays from a device visit.
 
@@ -62,11 +63,12 @@ def device_sequences(
         normal: (f + 1, 3) of `Surfaces`.
         device_m: (3,) position [m].
         depth: maximum number of facets of a sequence.
+        rays: that are shot.
 
     Returns:
         The sequences of up to `depth` facets.
     """
-    direction = sphere(DEVICE_RAYS)
+    direction = sphere(rays)
     start_m = np.broadcast_to(device_m, direction.shape)
     return _shoot(city, facets, normal, start_m, direction, np.zeros(len(direction), dtype=int), 1,
                   depth)

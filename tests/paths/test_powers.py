@@ -148,6 +148,16 @@ def test_chunks_change_nothing(town, links, monkeypatch):
     assert np.array_equal(stacked(one), stacked(many))
 
 
+def test_a_tenth_of_the_rays_finds_nearly_all_power(town, links):
+    device_m, receiver_m, device = links
+    many = path_powers(town(0.3), device_m, receiver_m, device, FREQUENCY_HZ)
+    few = path_powers(town(0.3), device_m, receiver_m, device, FREQUENCY_HZ, rays=10_000)
+    assert (few.total <= many.total * (1 + 1e-9)).all()
+    reached = many.total > 0
+    lacking_db = 10 * np.log10(many.total[reached] / np.maximum(few.total[reached], 1e-30))
+    assert np.quantile(lacking_db, 0.9) < 0.1 and lacking_db.max() < 3.0
+
+
 def test_subdivided_walls_change_nothing(box_mesh, city_of, links):
     device_m, receiver_m, device = links
     mesh = trimesh.util.concatenate([box_mesh(20, 5, 60, 30, 25), box_mesh(15, -40, 55, -12, 30)])
@@ -178,6 +188,7 @@ def test_more_interactions_only_add(town, links):
     ({"device_m": np.zeros((1, 2))}, "device_m"), ({"receiver_m": np.full((2, 3), np.nan)}, "receiver_m"),
     ({"device": np.array([0])}, "device"), ({"device": np.array([0, 1])}, "rows"),
     ({"frequency_hz": 0.0}, "frequency"), ({"polarisation": "odd"}, "average"), ({"depth": 7}, "depth"), ({"wedge": "odd"}, "luebbers"),
+    ({"rays": 0}, "rays"),
 ])
 def test_bad_input(city_of, change, message):
     good = {"device_m": np.ones((1, 3)), "receiver_m": np.full((2, 3), 40.0), "device": np.array([0, 0]),
