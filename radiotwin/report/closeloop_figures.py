@@ -134,7 +134,7 @@ def dependence_figure(data: LoopData) -> Figure:
         handles = dict(zip(*figure.axes[0].get_legend_handles_labels()[::-1]))
         shown = [label for label in ("before", "after", CONTRIBUTION) if label in handles]
         figure.legend([handles[label] for label in shown], shown, loc="outside upper center",
-                      ncols=3, frameon=False)
+                      ncols=min(columns + 1, 3), frameon=False)  # one panel has room for two
     else:
         figure.text(0.5, 0.5, "no variable could be tested", ha="center", va="center", fontsize=12)
     return figure

@@ -1,5 +1,7 @@
 """The figures of a close-loop: one for each effect, whatever was found and however names are written."""
 
+import dataclasses
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -28,7 +30,7 @@ from radiotwin.effects.tilted_dipole import TiltedDipole
 from radiotwin.measurements import Measurements
 from radiotwin.report.binning import bin_index, bin_means
 from radiotwin.report.closeloop_data import collect
-from radiotwin.report.closeloop_figures import write_closeloop_figures
+from radiotwin.report.closeloop_figures import dependence_figure, write_closeloop_figures
 from radiotwin.report.closeloop_maps import residual_map_figure
 from radiotwin.report.closeloop_page import write_closeloop_page
 from radiotwin.report.effect_figures import effect_figure
@@ -99,6 +101,17 @@ def test_every_figure_is_written_without_a_map(loop, tmp_path):
     assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in found)
     write_closeloop_page(content, tmp_path, "page")
     assert (tmp_path / "closeloop.html").read_text().count("data:image/png;base64,") == 5
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_legend_of_the_dependences_is_not_cut_off(loop, count):
+    data = collect(loop)
+    names = ["receiver", "distance_m", "elevation_deg"][:count]
+    figure = dependence_figure(dataclasses.replace(data, drivers=names))
+    figure.canvas.draw()
+    [legend], whole = figure.legends, figure.bbox
+    assert len(figure.axes) == count and len(legend.get_texts()) == 3
+    assert whole.x0 <= legend.get_window_extent().x0 and legend.get_window_extent().x1 <= whole.x1
 
 
 def test_figures_where_nothing_was_found_and_nothing_could_be_tested(loop, tmp_path):
