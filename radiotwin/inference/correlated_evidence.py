@@ -27,7 +27,8 @@ MIN_POINTS = 3  # of a part that says anything
 # Of correlation [m]: shadowing decorrelates within 10 to 50 m (3GPP TR 38.901, Table 7.5-6). Longer
 # ones would explain whatever an antenna or a wrong position does to a device's levels.
 LENGTHS_M = (5.0, 12.0, 30.0)
-PRECISION = {"maxfun": 60, "ftol": 1e-7, "gtol": 0.05}  # about 0.001 nats; 8 evaluations are common
+# Along a weak field the likelihood is flat: no slope may be left that adds up to a nat.
+PRECISION = {"maxfun": 60, "ftol": 1e-8, "gtol": 0.001}
 START = np.array([0.0, -1.0])  # logarithms: noise variance, field over noise
 BOUNDS = np.array([[-6.0, -7.0], [6.0, 7.0]])
 

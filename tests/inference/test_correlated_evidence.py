@@ -51,7 +51,7 @@ def test_the_variances_are_the_likeliest(seed):
     scan = [evidence.at(*own, np.array([noise, field]))[0] for noise in np.linspace(-3, 4, 36)
             for field in np.linspace(-7, 7, 29)]
     assert found == pytest.approx(evidence.at(*own, theta)[0], abs=1e-6)
-    assert max(scan) < found + 0.05
+    assert max(scan) < found + 0.01
 
 
 @pytest.mark.parametrize("seed", range(4))
