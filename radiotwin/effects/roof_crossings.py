@@ -9,7 +9,7 @@ import numpy as np
 
 from radiotwin.effects.boxes import Box, cross, two_edges_db
 from radiotwin.effects.mapped_buildings import building_extents_m, buildings
-from radiotwin.scene.citymap import CityMap
+from radiotwin.scene.citymap import DOWN, CityMap
 
 SAMPLES = 24  # points of a link over the box around a building
 END_M = 2.0  # a building closer to an end of a link than this belongs to that end
@@ -92,7 +92,7 @@ def _roof_over_m(city: CityMap, points_m: np.ndarray, is_mine: np.ndarray) -> np
     """Return how far some faces (f,) lie above points (n, 3), seen from above; NaN beside them."""
     top_m = float(city.vertices[:, 2].max()) + 1.0
     above_m = np.column_stack([points_m[:, :2], np.full(len(points_m), top_m)])
-    distance_m, face, _ = city.first_hits(above_m, above_m - [0.0, 0.0, 1.0], infinite=True)
+    distance_m, face, _ = city.first_hits_towards(above_m, DOWN)
     return np.where((face >= 0) & is_mine[face], top_m - distance_m - points_m[:, 2], np.nan)
 
 

@@ -22,6 +22,7 @@ from radiotwin.scene.vegetation import Vegetation
 SKIN_M = 0.01  # step past a surface before the next is looked for [m]
 GROUND_M = 0.05  # faces this close to z = 0 are the ground [m]
 CHUNK = 1_000_000  # rays per call: bounds the memory of any query to about 100 MB
+DOWN = np.array([0.0, 0.0, -1.0])
 CONCRETE = Material("concrete", itu="concrete")  # of faces whose material is not known
 
 
@@ -185,7 +186,7 @@ class CityMap:
         """
         x_m, y_m = np.broadcast_arrays(x_m, y_m)
         above = np.column_stack([x_m.ravel(), y_m.ravel(), np.full(x_m.size, self._top_m)])
-        distance, face, _ = self.first_hits(above, above - [0, 0, 1], infinite=True)
+        distance, face, _ = self.first_hits_towards(above, DOWN)
         height = np.where(face >= 0, self._top_m - distance, 0.0)
         return height.reshape(x_m.shape)
 
@@ -225,7 +226,7 @@ class CityMap:
             above = np.column_stack([
                 np.clip(points_m[left] + aside_m * np.array([0.8, 0.6]), low_m + SKIN_M,
                         high_m - SKIN_M), np.full(len(left), ground._top_m)])
-            far_m = ground.first_hits(above, above - [0, 0, 1], infinite=True)[0]
+            far_m = ground.first_hits_towards(above, DOWN)[0]
             height_m[left] = np.where(np.isfinite(far_m), ground._top_m - far_m, np.nan)
         left = np.flatnonzero(np.isnan(height_m))  # in a hole of a terrain that was made elsewhere
         if len(left):
@@ -304,36 +305,36 @@ class CityMap:
             travelled[ray] = at + SKIN_M
             ray = ray[travelled[ray] < length[ray]]
 
-    def first_hits(self, a_m: np.ndarray, b_m: np.ndarray, infinite: bool = False
+    def first_hits(self, a_m: np.ndarray, b_m: np.ndarray
                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find the first surface on the way from a to b.
 
         Args:
             a_m: (n, 3) starts [m].
             b_m: (n, 3) ends [m].
-            infinite: Whether the ray goes on beyond b.
 
         Returns:
             (n,) distance from a [m] (infinite: none), (n,) face (-1: none), and (n,) direction
             times normal, negative where the ray enters a solid.
         """
         a_m, b_m = np.asarray(a_m, dtype=float), np.asarray(b_m, dtype=float)
-        direction, length = _rays(a_m, b_m)
-        return self._hits(a_m, direction, np.full(len(a_m), np.inf) if infinite else length)
+        offset = b_m - a_m
+        length = np.linalg.norm(offset, axis=1)
+        return self.first_hits_towards(a_m, offset / np.maximum(length, 1e-12)[:, None], length)
 
-    def first_hits_towards(self, start_m: np.ndarray, direction: np.ndarray
+    def first_hits_towards(self, start_m: np.ndarray, direction: np.ndarray,
+                           length_m: np.ndarray | float = np.inf
                            ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Find the first surface in some directions, however far; returns those of `first_hits`.
+        """Find the first surface in some directions; returns those of `first_hits`.
 
         Args:
             start_m: (n, 3) [m].
-            direction: (n, 3) unit vectors.
+            direction: (n, 3), or one, unit vectors.
+            length_m: (n,), or one, how far to look [m].
         """
-        return self._hits(start_m, direction, np.full(len(start_m), np.inf))
-
-    def _hits(self, start_m: np.ndarray, direction: np.ndarray, length_m: np.ndarray
-              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         n = len(start_m)
+        direction = np.broadcast_to(direction, (n, 3))
+        length_m = np.broadcast_to(length_m, n)
         distance, face, cosine = np.full(n, np.inf), np.full(n, -1), np.zeros(n)
         for start in range(0, n, CHUNK):
             part = slice(start, start + CHUNK)
@@ -346,10 +347,3 @@ class CityMap:
             distance[start + hit] = found["tfar"][hit]
             cosine[start + hit] = np.einsum("ij,ij->i", towards[hit], self._normals[faces])
         return distance, face, cosine
-
-
-def _rays(a_m: np.ndarray, b_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return unit directions (n, 3) and lengths (n,) of segments."""
-    offset = b_m - a_m
-    length = np.linalg.norm(offset, axis=1)
-    return offset / np.maximum(length, 1e-12)[:, None], length
