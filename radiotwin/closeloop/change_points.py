@@ -1,10 +1,11 @@
-"""Steps in time between flights: a held-out flight cannot show them, positions in all flights can.
+"""Changes between flights: a held-out flight cannot show them, positions in all flights can.
 
 Where a receiver or a device changed after its first flight, that flight held out leaves nothing
 that shows it, and the others held out are predicted well by each other. So these candidates are
 scored on blocks of ground that are held out in all flights at once, with the effects that were
-found already. Positions cannot tell a step from flights that differ anyhow, so it must also be
-larger than flights of all receivers, or all devices, differ.
+found already. A warm-up over the first flight and ageing change the level between flights, too:
+the form is the one that explains most. Positions cannot tell a change from flights that differ
+anyhow, so it must also be larger than flights of all receivers, or all devices, differ.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from radiotwin.closeloop.cross_validation import (
     cross_validate,
     training_parts,
 )
-from radiotwin.closeloop.effect_size import effect_size_db
+from radiotwin.closeloop.effect_size import effect_size_db, why_not_borne_out
 from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.scoring import (
     Candidate,
@@ -39,7 +40,7 @@ from radiotwin.links import LinkData, evidence_blocks
 
 def select_change_points(result: SelectionResult, links: LinkData, base: Base, folds: Folds,
                          seed: int, on_progress: Callable[[str], None]) -> None:
-    """Add steps in time to a model whose folds are flights, one after the other, until none passes.
+    """Add changes in time to a model whose folds are flights, one by one, until none passes.
 
     Args:
         result: is extended.
@@ -56,7 +57,7 @@ def select_change_points(result: SelectionResult, links: LinkData, base: Base, f
 
 def _select_one_kind(result: SelectionResult, effect: ReceiverDrift | DeviceDrift, links: LinkData,
                      base: Base, seed: int, on_progress: Callable[[str], None]) -> None:
-    """Add steps of receivers, or of devices."""
+    """Add changes of receivers, or of devices."""
     criteria = result.criteria
     first = fit_candidate(result.model, effect, 0, criteria)
     if not _stands_out(result.model, first, criteria):
@@ -77,11 +78,9 @@ def _select_one_kind(result: SelectionResult, effect: ReceiverDrift | DeviceDrif
         if extended is None:
             result.scores.append(score)
             return
-        size_db = effect_size_db(extended, step)
-        if not size_db.low > 0:
-            result.scores.append(replace(score, passed=False, reason=(
-                "links that are held out may show nothing of it: "
-                f"{size_db.value:.1f} dB ({size_db.low:.1f} to {size_db.high:.1f})")))
+        why = why_not_borne_out(effect_size_db(extended, step))
+        if why:
+            result.scores.append(replace(score, passed=False, reason=why))
             return
         model = extended
         params = candidate.whole.effects[-1].params
@@ -99,7 +98,7 @@ def located_links(model: CrossValidatedModel, links: LinkData, base: Base) -> Li
 
 def _stands_out(model: CrossValidatedModel, candidate: Candidate | CandidateScore,
                 criteria: SelectionCriteria) -> bool:
-    """Return whether a step is larger than flights of all receivers, or all devices, differ.
+    """Return whether a change is larger than flights of all receivers, or all devices, differ.
 
     Student's t with their pooled standard deviation, corrected for the number of ends and of
     intervals between flights.
@@ -108,12 +107,17 @@ def _stands_out(model: CrossValidatedModel, candidate: Candidate | CandidateScor
         return False
     effect, params = candidate.effect, candidate.whole.effects[-1].params
     assert isinstance(effect, ReceiverDrift | DeviceDrift)
-    ((changed, (_, when_s)),) = effect.drifts(params).items()
+    ((changed, drift),) = effect.drifts(params).items()
     view = model.whole.view(model.fits[0])
     links = view.links
     seen = np.isfinite(links.level_db) & np.isfinite(links.time_s)
     end = effect.index(links)
-    group = np.where((end == changed) & (links.time_s >= when_s), -1, end)[seen]
+    # Flights are before or after it, whole: a warm-up is over, by two thirds, after its constant.
+    when_s = drift.number + (links.first_s if drift.form == "warm_up" else 0.0)
+    _, member = np.unique(links.flight[seen], return_inverse=True)
+    begins_s = np.full(member.max() + 1, np.inf)
+    np.minimum.at(begins_s, member, links.time_s[seen])
+    group = np.where((end[seen] == changed) & (begins_s[member] >= when_s), -1, end[seen])
     cells, cell = np.unique(np.column_stack([group, links.flight[seen]]), axis=0,
                             return_inverse=True)
     # Plain means: where all of a flight is off, its links are no outliers.

@@ -57,6 +57,14 @@ def effect_size_db(model: CrossValidatedModel, number: int) -> Parameter:
     return Parameter(float(value), float(low), float(high), "dB")
 
 
+def why_not_borne_out(size_db: Parameter) -> str:
+    """Return why an effect of this size is not named; "" where there is no reason."""
+    if size_db.low > 0 or np.isnan(size_db.value):
+        return ""
+    return ("links that are held out may show nothing of it: "
+            f"{size_db.value:.1f} dB ({size_db.low:.1f} to {size_db.high:.1f})")
+
+
 def _held_out(model: CrossValidatedModel, number: int
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return of each link (n,), as its fold has it, what `effect_size_db` is a regression of.

@@ -22,6 +22,7 @@ from radiotwin.closeloop.cross_validation import (
     same_effects,
     training_parts,
 )
+from radiotwin.closeloop.effect_size import effect_size_db, why_not_borne_out
 from radiotwin.closeloop.folds import Folds, make_folds
 from radiotwin.closeloop.posterior import judge
 from radiotwin.closeloop.scoring import (
@@ -74,6 +75,9 @@ def select_faults(result: SelectionResult, effects: list[Effect], links: LinkDat
             if extended is not None:
                 score = replace(score, evidence_nats=candidate.evidence)
                 score = judge([score], model, hypotheses, result.criteria)[0][0]
+            if extended is not None and not score.reason:
+                size_db = effect_size_db(extended, step)
+                score = replace(score, reason=why_not_borne_out(size_db))
             if extended is not None and not score.reason:
                 kept = candidate
                 model = extended

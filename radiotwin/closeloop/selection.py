@@ -13,6 +13,7 @@ import numpy as np
 
 from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import CrossValidatedModel
+from radiotwin.closeloop.effect_size import effect_size_db, why_not_borne_out
 from radiotwin.closeloop.hypotheses import Hypotheses
 from radiotwin.closeloop.moved_limits import with_moved_limits
 from radiotwin.closeloop.pairs import Passed, probable_together
@@ -132,7 +133,7 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
             if not passed:
                 together = probable_together(judged, result.model, result.steps[-1], block,
                                              len(available), seed, result.criteria, on_progress)
-                if together:
+                if together and _all_borne_out(together[-1].model, len(together)):
                     _keep_together(result, together, step)
                     continue
         if not passed:
@@ -204,16 +205,32 @@ def _score(result: SelectionResult, candidates: list[Candidate], available: list
 
 def _judged(result: SelectionResult, passed: list[Passed], hypotheses: Hypotheses,
             step: int) -> list[Passed]:
-    """Give all scores of a step their probabilities; return what passed with its own."""
+    """Give all scores of a step their probabilities; return what passed with its own.
+
+    What is probable is refused where held-out links may show nothing of it.
+    """
     here = [i for i, entry in enumerate(result.scores) if entry.step == step]
     judged, summary = judge([result.scores[i] for i in here], result.model,
                             hypotheses, result.criteria)
     result.steps = [*(each for each in result.steps if each.number < step), summary]
-    old = {id(result.scores[i]): score for i, score in zip(here, judged, strict=True)}
-    found = [replace(each, score=old[id(each.score)]) for each in passed]
+    place = {id(result.scores[i]): n for n, i in enumerate(here)}
+    found = []
+    for each in passed:
+        score = judged[place[id(each.score)]]
+        if not score.reason:
+            why = why_not_borne_out(effect_size_db(each.model, step))
+            score = judged[place[id(each.score)]] = replace(score, reason=why)
+        found.append(replace(each, score=score))
     for i, score in zip(here, judged, strict=True):
         result.scores[i] = score
     return found
+
+
+def _all_borne_out(model: CrossValidatedModel, last: int) -> bool:
+    """Return whether each of a model's last effects is larger than nothing at all."""
+    count = len(model.whole.effects)
+    return not any(why_not_borne_out(effect_size_db(model, number))
+                   for number in range(count - last, count))
 
 
 def _keep_together(result: SelectionResult, found: list[Passed], step: int) -> None:
@@ -308,7 +325,7 @@ def _several(rival: Passed, block: np.ndarray, hypotheses: Hypotheses | None, se
         score = replace(score, probability=rival.score.probability)
         steps.append((score, extended))
         if sum(score.held_out_nats for score, _ in steps) > min_nats:
-            return steps
+            return steps if _all_borne_out(extended, len(steps)) else None
     return None
 
 

@@ -82,7 +82,9 @@ class _GainDrift(GainEffect):
 
     @property
     def _forms(self) -> tuple[str, ...]:
-        return ("step",) if self._between_flights else self.forms
+        # What each flight repeats is no difference between flights.
+        again = "warm_up_each_flight" if self._between_flights else None
+        return tuple(form for form in self.forms if form != again)
 
     def index(self, links: LinkData) -> np.ndarray:
         """Return the index (n,) of the receiver or device of each link."""

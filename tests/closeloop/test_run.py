@@ -68,6 +68,15 @@ def test_a_step_after_the_first_flight_is_found_though_no_other_flight_shows_it(
     assert 59 <= value(report, "receiver_drift", "step_time_s[r1]") <= 200
 
 
+def test_a_warm_up_that_only_the_first_flight_shows_is_no_step(open_ground):
+    world = open_ground.fly(7)
+    world.gain_db[world.receiver == 1] -= 12.0 * np.exp(-world.time_s[world.receiver == 1] / 40.0)
+    report = run(open_ground.measured(world))
+    assert named(report) == ["receiver_drift"]
+    assert value(report, "receiver_drift", "warm_up_db[r1]") == pytest.approx(-12.0, abs=2.0)
+    assert value(report, "receiver_drift", "time_constant_s[r1]") == pytest.approx(40.0, abs=10.0)
+
+
 def test_a_device_that_has_changed_is_named(open_ground):
     world = open_ground.fly(10)
     world.gain_db[(world.device == 2) & (world.time_s > 530)] -= 7.0

@@ -100,6 +100,23 @@ def passed(name, nats, step=0, repeatable=False):
     return Passed(SimpleNamespace(name=name, repeatable=repeatable), score, MODEL)
 
 
+def test_what_may_be_nothing_at_all_is_not_named(open_ground, monkeypatch):
+    world = open_ground.fly(3)
+    world.gain_db[world.receiver == 1] += 6.0
+    measured = selection.effect_size_db
+
+    def uncertain(model, number):
+        size_db = measured(model, number)
+        assert size_db.low > 0
+        return replace(size_db, low=size_db.value - 20.0, high=size_db.value + 20.0)
+
+    monkeypatch.setattr(selection, "effect_size_db", uncertain)
+    loop = close_loop(open_ground.measured(world), base="log-distance")
+    assert loop.verdict != "effect" and not [each for each in loop.after.whole.effects if each.effect.is_cause]
+    (score, *_) = [each for each in loop.selection.scores if each.name == "receiver_gain_offset"]
+    assert not score.kept and "may show nothing of it: 3.0 dB (-17.0 to 23.0)" in score.reason
+
+
 @pytest.fixture
 def keep_best(monkeypatch):
     """Function that keeps the best of some candidates; `several` is what is found of one kind."""
