@@ -74,7 +74,8 @@ def _select_one_kind(result: SelectionResult, effect: ReceiverDrift | DeviceDrif
         candidate = fit_candidate(model, effect, step, criteria)
         if isinstance(candidate, CandidateScore) or not _stands_out(model, candidate, criteria):
             return
-        score, extended = score_candidate(model, candidate, block, 1, step, seed, criteria)
+        score, extended = score_candidate(model, candidate, block, 1, step, seed, criteria,
+                                          result.executor)
         if extended is None:
             result.scores.append(score)
             return

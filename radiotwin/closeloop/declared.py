@@ -47,7 +47,8 @@ def _take_best(result: SelectionResult, forms: list[Effect], block: np.ndarray, 
     for effect in forms:
         on_progress(effect.variant)
         criteria = result.criteria if effect.is_cause else result.criteria.of_no_claim
-        score, extended = fit_and_score(before, effect, block, len(forms), step, seed, criteria)
+        score, extended = fit_and_score(before, effect, block, len(forms), step, seed, criteria,
+                                        result.executor)
         tried.append(score)
         if extended is not None:
             passed.append((effect, score, extended))

@@ -71,7 +71,8 @@ def select_faults(result: SelectionResult, effects: list[Effect], links: LinkDat
             on_progress(f"step {step + 1}: {candidate.effect.name}, held out within flights")
             model = model or _within_flights(result, links, base, seed)
             score, extended = fit_and_score(model, candidate.effect, evidence_blocks(model.links),
-                                            len(timed), step, seed, result.criteria)
+                                            len(timed), step, seed, result.criteria,
+                                            result.executor)
             if extended is not None:
                 score = replace(score, evidence_nats=candidate.evidence)
                 score = judge([score], model, hypotheses, result.criteria)[0][0]

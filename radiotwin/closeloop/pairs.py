@@ -20,6 +20,7 @@ from radiotwin.closeloop.hypotheses import Hypotheses
 from radiotwin.closeloop.posterior import Step, probability_of_all
 from radiotwin.closeloop.scoring import CandidateScore, fit_and_score
 from radiotwin.effects.base import Effect
+from radiotwin.execution import Executor
 
 MIN_SHARE = 0.5  # of the probability that is needed, for the first of two
 MAX_SECONDS = 2  # effects that are tried beside it
@@ -36,7 +37,7 @@ class Passed:
 
 def probable_together(passed: Sequence[Passed], before: CrossValidatedModel, step: Step,
                       block: np.ndarray, tried: int, seed: int, criteria: SelectionCriteria,
-                      on_progress: Callable[[str], None]) -> list[Passed]:
+                      executor: Executor, on_progress: Callable[[str], None]) -> list[Passed]:
     """Return effects that are probable together, in order; none where there are none.
 
     Args:
@@ -47,6 +48,7 @@ def probable_together(passed: Sequence[Passed], before: CrossValidatedModel, ste
         tried: number of candidates.
         seed: of permutations.
         criteria: that decide.
+        executor: where folds are fitted.
         on_progress: called with what is being done.
     """
     ranked = sorted(passed, key=lambda each: -each.score.probability)
@@ -64,7 +66,7 @@ def probable_together(passed: Sequence[Passed], before: CrossValidatedModel, ste
         longer = []
         for effect in effects:
             score, extended = fit_and_score(model, effect, block, tried, number, seed, criteria,
-                                            hypotheses)
+                                            executor, hypotheses)
             if extended is not None:
                 longer.append([*found, Passed(effect, score, extended)])
         return longer

@@ -11,9 +11,10 @@ from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.closeloop.ends import ends_of
 from radiotwin.closeloop.hypotheses import Hypotheses, is_judged_by_levels
 from radiotwin.effects.base import Effect
-from radiotwin.effects.fitting import add_effect
+from radiotwin.effects.fitting import add_effect, prepare_additions
 from radiotwin.effects.fold_model import FittedEffect, FoldModel
 from radiotwin.effects.params import EffectParams
+from radiotwin.execution import Executor
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.evidence import cross_fit_p_value, sign_flip_p_value
 
@@ -124,7 +125,7 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
 
 
 def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.ndarray, tried: int,
-                    step: int, seed: int, criteria: SelectionCriteria,
+                    step: int, seed: int, criteria: SelectionCriteria, executor: Executor,
                     ) -> tuple[CandidateScore, CrossValidatedModel | None]:
     """Fit a candidate to each fold's training links, and score it on the others.
 
@@ -136,6 +137,7 @@ def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.
         step: number of effects that are there.
         seed: of permutations.
         criteria: that decide.
+        executor: where folds are fitted.
 
     Returns:
         the score, and the model with it; None where it does not pass.
@@ -145,6 +147,7 @@ def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.
                           candidate.fit.coefficients[candidate.whole.coefficient_slices[-1]])
     devices, receivers = ends_of(fitted, model.links)
     like = candidate.whole.effects[-1].params
+    prepare_additions(model.folds, model.fits[1:], [candidate.effect], executor, like)
     for each, fit in zip(model.folds, model.fits[1:], strict=True):
         extended_fold, extended_fit = add_effect(each, candidate.effect, fit, like) or (each, fit)
         models.append(extended_fold)
@@ -159,14 +162,14 @@ def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.
 
 
 def fit_and_score(model: CrossValidatedModel, effect: Effect, block: np.ndarray, tried: int,
-                  step: int, seed: int, criteria: SelectionCriteria,
+                  step: int, seed: int, criteria: SelectionCriteria, executor: Executor,
                   hypotheses: Hypotheses | None = None,
                   ) -> tuple[CandidateScore, CrossValidatedModel | None]:
     """Return `score_candidate` of `fit_candidate`; of one that is refused, no model."""
     candidate = fit_candidate(model, effect, step, criteria, hypotheses)
     if isinstance(candidate, CandidateScore):
         return candidate, None
-    return score_candidate(model, candidate, block, tried, step, seed, criteria)
+    return score_candidate(model, candidate, block, tried, step, seed, criteria, executor)
 
 
 def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score: CandidateScore,

@@ -132,7 +132,8 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
                 passed = [each for each in judged if not each.score.reason]
             if not passed:
                 together = probable_together(judged, result.model, result.steps[-1], block,
-                                             len(available), seed, result.criteria, on_progress)
+                                             len(available), seed, result.criteria, result.executor,
+                                             on_progress)
                 if together and _all_borne_out(together[-1].model, len(together)):
                     _keep_together(result, together, step)
                     continue
@@ -185,11 +186,9 @@ def _score(result: SelectionResult, candidates: list[Candidate], available: list
             on_progress(f"step {step + 1}: {effect.name}, held out")
             # One more of a kind needs no correction: that there is such a thing has been shown.
             more = any(each.effect is effect for each in result.model.whole.effects)
-            prepare_additions(result.model.folds, result.model.fits[1:], [effect], result.executor,
-                              candidate.whole.effects[-1].params)
             corrected_for = 1 if more else len(available)
             score, extended = score_candidate(result.model, candidate, block, corrected_for, step,
-                                              seed, result.criteria)
+                                              seed, result.criteria, result.executor)
         else:
             why = (f"{better.score.name} gains more on held-out links than this on those that it "
                    f"is fitted to ({candidate.gain:.0f} nats)")
@@ -262,7 +261,8 @@ def _keep_best(result: SelectionResult, passed: list[Passed], block: np.ndarray,
     if rival is not None and most > 1:
         on_progress(f"step {step + 1}: more of {rival.score.name}")
         least = first.score.held_out_nats
-        steps = _several(rival, block, hypotheses, seed, least, most, criteria) or steps
+        steps = _several(rival, block, hypotheses, seed, least, most, criteria,
+                         result.executor) or steps
     best, nats = steps[0][0], sum(score.held_out_nats for score, _ in steps)
     rivals = [each.score.name for each in passed
               if each.score.name != best.name and _alike(nats, each.score, criteria)]
@@ -305,7 +305,7 @@ def _on_one_mast(model: CrossValidatedModel) -> int:
 
 
 def _several(rival: Passed, block: np.ndarray, hypotheses: Hypotheses | None, seed: int,
-             min_nats: float, most: int, criteria: SelectionCriteria,
+             min_nats: float, most: int, criteria: SelectionCriteria, executor: Executor,
              ) -> list[tuple[CandidateScore, CrossValidatedModel]] | None:
     """Add an effect of which a step finds one again and again, until all have more than `min_nats`.
 
@@ -318,7 +318,7 @@ def _several(rival: Passed, block: np.ndarray, hypotheses: Hypotheses | None, se
         if hypotheses is not None:
             hypotheses = Hypotheses.of(extended.whole, extended.fits[0], seed)
         score, more = fit_and_score(extended, rival.effect, block, 1, score.step + 1, seed,
-                                    criteria, hypotheses)
+                                    criteria, executor, hypotheses)
         if more is None:
             return None
         extended = more

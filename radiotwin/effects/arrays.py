@@ -26,6 +26,10 @@ class LinkCache:
             known[key] = derive()
         return known[key]
 
+    def __reduce__(self) -> tuple[type, tuple[()]]:
+        """Leave all behind on the way to another process: weak references cannot be sent."""
+        return type(self), ()
+
     def state(self) -> None:
         """Decide nothing: what is remembered could be derived again."""
 

@@ -8,7 +8,6 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Generic
 
@@ -51,7 +50,8 @@ class Executor:
         """Run in other processes what this one will need, for it to find it in the cache.
 
         Without other processes, or where they are not worth it, nothing is done. A piece that
-        cannot be run there is left to this process, where its error shows.
+        cannot be run there is left to this process, where its error shows; that it could not is
+        said.
 
         Args:
             job: As of `run`.
@@ -61,8 +61,11 @@ class Executor:
         if self.is_worth_it:
             missing = deque(_Todo(piece, _nowhere) for piece in pieces if cache.get(piece) is None)
             if missing:
-                with suppress(RunFailed), progress(job.description, len(missing)) as advance:
-                    self._run_there(job, missing, cache, advance)
+                with progress(job.description, len(missing)) as advance:
+                    try:
+                        self._run_there(job, missing, cache, advance)
+                    except RunFailed as error:
+                        self._say_once(f"{error}. It is done in this process")
 
     def run(self, job: Job[P, R], pieces: Sequence[P], cache: Cache[P, R] | None = None
             ) -> list[R]:
@@ -123,12 +126,14 @@ class Executor:
         if not workers:
             return False
         self._has_workers = True
-        line = _said(job, workers, self._pool)
+        self._say_once(_said(job, workers, self._pool))
+        _Run(job, todo, cache, advance).on(workers)
+        return True
+
+    def _say_once(self, line: str) -> None:
         if line not in self._said:
             self._said.add(line)
             self._say(line)
-        _Run(job, todo, cache, advance).on(workers)
-        return True
 
 
 @dataclass

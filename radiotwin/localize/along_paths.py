@@ -126,7 +126,11 @@ class Relocation:
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out what was followed, and where: another process follows what it needs."""
-        return self.__dict__ | {"powers": WeakKeyDictionary(), "executor": Executor()}
+        return {name: value for name, value in self.__dict__.items()
+                if name not in ("powers", "executor")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, powers=WeakKeyDictionary(), executor=Executor())
 
     def _search(self, search: _Search, device: TwinDevice,
                 before: list[tuple[float, float]]) -> TwinDevice:

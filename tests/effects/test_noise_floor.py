@@ -12,6 +12,7 @@ from radiotwin.closeloop.selection import fit_candidate, score_candidate
 from radiotwin.effects.fitting import add_effect
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.noise_floor import NoiseFloor
+from radiotwin.execution import Executor
 from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.links import evidence_blocks
 
@@ -93,5 +94,5 @@ def test_links_with_line_of_sight_which_are_strong_need_not_show_it(flown):
     model = CrossValidatedModel(whole, folds, [each.fit() for each in (whole, *folds)], index, None)
     criteria = SelectionCriteria()
     candidate = fit_candidate(model, NoiseFloor(), 0, criteria)
-    score, extended = score_candidate(model, candidate, evidence_blocks(links), 20, 0, 0, criteria)
+    score, extended = score_candidate(model, candidate, evidence_blocks(links), 20, 0, 0, criteria, Executor())
     assert score.reason == "" and extended is not None

@@ -5,6 +5,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import SimpleNamespace
 
+import cloudpickle
 import numpy as np
 import pytest
 
@@ -49,6 +50,11 @@ def test_a_broken_one_warns_and_the_rest_works(installed):
         assert catalogue()[-1] is Hail
     first, second = (str(each.message) for each in warned)
     assert "broken" in first and "no_such_module" in first and "no_effect" in second
+
+
+@pytest.mark.parametrize("effect", registry.BUILT_IN, ids=lambda effect: f"{effect.name}-{effect.variant}")
+def test_every_effect_can_be_sent_to_another_process(effect):
+    assert type(cloudpickle.loads(cloudpickle.dumps(effect()))) is effect
 
 
 def test_a_taken_name_is_refused(installed):

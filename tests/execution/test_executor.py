@@ -9,6 +9,7 @@ import pytest
 
 from radiotwin.errors import BadInput, RunFailed
 from radiotwin.execution import Executor, Job, Resources, open_executor
+from radiotwin.execution.job import NoCache
 from radiotwin.threads import usable_cores
 from tests.execution.jobs import (
     PLACES,
@@ -211,6 +212,17 @@ def test_a_function_that_cannot_be_sent():
 
     with open_executor("2") as executor, pytest.raises(RunFailed, match="cannot be sent to another process"):
         executor.run(Job("locked", lambda number, lock=threading.Lock(): number), range(2))
+
+
+def test_what_cannot_be_run_ahead_elsewhere_is_said_once():
+    import threading
+
+    lines = []
+    with open_executor("2", say=lines.append) as executor:
+        for _ in range(2):
+            executor.run_ahead(Job("locked", lambda number, lock=threading.Lock(): number), range(2), NoCache())
+    (line,) = lines
+    assert line.startswith("locked") and "cannot be sent to another process" in line and "in this process" in line
 
 
 def test_this_process_is_the_default():

@@ -1,5 +1,6 @@
 """Unknown devices where paths put them, in a city traced by Sionna RT, whose code the paths do not share."""
 
+import cloudpickle
 import numpy as np
 import pandas as pd
 import pytest
@@ -71,6 +72,14 @@ def test_as_many_threads_as_there_are_find_the_same_to_the_bit(narrow_street, mo
         twins.append(fit_paths(links, Scene.load(RBM), law, relocation_from(scene, 100.0)))
     assert twins[0].devices == twins[1].devices
     assert found(twins[0], narrow_street.name)[0].tolist() != found(law, narrow_street.name)[0].tolist()
+
+
+def test_what_was_followed_and_the_executor_stay_in_this_process(small_scene):
+    relocation = relocation_from(small_scene, 100.0)
+    relocation.powers[small_scene.city] = {}
+    sent = cloudpickle.loads(cloudpickle.dumps(relocation))
+    assert sent.bounds == relocation.bounds and not sent.powers and not sent.executor.is_worth_it
+    assert small_scene.city in relocation.powers
 
 
 @pytest.mark.slow
