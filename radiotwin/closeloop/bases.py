@@ -11,7 +11,6 @@ from typing_extensions import override
 
 from radiotwin.channel.log_distance import LogDistance
 from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
-from radiotwin.execution import Executor
 from radiotwin.links import LinkData
 from radiotwin.scene import Scene
 from radiotwin.twin.fit_links import fit_known, fit_links, reliable_m
@@ -85,16 +84,17 @@ class RaytraceBase(Base):
     """Paths over the 3D map, and unknown devices where they explain the levels best.
 
     A device stays where the law has it if that is less sure than `MAX_RADIUS_M`: one that is surely
-    elsewhere, because of what the map lacks, would be taken for an effect.
+    elsewhere, because of what the map lacks, would be taken for an effect. All parts of the links
+    are fitted in one process, as they ask for the same paths.
     """
 
     name = "raytrace"
     max_radius_m = LOST_M
 
-    def __init__(self, law: TwinBase, executor: Executor) -> None:
+    def __init__(self, law: TwinBase) -> None:
         assert law.scene is not None
         self._law, self._scene = law, law.scene
-        self._relocation = relocation_from(law.scene, MAX_RADIUS_M, executor=executor)
+        self._relocation = relocation_from(law.scene, MAX_RADIUS_M)
 
     @override
     def fit(self, links: LinkData) -> Twin:
@@ -104,11 +104,10 @@ class RaytraceBase(Base):
 BASES = (TwinBase.name, RaytraceBase.name, LogDistanceBase.name)
 
 
-def make_bases(scene: Scene | None, seed: int, executor: Executor | None = None
-               ) -> dict[str, Base]:
+def make_bases(scene: Scene | None, seed: int) -> dict[str, Base]:
     """Return every kind of base that a scene allows, by name."""
     twin = TwinBase(scene, seed)
     bases: dict[str, Base] = {twin.name: twin, LogDistanceBase.name: LogDistanceBase(scene, seed)}
     if scene is not None:
-        bases[RaytraceBase.name] = RaytraceBase(twin, executor or Executor())
+        bases[RaytraceBase.name] = RaytraceBase(twin)
     return bases

@@ -188,7 +188,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     if base == "auto":
         names = ["log-distance"] if scene is None else ["twin", "raytrace"]
     executor = executor or Executor()
-    bases = make_bases(scene, seed, executor)
+    bases = make_bases(scene, seed)
     models, parts = {}, training_parts(links, folds)
     for name in names:
         on_progress(f"fitting the base {name}")
@@ -207,7 +207,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
                       on_progress)
     drop_idle_faults(selection)
     on_progress("unknown devices again, beside the effects")
-    anew = make_bases(scene, seed, executor)[best]  # which remembers no earlier position
+    anew = make_bases(scene, seed)[best]  # which remembers no earlier position
     selection.model = relocate_devices(selection.model, links, anew)
     selection.explained = selection.model
     on_progress("looking at what is left")

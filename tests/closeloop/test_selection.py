@@ -15,6 +15,7 @@ from radiotwin.closeloop.pairs import Passed
 from radiotwin.closeloop.run import close_loop
 from radiotwin.closeloop.scoring import CandidateScore, score_model
 from radiotwin.closeloop.selection import SelectionResult, forward_selection
+from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
 from radiotwin.links import prepare_links
 
 
@@ -111,6 +112,7 @@ def test_what_may_be_nothing_at_all_is_not_named(open_ground, monkeypatch):
         return replace(size_db, low=size_db.value - 20.0, high=size_db.value + 20.0)
 
     monkeypatch.setattr(selection, "effect_size_db", uncertain)
+    monkeypatch.setattr("radiotwin.closeloop.run.catalogue", lambda: [ReceiverGainOffset, DeviceGainOffset])
     loop = close_loop(open_ground.measured(world), base="log-distance")
     assert loop.verdict != "effect" and not [each for each in loop.after.whole.effects if each.effect.is_cause]
     (score, *_) = [each for each in loop.selection.scores if each.name == "receiver_gain_offset"]
