@@ -18,9 +18,11 @@ from radiotwin.errors import BadInput, RunFailed
 from radiotwin.scene.materials import Material
 from radiotwin.scene.reader import read_triangles
 from radiotwin.scene.vegetation import Vegetation
+from radiotwin.threads import in_threads
 
 SKIN_M = 0.01  # step past a surface before the next is looked for [m]
 GROUND_M = 0.05  # faces this close to z = 0 are the ground [m]
+SIGHT_CHUNK = 1 << 16  # lines of sight of one thread at a time
 CHUNK = 1_000_000  # rays per call: bounds the memory of any query to about 100 MB
 DOWN = np.array([0.0, 0.0, -1.0])
 CONCRETE = Material("concrete", itu="concrete")  # of faces whose material is not known
@@ -161,13 +163,16 @@ class CityMap:
         """
         a_m, b_m = np.broadcast_arrays(np.atleast_2d(a_m), np.atleast_2d(b_m))
         los = np.empty(len(a_m), dtype=bool)
-        for start in range(0, len(a_m), CHUNK):
-            part = slice(start, start + CHUNK)
+
+        def cast(start: int) -> None:
+            part = slice(start, start + SIGHT_CHUNK)
             origin = np.ascontiguousarray(a_m[part], dtype=np.float32)
             # Not normalised: a length of 1 then ends the ray at b, which is faster
             way = np.ascontiguousarray(b_m[part] - a_m[part], dtype=np.float32)
             los[part] = self._scene.run(origin, way, np.ones(len(way), np.float32),
                                         query="OCCLUDED") == -1
+
+        in_threads(cast, range(0, len(a_m), SIGHT_CHUNK))
         return los
 
     def first_face(self, a_m: np.ndarray, b_m: np.ndarray) -> np.ndarray:
