@@ -97,6 +97,8 @@ def close_loop(
 
 
 def _print(report: dict[str, Any]) -> None:
+    from radiotwin.report.labels import name_label
+
     for note in report["notes"]:
         say(f"note: {note}")
     error = report["error"]
@@ -104,7 +106,7 @@ def _print(report: dict[str, Any]) -> None:
               if both["before"]["n"]]
     rows = [[name, when, *(_number(both[when][key]) for key in ("rmse_db", "mae_db", "bias_db"))]
             for name, both in groups for when in ("before", "after")]
-    rows += [[name.replace("_", " "), "", value["rmse_db"], float("nan"), float("nan")]
+    rows += [[name_label(name), "", value["rmse_db"], float("nan"), float("nan")]
              for name, value in report["baselines"].items()]
     print_rows(
         f"Error on held-out links (by {report['heldout']['by']}) [dB], base {report['base']}",

@@ -52,12 +52,15 @@ PARAMETERS = {
 }
 SUFFIXES = {"_db_km": "dB/km", "_db_m": "dB/m", "_deg": "°", "_db": "dB", "_dbm": "dBm",
             "_m": "m", "_s": "s"}
-NAMES = {"log_distance": "log-distance law", "raytrace": "ray tracer"}
 MODELS = {"log_distance": "log-distance", "segmented_log_distance": "segmented log-distance",
           "segmented_nn": "segmented NN", "regression_kriging": "regression kriging",
+          "extra_trees": "extra trees", "hist_gradient_boosting": "gradient boosting",
           "tr36777_uma": "TR 36.777 UMa", "tr36777_umi": "TR 36.777 UMi",
-          "al_hourani_urban": "Al-Hourani urban", "p1411": "ITU-R P.1411",
+          "al_hourani_suburban": "Al-Hourani suburban", "al_hourani_urban": "Al-Hourani urban",
+          "al_hourani_dense_urban": "Al-Hourani dense urban",
+          "al_hourani_high_rise": "Al-Hourani high-rise", "p1411": "ITU-R P.1411",
           "cost231_wi": "COST 231 W-I"}
+NAMES = MODELS | {"log_distance": "log-distance law", "raytrace": "ray tracer"}
 INTERPOLATIONS = ("correlated_shadowing", "unexplained_trend")
 """Effects that fit what is left without a cause."""
 
