@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,6 +21,7 @@ from radiotwin.inference import censored_regression
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.links import LinkData
 from radiotwin.pieces import KeptParts, Piece, keeps, kept
+from radiotwin.processes import resident_bytes
 
 EVALUATIONS = 25  # of the objective for each number, in one descent
 DESCENTS = 2  # a simplex that has collapsed too early starts anew; one for a fold, which is near
@@ -32,7 +34,7 @@ MAX_EXACT_DESCENTS = 3  # the objective is rough, as paths open and close: a sim
 MAX_PROPOSALS = 4  # of one effect that are fitted
 MIN_GAIN_NATS = 5.0  # that a proposal must gain to be refined
 OUTSIDE_NATS = 10.0  # penalty of a step outside the bounds
-WORKER_BYTES = 2 * 2**30  # of a process that fits effects
+WORKER_BYTES = 2 * 2**30  # of a process that fits effects, at least
 EXTREMES_DB = (-200.0, 100.0)  # levels at which whatever a receiver does to them shows
 
 
@@ -84,8 +86,10 @@ def prepare_additions(models: Sequence[FoldModel], results: Sequence[FitResult],
         "effect", lambda piece: (models[piece[0]], effects[piece[1]], results[piece[0]], like),
         lambda found: found, lambda arrays, content: (arrays, content))
     function = _Addition(list(models), list(results), list(effects), like)
+    # A worker holds links, map and models as this process does, and no more.
+    memory_bytes = max(WORKER_BYTES, resident_bytes(os.getpid()))
     job: Job[tuple[int, int], Piece | None] = Job("fitting effects", function,
-                                                  Resources(WORKER_BYTES, False))
+                                                  Resources(memory_bytes, False))
     executor.run_ahead(job, pieces, parts)
 
 

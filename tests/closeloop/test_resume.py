@@ -1,6 +1,7 @@
 """A loop that was killed goes on with the parts that it had finished, and ends with the same bytes."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -106,6 +107,16 @@ def test_a_killed_loop_over_a_city_ends_equal_to_the_bit(family, kill_after):
                 assert everything(given.measurements, given.scene, "auto") == whole
             except Killed:
                 continue
+
+
+def test_a_worker_may_take_as_much_memory_as_this_process(monkeypatch):
+    asked = []
+    executor = SimpleNamespace(is_worth_it=True, run_ahead=lambda job, pieces, parts: asked.append(job.resources))
+    for resident in (0, 5 * 2**30):
+        monkeypatch.setattr(fitting, "resident_bytes", lambda _, resident=resident: resident)
+        with keep_pieces():
+            fitting.prepare_additions([], [], [], executor)
+    assert [each.memory_bytes for each in asked] == [fitting.WORKER_BYTES, 5 * 2**30]
 
 
 @pytest.mark.parametrize("place", [pytest.param("local", marks=pytest.mark.slow),
