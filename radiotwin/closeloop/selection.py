@@ -17,7 +17,7 @@ from radiotwin.closeloop.effect_size import effect_size_db, why_not_borne_out
 from radiotwin.closeloop.hypotheses import Hypotheses
 from radiotwin.closeloop.moved_limits import with_moved_limits
 from radiotwin.closeloop.pairs import Passed, probable_together
-from radiotwin.closeloop.posterior import Step, judge
+from radiotwin.closeloop.posterior import Step, judge, probability_of_all
 from radiotwin.closeloop.scoring import (
     Candidate,
     CandidateScore,
@@ -33,6 +33,8 @@ from radiotwin.effects.fitting import prepare_additions, with_exact_levels
 from radiotwin.execution import Executor
 from radiotwin.links import evidence_blocks
 from radiotwin.links.sites import site_of
+
+MIN_RIVAL_SHARE = 0.5  # of what the best gains, for several of a kind to be tried in its place
 
 Outdone = list[tuple[Candidate, CandidateScore]]
 """Candidates that were not scored, and why not."""
@@ -114,7 +116,7 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
     causes = all(effect.is_cause for effect in effects)
     while not result.is_full:
         step = len(result.model.whole.effects)
-        hypotheses = None
+        hypotheses, supported = None, []
         if causes:
             on_progress(f"step {step + 1}: what the base may be wrong in")
             hypotheses = result.hypotheses(seed)
@@ -130,6 +132,7 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
                                  seed, on_progress)[0]
                 judged = _judged(result, judged, hypotheses, step)
                 passed = [each for each in judged if not each.score.reason]
+            supported = judged
             if not passed:
                 together = probable_together(judged, result.model, result.steps[-1], block,
                                              len(available), seed, result.criteria, result.executor,
@@ -139,7 +142,7 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
                     continue
         if not passed:
             break
-        _keep_best(result, passed, block, hypotheses, seed, step, on_progress)
+        _keep_best(result, passed, supported, block, hypotheses, seed, step, on_progress)
     # A rival that gains beside the effect is another effect; else it is another name for it.
     last = max((entry.step for entry in result.scores), default=0)
     alive = {entry.name for entry in result.scores
@@ -244,10 +247,14 @@ def _keep_together(result: SelectionResult, found: list[Passed], step: int) -> N
     result.model = with_moved_limits(_exactly(found[-1].model))
 
 
-def _keep_best(result: SelectionResult, passed: list[Passed], block: np.ndarray,
-               hypotheses: Hypotheses | None, seed: int, step: int,
+def _keep_best(result: SelectionResult, passed: list[Passed], supported: list[Passed],
+               block: np.ndarray, hypotheses: Hypotheses | None, seed: int, step: int,
                on_progress: Callable[[str], None]) -> None:
-    """Keep the best of the candidates that passed, or several of one kind that are better."""
+    """Keep the best of the candidates that passed, or several of one kind that are better.
+
+    Of a kind that held-out links support, though one alone is not probable beside the best: groves
+    beside an offset of each device.
+    """
     criteria = result.criteria
     passed.sort(key=lambda each: -each.score.held_out_nats)
     # Of those that the data cannot tell apart the one with the least error.
@@ -256,13 +263,19 @@ def _keep_best(result: SelectionResult, passed: list[Passed], block: np.ndarray,
     passed.sort(key=lambda each: each.score.rmse_db if each in close else np.inf)
     first = passed[0]
     steps = [(first.score, first.model)]
+    least = first.score.held_out_nats
     rival = next((each for each in passed[1:] if each.effect.repeatable), None)
+    if rival is None and not first.effect.repeatable:
+        rival = max((each for each in supported if each.effect.repeatable
+                     and each.score.held_out_nats >= MIN_RIVAL_SHARE * least),
+                    key=lambda each: each.score.held_out_nats, default=None)
     most = criteria.max_repeats if not first.effect.repeatable else _on_one_mast(first.model)
     if rival is not None and most > 1:
         on_progress(f"step {step + 1}: more of {rival.score.name}")
-        least = first.score.held_out_nats
-        steps = _several(rival, block, hypotheses, seed, least, most, criteria,
-                         result.executor) or steps
+        several = _several(rival, block, hypotheses, seed, least, most, criteria, result.executor)
+        if several and rival.score.reason:
+            several = _if_likelier(result, several, first.score)
+        steps = several or steps
     best, nats = steps[0][0], sum(score.held_out_nats for score, _ in steps)
     rivals = [each.score.name for each in passed
               if each.score.name != best.name and _alike(nats, each.score, criteria)]
@@ -275,6 +288,22 @@ def _keep_best(result: SelectionResult, passed: list[Passed], block: np.ndarray,
     result.rivals += [rivals, *([] for _ in steps[1:])]
     on_progress(f"step {step + 1}: {best.name}, exactly")
     result.model = with_moved_limits(_exactly(steps[-1][1]))
+
+
+def _if_likelier(result: SelectionResult, several: list[tuple[CandidateScore, CrossValidatedModel]],
+                 best: CandidateScore) -> list[tuple[CandidateScore, CrossValidatedModel]]:
+    """Return several of a kind with the probability that all are there, if it exceeds the best's.
+
+    Of the first, what is among the scores is replaced.
+    """
+    scores, step = [score for score, _ in several], result.steps[-1]
+    chance = probability_of_all(scores, best.held_out_nats, result.model,
+                                step.rest_db / step.noise_db)
+    if chance < max(best.probability, result.criteria.min_probability):
+        return []
+    found = [(replace(score, reason="", probability=chance), model) for score, model in several]
+    result.scores = [found[0][0] if score is scores[0] else score for score in result.scores]
+    return found
 
 
 def _beyond(passed: Passed, candidate: Candidate, model: CrossValidatedModel,

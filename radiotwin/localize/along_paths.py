@@ -2,9 +2,8 @@
 
 A law with two classes of links takes one just behind an edge, a few decibels below line of sight,
 for one with it, and moves a device in a narrow street to where it would have line of sight. Paths
-tell the two apart. Following them takes long, so the law says where it is worth it: the likelihood
-of each position is that of some of the device's links, by the law in all cells around, by paths in
-the best of these and on the way down from there.
+tell the two apart, and take long. So the likelihood of each position is that of some of the
+device's links, by the law in all cells around, by paths in the best of these and downhill of them.
 """
 
 from __future__ import annotations
@@ -58,8 +57,8 @@ class Relocation:
         thresholds: of each device: the least hash of a link's position to take part, so that all
             parts of the links use the same ones.
         positions: where each device was found before, which is worth trying with other links, too.
-        powers: map -> position -> hash of the other end's position -> power.
         history: hash of all searches so far, which decide what is remembered.
+        powers: map -> position -> hash of the other end's position -> power.
         executor: where devices are searched for side by side, inside `keep_pieces`.
     """
 
@@ -67,8 +66,8 @@ class Relocation:
     max_radius_m: float
     thresholds: dict[str, np.uint64] = field(default_factory=dict)
     positions: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
-    powers: WeakKeyDictionary[CityMap, Followed] = field(default_factory=WeakKeyDictionary)
     history: str = ""
+    powers: WeakKeyDictionary[CityMap, Followed] = field(default_factory=WeakKeyDictionary)
     executor: Executor = field(default_factory=Executor)
 
     def relocate(self, links: LinkData, devices: list[TwinDevice],
@@ -124,13 +123,10 @@ class Relocation:
         self.executor.run_ahead(Job("looking for devices along paths", _Searches(searches),
                                     Resources(WORKER_BYTES, False)), range(len(searches)), parts)
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __reduce__(self) -> tuple[Any, ...]:
         """Leave out what was followed, and where: another process follows what it needs."""
-        return {name: value for name, value in self.__dict__.items()
-                if name not in ("powers", "executor")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, powers=WeakKeyDictionary(), executor=Executor())
+        return type(self), (self.bounds, self.max_radius_m, self.thresholds, self.positions,
+                            self.history)
 
     def _search(self, search: _Search, device: TwinDevice,
                 before: list[tuple[float, float]]) -> TwinDevice:

@@ -12,6 +12,7 @@ from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import CrossValidatedModel, cross_validate, training_parts
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.closeloop.pairs import Passed
+from radiotwin.closeloop.posterior import Step
 from radiotwin.closeloop.run import close_loop
 from radiotwin.closeloop.scoring import CandidateScore, score_model
 from radiotwin.closeloop.selection import SelectionResult, forward_selection
@@ -122,12 +123,13 @@ def test_what_may_be_nothing_at_all_is_not_named(open_ground, monkeypatch):
 @pytest.fixture
 def keep_best(monkeypatch):
     """Function that keeps the best of some candidates; `several` is what is found of one kind."""
-    def run(result, candidates, step, several=None):
+    def run(result, candidates, step, several=None, improbable=()):
         for name, stand_in in (("_exactly", lambda model: model), ("with_moved_limits", lambda model: model),
                                ("_on_one_mast", lambda _: 0), ("_several", lambda *_: several)):
             monkeypatch.setattr(selection, name, stand_in)
-        result.scores += [each.score for each in candidates]
-        selection._keep_best(result, candidates, None, None, 0, step, lambda _: None)
+        supported = [*candidates, *improbable]
+        result.scores += [each.score for each in supported]
+        selection._keep_best(result, candidates, supported, None, None, 0, step, lambda _: None)
         return result
     return run
 
@@ -149,6 +151,29 @@ def test_several_of_a_kind_are_told_from_another_effect_by_what_they_gain_togeth
     assert result.rivals == [rivals] + [[]] * bool(second)
     assert [each.name for each in result.scores if each.kept] == (["missing_obstacle"] * 2 if second else
                                                                  ["device_gain_offset"])
+
+
+@pytest.mark.parametrize(("nats", "chance", "kept"), [(61.0, 0.9, ["foliage", "foliage"]), (61.0, 0.6, ["device_gain_offset"]),
+                                                      (30.0, 0.9, ["device_gain_offset"])])
+def test_groves_of_which_one_is_improbable_beside_an_offset_are_named_where_all_are_likelier(
+        keep_best, monkeypatch, nats, chance, kept):
+    """An offset of each of six devices gains 64 nats, and each of two groves `nats`."""
+    offset, grove = passed("device_gain_offset", 64.0), passed("foliage", nats, repeatable=True)
+    offset, grove = (replace(each, score=replace(each.score, probability=probability, reason=reason))
+                     for each, probability, reason in ((offset, 0.7, ""), (grove, 0.2, "it is not probable enough")))
+    two = [(grove.score, MODEL), (replace(grove.score, step=1, reason=""), MODEL)]
+    asked = []
+    monkeypatch.setattr(selection, "probability_of_all", lambda *what: asked.append(what) or chance)
+    result = SelectionResult(MODEL, steps=[Step(0, {}, 3.0, 1.0, {})])
+    result = keep_best(result, [offset], 0, two, [grove])
+    assert [each.name for each in result.scores if each.kept] == kept
+    assert all(each.probability == (chance if each.name == "foliage" else 0.7) and not each.reason
+               for each in result.scores if each.kept)
+    if nats < 32:  # even two of them gain less
+        assert not asked
+    else:
+        ((scores, other, model, ratio),) = asked
+        assert len(scores) == 2 and other == 64.0 and model is MODEL and ratio == 3.0
 
 
 def test_without_a_candidate_there_is_no_step():
