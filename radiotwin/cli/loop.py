@@ -75,7 +75,9 @@ def close_loop(
     if base == "raytrace":
         notice(f"the twin will follow paths, {NOT_BY_PATHS}")
     inputs = {"measurements": str(measurements), "scene": scene and str(scene)}
-    with keep_pieces() as pieces, open_executor(workers, cluster, notice) as executor, \
+    # Two workers are no faster than the threads of one process: they are for who asks for them.
+    some = "1" if workers == "auto" and cluster is None else workers
+    with keep_pieces() as pieces, open_executor(some, cluster, notice) as executor, \
             progress("closing the loop", total=None) as advance:
         loop = run(data, world, base, seed,
                    lambda text: advance(1, "; ".join(filter(None, [text, pieces.progress]))),
