@@ -53,7 +53,7 @@ def close_loop(
     """
     from radiotwin.closeloop.corrected_scene import check_corrected_target, write_corrected_scene
     from radiotwin.closeloop.run import close_loop as run
-    from radiotwin.execution import open_executor
+    from radiotwin.execution import AUTO, open_executor
     from radiotwin.measurements import read_measurements
     from radiotwin.pieces import keep_pieces
     from radiotwin.progress import progress
@@ -76,7 +76,7 @@ def close_loop(
         notice(f"the twin will follow paths, {NOT_BY_PATHS}")
     inputs = {"measurements": str(measurements), "scene": scene and str(scene)}
     # Two workers are no faster than the threads of one process: they are for who asks for them.
-    some = "1" if workers == "auto" and cluster is None else workers
+    some = "1" if workers == AUTO and cluster is None else workers
     with keep_pieces() as pieces, open_executor(some, cluster, notice) as executor, \
             progress("closing the loop", total=None) as advance:
         loop = run(data, world, base, seed,
