@@ -15,6 +15,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.stats import t
 
 from radiotwin.closeloop.bases import Base
@@ -115,10 +116,8 @@ def _stands_out(model: CrossValidatedModel, candidate: Candidate | CandidateScor
     end = effect.index(links)
     # Flights are before or after it, whole: a warm-up is over, by two thirds, after its constant.
     when_s = drift.number + (links.first_s if drift.form == "warm_up" else 0.0)
-    _, member = np.unique(links.flight[seen], return_inverse=True)
-    begins_s = np.full(member.max() + 1, np.inf)
-    np.minimum.at(begins_s, member, links.time_s[seen])
-    group = np.where((end[seen] == changed) & (begins_s[member] >= when_s), -1, end[seen])
+    begins_s = pd.Series(links.time_s[seen]).groupby(links.flight[seen]).transform("min")
+    group = np.where((end[seen] == changed) & (begins_s >= when_s), -1, end[seen])
     cells, cell = np.unique(np.column_stack([group, links.flight[seen]]), axis=0,
                             return_inverse=True)
     # Plain means: where all of a flight is off, its links are no outliers.

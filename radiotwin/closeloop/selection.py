@@ -116,7 +116,7 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
     causes = all(effect.is_cause for effect in effects)
     while not result.is_full:
         step = len(result.model.whole.effects)
-        hypotheses, supported = None, []
+        hypotheses, judged = None, []
         if causes:
             on_progress(f"step {step + 1}: what the base may be wrong in")
             hypotheses = result.hypotheses(seed)
@@ -132,7 +132,6 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
                                  seed, on_progress)[0]
                 judged = _judged(result, judged, hypotheses, step)
                 passed = [each for each in judged if not each.score.reason]
-            supported = judged
             if not passed:
                 together = probable_together(judged, result.model, result.steps[-1], block,
                                              len(available), seed, result.criteria, result.executor,
@@ -142,7 +141,7 @@ def forward_selection(result: SelectionResult, effects: list[Effect], seed: int,
                     continue
         if not passed:
             break
-        _keep_best(result, passed, supported, block, hypotheses, seed, step, on_progress)
+        _keep_best(result, passed, judged, block, hypotheses, seed, step, on_progress)
     # A rival that gains beside the effect is another effect; else it is another name for it.
     last = max((entry.step for entry in result.scores), default=0)
     alive = {entry.name for entry in result.scores
