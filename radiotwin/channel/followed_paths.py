@@ -1,5 +1,6 @@
 """Powers and directions of the paths of links over the 3D map, each followed once."""
 
+import time
 from collections import OrderedDict
 from collections.abc import Iterator
 from typing import Any, NamedTuple
@@ -9,12 +10,15 @@ from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkData, LinkGeometry
-from radiotwin.pieces import kept
+from radiotwin.pieces import KeptParts, Piece
+from radiotwin.progress import progress
 from radiotwin.scene.citymap import CityMap
+from radiotwin.threads import in_threads
 
 GRID_M = 0.5  # estimated positions of devices are rounded to it, and share their paths
 MAX_REMEMBERED = 300_000  # links: 200 MB
 MIN_REMEMBERED = 2  # devices, however many links they have
+BATCH_LINKS = 50_000  # of devices that are followed side by side: 30 MB
 
 
 def path_gains(geometry: LinkGeometry, kinds: tuple[str, ...] | None = None) -> np.ndarray:
@@ -115,8 +119,10 @@ class _Followed(NamedTuple):
     arrivals: np.ndarray
 
 
-_remembered: OrderedDict[
-    tuple[CityMap, tuple[float, float, float], float], _Followed] = OrderedDict()
+_Position = tuple[float, float, float]  # [m]
+_NewPaths = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+_remembered: OrderedDict[tuple[CityMap, _Position, float], _Followed] = OrderedDict()
 
 
 def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, np.ndarray]]:
@@ -125,69 +131,101 @@ def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, 
     if city is None:
         raise BadInput("the channel image_paths follows paths over a 3D map, and none is given; "
                        "give it with --scene")
-    for device in np.unique(geometry.device):
-        rows = np.flatnonzero(geometry.device == device)
-        position_m = geometry.device_m[rows[0]]
-        if geometry.estimated is not None and geometry.estimated[rows[0]]:
-            rounded_m = np.append(np.round(position_m[:2] / GRID_M) * GRID_M, position_m[2])
-            position_m = position_m if city.inside(rounded_m[None])[0] else rounded_m
-        x_m, y_m, z_m = map(float, position_m)
-        followed, index = _follow(city, (x_m, y_m, z_m), geometry.receiver_m[rows],
-                                  geometry.frequency_hz)
-        yield rows, followed, index
+    devices, first, count = np.unique(geometry.device, return_index=True, return_counts=True)
+    batch = np.cumsum(count) // BATCH_LINKS
+    for number in np.unique(batch):
+        rows = [np.flatnonzero(geometry.device == device) for device in devices[batch == number]]
+        wanted = [(_position_m(geometry, row), geometry.receiver_m[mine])
+                  for row, mine in zip(first[batch == number], rows, strict=True)]
+        yield from ((mine, *found) for mine, found in zip(
+            rows, _follow(city, wanted, geometry.frequency_hz), strict=True))
 
 
-def _follow(city: CityMap, position_m: tuple[float, float, float], ends_m: np.ndarray,
-            frequency_hz: float) -> tuple[_Followed, np.ndarray]:
-    """Return the paths from one position to ends (n, 3), and the row of each end."""
+def _position_m(geometry: LinkGeometry, row: int) -> _Position:
+    """Return where paths of the device of a link are followed from [m]."""
+    assert geometry.city is not None
+    position_m = geometry.device_m[row]
+    if geometry.estimated is not None and geometry.estimated[row]:
+        rounded_m = np.append(np.round(position_m[:2] / GRID_M) * GRID_M, position_m[2])
+        position_m = position_m if geometry.city.inside(rounded_m[None])[0] else rounded_m
+    x_m, y_m, z_m = map(float, position_m)
+    return x_m, y_m, z_m
+
+
+def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
+            frequency_hz: float) -> list[tuple[_Followed, np.ndarray]]:
+    """Return the paths from positions to ends (n, 3) of each, and the row of each end."""
     from radiotwin.paths.powers import COMPONENTS, SECTORS
 
-    key = (city, position_m, frequency_hz)
-    wanted = _keys(ends_m)
     no_rays = np.zeros((0, SECTORS, 3), dtype=np.float32)
-    nothing = _Followed(wanted[:0], np.zeros((0, len(COMPONENTS))), no_rays, no_rays)
-    known = _remembered.pop(key, nothing)
-    index = np.searchsorted(known.ends, wanted)
-    unknown = np.append(known.ends, -1)[index] != wanted
-    if unknown.any():
-        new, first = np.unique(wanted[unknown], return_index=True)
-        new_m = ends_m[unknown][first]
-        order = np.argsort(np.concatenate([known.ends, new]))
-        more = (new, *_new_paths(city, position_m, new_m, frequency_hz))
-        known = _Followed(*(np.concatenate([old, each])[order]
-                            for old, each in zip(known, more, strict=True)))
-        index = np.searchsorted(known.ends, wanted)
-    _remembered[key] = known
+    nothing = _Followed(np.zeros(0, dtype=np.int64), np.zeros((0, len(COMPONENTS))), no_rays,
+                        no_rays)
+    keys = [_keys(ends_m) for _, ends_m in wanted]
+    known = [_remembered.pop((city, position_m, frequency_hz), nothing)
+             for position_m, _ in wanted]
+    missing = {}
+    for number, ((position_m, ends_m), ends, old) in enumerate(zip(wanted, keys, known,
+                                                                   strict=True)):
+        unknown = np.append(old.ends, -1)[np.searchsorted(old.ends, ends)] != ends
+        if unknown.any():
+            new, first = np.unique(ends[unknown], return_index=True)
+            missing[number] = new, (position_m, ends_m[unknown][first])
+    followed = _new_paths(city, [asked for _, asked in missing.values()], frequency_hz)
+    for (number, (new, _)), found in zip(missing.items(), followed, strict=True):
+        old, order = known[number], np.argsort(np.concatenate([known[number].ends, new]))
+        known[number] = _Followed(*(np.concatenate([each, more])[order]
+                                    for each, more in zip(old, (new, *found), strict=True)))
+    for (position_m, _), each in zip(wanted, known, strict=True):
+        _remembered[city, position_m, frequency_hz] = each
     while len(_remembered) > MIN_REMEMBERED \
             and sum(len(each.ends) for each in _remembered.values()) > MAX_REMEMBERED:
         _remembered.popitem(last=False)
-    return known, index
+    return [(each, np.searchsorted(each.ends, ends))
+            for each, ends in zip(known, keys, strict=True)]
 
 
-_NewPaths = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
-def _new_paths(city: CityMap, position_m: tuple[float, float, float], ends_m: np.ndarray,
-               frequency_hz: float) -> _NewPaths:
-    """Return powers, departures and arrivals as of `_Followed` to ends (n, 3)."""
+def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
+               frequency_hz: float) -> list[_NewPaths]:
+    """Return powers, departures and arrivals as of `_Followed` from positions to ends (n, 3)."""
     from radiotwin.paths.powers import COMPONENTS, SECTORS, path_powers
 
-    shapes = [(len(ends_m), len(COMPONENTS)), *[(len(ends_m), SECTORS, 3)] * 2]
-
-    def follow() -> _NewPaths:
+    def follow(number: int) -> _NewPaths:
+        position_m, ends_m = asked[number]
         found = path_powers(city, np.array([position_m]), ends_m, np.zeros(len(ends_m), int),
                             frequency_hz, "vertical")
         powers = np.column_stack([getattr(found, name) for name in COMPONENTS])
         return powers, found.departures.astype(np.float32), found.arrivals.astype(np.float32)
 
+    def write(found: _NewPaths) -> Piece:
+        return dict(zip(("powers", "departures", "arrivals"), found, strict=True)), None
+
     def read(arrays: dict[str, np.ndarray], _: Any) -> _NewPaths:
         values = arrays["powers"], arrays["departures"], arrays["arrivals"]
-        if [each.shape for each in values] != shapes:
+        ends = len(values[0])
+        if [each.shape for each in values] != [(ends, len(COMPONENTS)), *[(ends, SECTORS, 3)] * 2]:
             raise ValueError("other shapes")
         return values
 
-    return kept("paths", (city, position_m, ends_m, frequency_hz), follow,
-                lambda found: (dict(zip(("powers", "departures", "arrivals"), found)), None), read)
+    parts: KeptParts[int, _NewPaths] = KeptParts(
+        "paths", lambda number: (city, *asked[number], frequency_hz), write, read)
+    found = {}
+    for number, (_, ends_m) in enumerate(asked):
+        earlier = parts.get(number)
+        if earlier is not None and len(earlier[0][0]) == len(ends_m):
+            found[number] = earlier[0]
+    new = [number for number in range(len(asked)) if number not in found]
+    with progress("following paths", total=len(new)) as advance:
+        def timed(number: int) -> tuple[_NewPaths, float]:
+            started = time.perf_counter()
+            value = follow(number)
+            advance()
+            return value, time.perf_counter() - started
+
+        # Threads follow, and one keeps: what is kept notes warnings, of which there is one place.
+        for number, (value, seconds) in zip(new, in_threads(timed, new), strict=True):
+            parts.put(number, value, [], seconds)
+            found[number] = value
+    return [found[number] for number in range(len(asked))]
 
 
 def _keys(positions_m: np.ndarray) -> np.ndarray:

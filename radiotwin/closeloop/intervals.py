@@ -18,7 +18,7 @@ from scipy.stats import t
 from radiotwin.closeloop.cross_validation import CrossValidatedModel, same_effects
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.params import Estimate, Parameter
-from radiotwin.effects.uncertainty import estimates
+from radiotwin.effects.uncertainty import Linearised, Secant, estimates, linearise
 from radiotwin.inference.sandwich import MAX_WIDTH
 
 QUANTILE = 0.95  # upper end of a 90 % interval
@@ -33,8 +33,10 @@ def effect_parameters(model: CrossValidatedModel) -> list[dict[str, Parameter]]:
     Args:
         model: of all links, and of those outside each fold.
     """
-    of_whole, *of_folds = (estimates(each, fit)
-                           for each, fit in zip(model.models, model.fits, strict=True))
+    whole = linearise(model.whole, model.fits[0])
+    of_whole = estimates(whole)
+    of_folds = [estimates(linearise(fold, fit, _as_followed(whole, fold)))
+                for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
     found = []
     for number, (applied, estimate) in enumerate(zip(model.whole.effects, of_whole, strict=True)):
         reported = applied.effect.parameters(model.links, applied.params, estimate)
@@ -43,6 +45,25 @@ def effect_parameters(model: CrossValidatedModel) -> list[dict[str, Parameter]]:
         found.append({name: _with_folds(parameter, [fold[name] for fold in folds if name in fold],
                                         len(folds)) for name, parameter in reported.items()})
     return found
+
+
+def _as_followed(whole: Linearised, fold: FoldModel) -> dict[int, list[Secant]]:
+    """Return secants for a fold, by the place of the effect, of paths that the whole followed.
+
+    Following them anew around each fold's values takes minutes, and of a fold's own uncertainty
+    no more is asked than whether it knows a number at all.
+    """
+    known = {}
+    for number, place in enumerate(same_effects(whole.model, fold)):
+        own = whole.variations[number]
+        if place is None or own is None or not own.follows_paths:
+            continue
+        applied = fold.effects[place]
+        other = applied.effect.variation(applied.params)
+        if other is not None and other.follows_paths and len(other.values) == len(own.values):
+            known[place] = [each.moved(whole.model.train, fold.train)
+                            for each in whole.secants[number]]
+    return known
 
 
 def _of_fold(fold: FoldModel, own: list[Estimate], whole: FoldModel,

@@ -8,6 +8,7 @@ each is well known where the others are.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,42 +26,8 @@ MIN_FLIGHTS = 4  # that clusters of flights are made of
 STEP_SHARES = (0.02, 3.0)  # of `Variation.steps`, least and greatest secant
 
 
-def estimates(model: FoldModel, result: FitResult) -> list[Estimate]:
-    """Return the uncertainty of each effect, in view of places and flights that err alike.
-
-    Args:
-        model: with its effects.
-        result: its fit to the training links.
-    """
-    variations = [each.effect.variation(each.params) for each in model.effects]
-    model, result = _as_varied(model, result, variations)
-    # A design effect of the whole stands in for what each prior counts beside links.
-    design_effect = model.view(result).design_effect
-    secants = [_secants(model, result, number, variation, design_effect)
-               for number, variation in enumerate(variations)]
-    scores = _scores(model, result, [each for of_effect in secants for each in of_effect],
-                     design_effect)
-    links = model.links.select(model.train)
-    clusterings = [evidence_blocks(links), places(links)]
-    if len(np.unique(links.flight)) >= MIN_FLIGHTS:
-        clusterings.append(links.flight)
-    covariances = scores.covariances(clusterings)
-    every_sd = np.sqrt(np.max([np.diag(each) for each in covariances], axis=0))
-    first, found = len(result.coefficients), []
-    for own, of_effect, variation in zip(model.coefficient_slices, secants, variations,
-                                         strict=True):
-        sd = every_sd[first:first + len(of_effect)]
-        if variation is not None:
-            sd = np.hypot(sd, variation.resolution_sd)
-        sides = np.reshape([each.sides for each in of_effect], (-1, 2)).T
-        found.append(Estimate(result.coefficients[own],
-                              [each[own, own] for each in covariances], sd * sides))
-        first += len(of_effect)
-    return found
-
-
 @dataclass(frozen=True, eq=False)
-class _Secant:
+class Secant:
     """How n readings change with a number.
 
     Attributes:
@@ -76,6 +43,82 @@ class _Secant:
     precision: float = 0.0
     sides: tuple[float, float] = (1.0, 1.0)
 
+    def moved(self, own: np.ndarray, wanted: np.ndarray) -> Secant:
+        """Return the secant of other links of the same m, as if what it lacks did not change.
+
+        Args:
+            own: (m,) bool, its links.
+            wanted: (m,) bool, those of the secant returned.
+        """
+        def on_wanted(values: np.ndarray) -> np.ndarray:
+            every = np.zeros(len(own))
+            every[own] = values
+            return every[wanted]
+        return replace(self, mean_db=on_wanted(self.mean_db),
+                       log_scale=on_wanted(self.log_scale), score=on_wanted(self.score))
+
+
+@dataclass(frozen=True, eq=False)
+class Linearised:
+    """A fitted model whose readings are linear in all coefficients and numbers.
+
+    Attributes:
+        model, result: the fit, of quick levels where numbers vary quickly.
+        design_effect: of its training links.
+        variations: of each effect.
+        secants: of each effect's numbers, on the training links.
+    """
+
+    model: FoldModel
+    result: FitResult
+    design_effect: float
+    variations: list[Variation | None]
+    secants: list[list[Secant]]
+
+
+def linearise(model: FoldModel, result: FitResult,
+              known: Mapping[int, list[Secant]] | None = None) -> Linearised:
+    """Return how the readings of a model's training links change with its effects' numbers.
+
+    Args:
+        model: with its effects.
+        result: its fit to the training links.
+        known: secants of effects, by their place in the model, that are not computed again.
+    """
+    variations = [each.effect.variation(each.params) for each in model.effects]
+    model, result = _as_varied(model, result, variations)
+    # A design effect of the whole stands in for what each prior counts beside links.
+    design_effect = model.view(result).design_effect
+    known = known or {}
+    secants = [known[number] if number in known
+               else _secants(model, result, number, variation, design_effect)
+               for number, variation in enumerate(variations)]
+    return Linearised(model, result, design_effect, variations, secants)
+
+
+def estimates(linearised: Linearised) -> list[Estimate]:
+    """Return the uncertainty of each effect, in view of places and flights that err alike."""
+    model, result = linearised.model, linearised.result
+    scores = _scores(model, result, [each for of_effect in linearised.secants
+                                     for each in of_effect], linearised.design_effect)
+    links = model.links.select(model.train)
+    clusterings = [evidence_blocks(links), places(links)]
+    if len(np.unique(links.flight)) >= MIN_FLIGHTS:
+        clusterings.append(links.flight)
+    covariances = scores.covariances(clusterings)
+    every_sd = np.sqrt(np.max([np.diag(each) for each in covariances], axis=0))
+    first, found = len(result.coefficients), []
+    for own, of_effect, variation in zip(model.coefficient_slices, linearised.secants,
+                                         linearised.variations, strict=True):
+        sd = every_sd[first:first + len(of_effect)]
+        if variation is not None:
+            sd = np.hypot(sd, variation.resolution_sd)
+        sides = np.reshape([each.sides for each in of_effect], (-1, 2)).T
+        found.append(Estimate(result.coefficients[own],
+                              [each[own, own] for each in covariances], sd * sides))
+        first += len(of_effect)
+    return found
+
 
 def _as_varied(model: FoldModel, result: FitResult,
                variations: list[Variation | None]) -> tuple[FoldModel, FitResult]:
@@ -90,7 +133,7 @@ def _as_varied(model: FoldModel, result: FitResult,
 
 
 def _secants(model: FoldModel, result: FitResult, number: int, variation: Variation | None,
-             design_effect: float) -> list[_Secant]:
+             design_effect: float) -> list[Secant]:
     """Return a secant of each number of an effect, about as wide as it is uncertain by itself."""
     if variation is None:
         return []
@@ -107,7 +150,7 @@ def _secants(model: FoldModel, result: FitResult, number: int, variation: Variat
 
 
 def _secant(model: FoldModel, result: FitResult, number: int, variation: Variation, i: int,
-            step: float) -> _Secant:
+            step: float) -> Secant:
     applied, problem = model.effects[number], model.training
     blanking = isinstance(applied.effect, DetectionEffect | LimitEffect)
     here = problem.predict(result)
@@ -131,15 +174,15 @@ def _secant(model: FoldModel, result: FitResult, number: int, variation: Variati
         sides.append(change / moved_by)
         priors.append(applied.effect.neg_log_prior(variation.params(numbers)) - prior)
     if not sides:
-        return _Secant(np.zeros(n), np.zeros(n), np.zeros(n))
+        return Secant(np.zeros(n), np.zeros(n), np.zeros(n))
     mean_db, log_scale, score = np.mean(sides, axis=0)
     # A normal prior rises by (step / sd)² / 2 to each side on average; bounds are a flat one.
     precision = max(2 * float(np.mean(priors)) / step**2, 0.0)
     precision += 12.0 / (variation.high[i] - variation.low[i])**2
-    secant = _Secant(mean_db, log_scale, score, precision)
+    secant = Secant(mean_db, log_scale, score, precision)
     if len(sides) < 2:
         return secant
-    own = [_information(model, result, _Secant(side[0], side[1], side[2])) + precision
+    own = [_information(model, result, Secant(side[0], side[1], side[2])) + precision
            for side in sides]
     below, above = (float(np.sqrt(np.mean(own) / each)) for each in own)
     return replace(secant, sides=(below, above))
@@ -151,7 +194,7 @@ def _moved(model: FoldModel, number: int, applied: AppliedEffect) -> CensoredReg
     return model.with_effects(effects).training
 
 
-def _information(model: FoldModel, result: FitResult, secant: _Secant) -> float:
+def _information(model: FoldModel, result: FitResult, secant: Secant) -> float:
     """Return the information of all links on a number, if all else were known."""
     curvature, scale_curvature = _curvatures(model.training, model.training.predict(result))[2:]
     return float((curvature * secant.mean_db**2 + scale_curvature * secant.log_scale**2
@@ -173,7 +216,7 @@ def _curvatures(problem: CensoredRegression, predicted: Linearisation,
             2 * problem.dof / (problem.dof + 3) * seen)
 
 
-def _scores(model: FoldModel, result: FitResult, secants: list[_Secant],
+def _scores(model: FoldModel, result: FitResult, secants: list[Secant],
             design_effect: float) -> Scores:
     """Return how links and priors bear on all coefficients, then on all numbers."""
     problem = model.training

@@ -26,7 +26,7 @@ from radiotwin.effects.declared_sectors import DeclaredSectors
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.registry import BUILT_IN
 from radiotwin.effects.sector_antenna import SectorPattern
-from radiotwin.effects.uncertainty import estimates
+from radiotwin.effects.uncertainty import estimates, linearise
 from radiotwin.links import prepare_links
 from radiotwin.links.features import link_features
 from radiotwin.measurements import Measurements
@@ -73,7 +73,7 @@ def taken(measurements):
     others = take_declared(result, [effect() for effect in BUILT_IN], 0, lambda _: None)
     assert len(others) == sum(not effect.is_declared for effect in BUILT_IN)
     whole, parameters = result.model.whole, {}
-    for each, estimate in zip(whole.effects, estimates(whole, result.model.fits[0]), strict=True):
+    for each, estimate in zip(whole.effects, estimates(linearise(whole, result.model.fits[0])), strict=True):
         parameters |= each.effect.parameters(links, each.params, estimate)
     return SimpleNamespace(before_db=base.rmse_db(), after_db=result.model.rmse_db(), scores=result.scores,
                            params=whole.effects[0].params if whole.effects else None, parameters=parameters,
