@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
+from threadpoolctl import ThreadpoolController
 
 from radiotwin.channel import ChannelModel
 from radiotwin.channel.forest import Forest
@@ -83,9 +84,19 @@ def grow_trees(kind: str, features: np.ndarray, target: np.ndarray, seed: int,
         return Forest.of_extra_trees(ExtraTreesRegressor(
             trees, min_samples_leaf=MIN_LEAF, max_features=MAX_FEATURES, random_state=seed,
             n_jobs=1).fit(features, target))
-    return Forest.of_boosting(HistGradientBoostingRegressor(
+    boosting = HistGradientBoostingRegressor(
         learning_rate=LEARNING_RATE * TREES / trees, max_iter=2 * trees, early_stopping=False,
-        random_state=seed).fit(features, target))
+        random_state=seed)
+    # Folds have threads of their own, and OpenMP's wait for each other busily: where a core has
+    # other work, several take a hundred times as long as one.
+    with _openmp().limit(limits=1):
+        return Forest.of_boosting(boosting.fit(features, target))
+
+
+@cache
+def _openmp() -> ThreadpoolController:
+    """Return what sets the threads of OpenMP, once scikit-learn is loaded."""
+    return ThreadpoolController().select(user_api="openmp")
 
 
 def trees_db(kind: str, part: Part, train: np.ndarray, test: np.ndarray, seed: int,
