@@ -34,6 +34,13 @@ def flown(make_links, view):
     return make
 
 
+def of_one_receiver(given, flights):
+    """View of some flights of receiver 1."""
+    rows = (given.links.receiver == 1) & np.isin(given.links.flight, flights)
+    return given.__class__(given.links.select(rows), given.residual_db[rows], given.scale_db[rows],
+                           given.mean_db[rows], given.level_at)
+
+
 def on_flight(links):
     return (links.receiver == 1) & (links.flight == 3)
 
@@ -66,16 +73,24 @@ def test_a_step_of_another_receiver_does_not_hide_a_faulty_flight(flown, seed):
 @pytest.mark.parametrize("seed", range(3))
 def test_of_three_flights_the_one_between_is_found_if_it_is_far_off_and_neither_of_the_others(flown, seed):
     """Two others do not tell how much flights usually differ: other campaigns do."""
-    def few(change):
-        given = flown(seed, change)
-        rows = (given.links.receiver == 1) & np.isin(given.links.flight, [0, 3, FLIGHTS - 1])
-        return given.__class__(given.links.select(rows), given.residual_db[rows], given.scale_db[rows],
-                               given.mean_db[rows], given.level_at)
+    def three(change):
+        return of_one_receiver(flown(seed, change), [0, 3, FLIGHTS - 1])
 
-    (params,) = FaultyFlight().propose(few(lambda links, rng: np.where(on_flight(links), -12.0, 0.0)))
+    (params,) = FaultyFlight().propose(three(lambda links, rng: np.where(on_flight(links), -12.0, 0.0)))
     assert params.flight == "f3"
-    assert FaultyFlight().propose(few(lambda links, rng: np.where(on_flight(links), -2.5, 0.0))) == []
-    assert FaultyFlight().propose(few(lambda links, rng: np.where(links.flight == FLIGHTS - 1, -12.0, 0.0))) == []
+    assert FaultyFlight().propose(three(lambda links, rng: np.where(on_flight(links), -2.5, 0.0))) == []
+    assert FaultyFlight().propose(three(lambda links, rng: np.where(links.flight == FLIGHTS - 1, -12.0, 0.0))) == []
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_cable_of_4_db_is_found_where_the_few_other_flights_agree(flown, seed):
+    def four(loss_db):
+        return of_one_receiver(flown(seed, lambda links, rng: np.where(on_flight(links), -loss_db, 0.0)),
+                               [0, 1, 3, FLIGHTS - 1])
+
+    (params,) = FaultyFlight().propose(four(4.0))
+    assert params.flight == "f3"
+    assert FaultyFlight().propose(four(1.0)) == []
 
 
 def test_what_is_compared_once_is_remembered_and_cannot_be_changed(flown):
