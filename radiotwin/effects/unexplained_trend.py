@@ -13,7 +13,7 @@ from radiotwin.effects.arrays import LinkCache
 from radiotwin.effects.base import GainEffect, Term
 from radiotwin.effects.params import EffectParams, Estimate, Parameter
 from radiotwin.effects.residual_view import LevelAt, ResidualView
-from radiotwin.links import LinkData, residual_variables
+from radiotwin.links import LinkData, residual_variable
 
 KNOTS = 8
 PRIOR_SD_DB = 5.0  # of the value at a knot
@@ -85,7 +85,7 @@ class UnexplainedTrend(GainEffect):
     def _value(self, links: LinkData, level_at: LevelAt) -> np.ndarray:
         """Return the variable (n,)."""
         return self._values.get(
-            links, (level_at,), lambda: residual_variables(links, level_at(links))[self.variable])
+            links, (level_at,), lambda: residual_variable(self.variable, links, level_at(links)))
 
 
 def curve_columns(value: np.ndarray, knots: int, circular: bool) -> np.ndarray:

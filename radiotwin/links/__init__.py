@@ -6,8 +6,8 @@ from radiotwin.links.geometry import LinkGeometry, link_geometry
 from radiotwin.links.link_data import LinkData
 from radiotwin.links.prepare import join_links, prepare_links
 from radiotwin.links.sites import site_of
-from radiotwin.links.variables import residual_variables
+from radiotwin.links.variables import residual_variable, residual_variables
 
 __all__ = ["LinkData", "LinkGeometry", "correlation_length_m", "design_effect", "evidence_blocks",
-           "join_links", "link_geometry", "places", "prepare_links", "residual_variables",
-           "site_of", "with_evidence"]
+           "join_links", "link_geometry", "places", "prepare_links", "residual_variable",
+           "residual_variables", "site_of", "with_evidence"]
