@@ -4,6 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from sklearn.ensemble import HistGradientBoostingRegressor
+from threadpoolctl import ThreadpoolController
 
 from radiotwin.closeloop.advice import compare_with_baselines
 from radiotwin.closeloop.baselines import BOOSTING, EXTRA_TREES, Part, grow_trees, published_laws
@@ -93,3 +95,16 @@ def test_a_model_of_fewer_links_is_not_compared():
     error = {"combined": scores(3.6), "after": scores(3.6)}
     assert compare_with_baselines(error, {"regression_kriging": scores(1.0, 50)}) is None
     assert compare_with_baselines({"combined": scores(None, 0), "after": scores(None, 0)}, {}) is None
+
+
+def test_boosting_has_one_thread_and_leaves_those_of_others(monkeypatch):
+    """Threads of OpenMP wait for each other busily, which takes a hundred times as long on a core with other work."""
+    openmp = ThreadpoolController().select(user_api="openmp")
+    seen, fit = [], HistGradientBoostingRegressor.fit
+    monkeypatch.setattr(HistGradientBoostingRegressor, "fit", lambda *given: (
+        seen.extend(each["num_threads"] for each in openmp.info()), fit(*given))[1])
+    rng = np.random.default_rng(0)
+    with openmp.limit(limits=2):
+        grow_trees(BOOSTING, rng.normal(size=(100, 3)), rng.normal(size=100), 0, 2)
+        after = {each["num_threads"] for each in openmp.info()}
+    assert set(seen) == {1} and after == {2}

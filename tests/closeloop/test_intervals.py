@@ -14,6 +14,7 @@ from radiotwin.effects.gain_offsets import DeviceGainOffset, ReceiverGainOffset
 from radiotwin.effects.params import Allowed, Parameter
 from radiotwin.effects.position_errors import DevicePositionError
 from radiotwin.effects.sector_antenna import SectorAntenna
+from radiotwin.effects.uncertainty import estimates, linearise
 from tests.closeloop.drives import MASTS_M, drive, fitted
 
 AZIMUTH_DEG, WIDTH_DEG, BACK_DB = 200.0, 70.0, 20.0
@@ -87,6 +88,31 @@ def test_the_position_of_a_mast_is_held():
     moved_m[1, :2] += (30.0, -20.0)
     (found,) = effect_parameters(fitted(drive(1), DevicePositionError(), devices_m=moved_m))
     assert holds(found["x_m[d1]"], MASTS_M[1, 0]) and holds(found["y_m[d1]"], MASTS_M[1, 1])
+
+
+def test_folds_follow_no_paths_of_their_own_for_intervals(monkeypatch):
+    """What moving a mast does is followed over the whole; each fold looks at that on its own links."""
+    moved_m = MASTS_M.copy()
+    moved_m[1, :2] += (30.0, -20.0)
+    effect = DevicePositionError()
+    model = fitted(drive(1), effect, devices_m=moved_m)
+    exact = [each.with_effects([each.apply(effect, effect.exact(each.effects[0].params))]) for each in model.models]
+    model = model.extended(exact, [each.fit() for each in exact])
+    own = [np.concatenate(estimates(linearise(fold, fit))[0].sides_sd)
+           for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
+
+    moves_m, term = [], DevicePositionError.term
+    monkeypatch.setattr(DevicePositionError, "term", lambda self, links, params, level_at: (
+        moves_m.append(params.move_m), term(self, links, params, level_at))[1])
+    (found,) = effect_parameters(model)
+    assert holds(found["x_m[d1]"], MASTS_M[1, 0]) and holds(found["y_m[d1]"], MASTS_M[1, 1])
+    around = np.array(model.whole.effects[0].params.move_m)
+    assert 4 <= len(moves_m) <= 8 and (np.array(moves_m) == around).any(axis=1).all()
+
+    whole = linearise(model.whole, model.fits[0])
+    shared = [np.concatenate(estimates(linearise(fold, fit, intervals._as_followed(whole, fold)))[0].sides_sd)
+              for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
+    np.testing.assert_allclose(shared, own, rtol=0.4)
 
 
 @pytest.mark.parametrize(("values", "allowed", "reach"), (
