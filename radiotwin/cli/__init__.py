@@ -1,11 +1,16 @@
 """The command `radiotwin`."""
 
+import os
+
 from radiotwin import signals
 
 
 def main() -> None:
     """Run the command line and end the process; see `exit_status`."""
     signals.handle()  # before anything that takes time
+    # On matrices as small as here several threads of a BLAS are slower than one, and wait busily;
+    # what can be done side by side has threads and workers of its own. Read when it is loaded.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from radiotwin.cli.commands import app
     from radiotwin.exits import exit_status
     from radiotwin.interruption import after_interrupt

@@ -141,3 +141,18 @@ def test_planning_has_the_same_options(small_scene, tmp_path):
     assert done.returncode == 0, done.stderr
     rows = json.loads(done.stdout)["tables"][0]["rows"]
     assert [row["method"] for row in rows] == ["random", "planner", "greedy"]
+
+
+@pytest.mark.parametrize("given", [None, "2"])
+def test_the_command_has_one_thread_of_blas_if_nothing_else_is_said(given):
+    """Several wait for each other busily, and sums have another order for each number of them."""
+    program = ("import sys; from radiotwin import cli, signals; assert 'numpy' not in sys.modules\n"
+               "signals.leave, sys.argv = (lambda status: None), ['radiotwin', '--version']\n"
+               "cli.main()\n"
+               "import numpy, threadpoolctl\n"
+               "print({each['num_threads'] for each in threadpoolctl.threadpool_info() if each['user_api'] == 'blas'})")
+    environment = {name: value for name, value in os.environ.items() if not name.endswith("_NUM_THREADS")}
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment | {
+        "PYTHONPATH": ROOT} | ({"OPENBLAS_NUM_THREADS": given} if given else {}))
+    threads = min(int(given or 1), os.cpu_count())
+    assert done.stdout.splitlines()[-1] == f"{{{threads}}}", done.stderr
