@@ -187,6 +187,8 @@ def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
 def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
                frequency_hz: float) -> list[_NewPaths]:
     """Return powers, departures and arrivals as of `_Followed` from positions to ends (n, 3)."""
+    if not asked:  # as most often: no bar, and no numba, for what is remembered
+        return []
     from radiotwin.paths.powers import COMPONENTS, SECTORS, path_powers
 
     def follow(number: int) -> _NewPaths:
@@ -208,9 +210,10 @@ def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
 
     parts: KeptParts[int, _NewPaths] = KeptParts(
         "paths", lambda number: (city, *asked[number], frequency_hz), write, read)
+    names = [parts.name(number) for number in range(len(asked))]
     found = {}
-    for number, (_, ends_m) in enumerate(asked):
-        earlier = parts.get(number)
+    for number, (name, (_, ends_m)) in enumerate(zip(names, asked, strict=True)):
+        earlier = parts.find(name) if name else None
         if earlier is not None and len(earlier[0][0]) == len(ends_m):
             found[number] = earlier[0]
     new = [number for number in range(len(asked)) if number not in found]
@@ -223,7 +226,8 @@ def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],
 
         # Threads follow, and one keeps: what is kept notes warnings, of which there is one place.
         for number, (value, seconds) in zip(new, in_threads(timed, new), strict=True):
-            parts.put(number, value, [], seconds)
+            if names[number]:
+                parts.keep(names[number], value, [], seconds)
             found[number] = value
     return [found[number] for number in range(len(asked))]
 
