@@ -43,11 +43,14 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
 
 
 def _calibration(loop: Loop) -> RadiusCalibration:
-    """Return how far positions that the loop's models locate are to be believed."""
-    model, links = loop.after, loop.links
+    """Return how far positions are to be believed that the loop's models locate as its twin does.
+
+    That is without what only describes the rest: the twin does not have it, either.
+    """
+    model, links = loop.explained, loop.links
     if model.whole.channel.follows_paths:  # which locates nothing: `check_can_locate`
         return RadiusCalibration()
-    models = [EffectModel.of(fold, fit).for_positions()
+    models = [EffectModel.of(fold, fit, causes_only=True).for_positions()
               for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
     held_out = [links.select(model.index == number) for number in range(len(models))]
     return calibrate_radii(models, held_out, whole_area(models[0], links), 0)

@@ -20,6 +20,7 @@ from radiotwin.effects.arrays import one_hot
 from radiotwin.effects.base import Effect
 from radiotwin.effects.correlated_shadowing import receivers_move
 from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.params import NEAR_SHARE
 from radiotwin.effects.unexplained_trend import curve_columns
 from radiotwin.inference.censored_regression import FitResult
 from radiotwin.inference.correlated_evidence import Columns, CorrelatedEvidence
@@ -207,7 +208,9 @@ def _slopes(model: FoldModel, fit: FitResult) -> Columns:
     if variation is None:
         return Columns(np.zeros((int(model.train.sum()), 0)), np.zeros(0))
     mean_db, slopes_db = model.training.predict(fit).mean_db, []
-    for number, step in enumerate(STEP_SHARE * variation.steps):
+    # Of paths those that folds will ask for, too.
+    share = NEAR_SHARE if variation.follows_paths else STEP_SHARE
+    for number, step in enumerate(share * variation.steps):
         values = variation.values.copy()
         if values[number] + step > variation.high[number]:
             step = -step

@@ -11,7 +11,12 @@ from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.closeloop.ends import ends_of
 from radiotwin.closeloop.hypotheses import Hypotheses, is_judged_by_levels
 from radiotwin.effects.base import Effect
-from radiotwin.effects.fitting import add_effect, prepare_additions
+from radiotwin.effects.fitting import (
+    add_effect,
+    along_paths,
+    prepare_additions,
+    takes_many_paths,
+)
 from radiotwin.effects.fold_model import FittedEffect, FoldModel
 from radiotwin.effects.params import EffectParams
 from radiotwin.execution import Executor
@@ -110,6 +115,10 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
     whole = add_effect(model.whole, effect, model.fits[0])
     if whole is None:
         return replace(refused, reason="nothing in the residual looks like it")
+    why = _why_no_paths(*whole, hypotheses)
+    if why:
+        return replace(refused, reason=why)
+    whole = along_paths(*whole, model.fits[0])
     coefficients = whole[1].coefficients[whole[0].coefficient_slices[-1]]
     params = whole[0].effects[-1].params
     why = effect.implausible(params, coefficients) or effect.contradicted(params, model.links)
@@ -122,6 +131,23 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
     if hypotheses is None or not is_judged_by_levels(effect):
         return Candidate(effect, *whole, gain)
     return Candidate(effect, *whole, gain, hypotheses.of_named(*whole))
+
+
+def _why_no_paths(model: FoldModel, fit: FitResult, hypotheses: Hypotheses | None) -> str | None:
+    """Return why a candidate, a model's last effect, is not worth that its paths are followed.
+
+    None where it is, or where there are none.
+    """
+    last = model.effects[-1]
+    if not last.effect.always_exact:
+        return None
+    why = last.effect.contradicted(last.params, model.links)
+    if why or hypotheses is None or not takes_many_paths(model):
+        return why
+    evidence = hypotheses.of_named(model, fit)
+    if evidence >= 0:
+        return None
+    return f"errors of the base that are correlated explain what it does ({evidence:.0f} nats)"
 
 
 def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.ndarray, tried: int,

@@ -69,8 +69,9 @@ class RemovedObstacle(GainEffect):
             behind = ~links.city.without(label != building).line_of_sight(a_m, b_m)
             if behind.sum() >= MIN_LINKS:
                 total[building] = nats[behind].sum()
+        # A building behind which links are no stronger than they should be is there.
         likely = [int(building) for building in np.argsort(-total)[:MAX_PROPOSALS]
-                  if np.isfinite(total[building])]
+                  if total[building] > 0]
         gains = {building: _gain_nats(view, building, _without(links.city, building)[0])
                  for building in likely}
         for building in sorted(gains, key=gains.__getitem__, reverse=True):

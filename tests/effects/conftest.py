@@ -8,28 +8,9 @@ import pytest
 import radiotwin as rt
 from radiotwin.closeloop.result_file import scores
 from radiotwin.effects.residual_view import ResidualView
-from radiotwin.links import LinkData
-from tests.worlds import open_ground
+from tests.worlds import make_links, open_ground
 
-__all__ = ["open_ground"]
-
-
-@pytest.fixture
-def make_links():
-    """Make the links of every receiver position (n, 3) to every device (k, 3): LinkData of n k links."""
-    def make(device_m, receiver_m, **given):
-        device_m, receiver_m = np.atleast_2d(device_m).astype(float), np.atleast_2d(receiver_m).astype(float)
-        each, count = len(device_m), len(receiver_m) * len(device_m)
-        values = {"level_db": np.zeros(count), "receiver": np.zeros(count, int), "flight": np.zeros(count, int),
-                  "time_s": np.full(count, np.nan), "heading_deg": np.full(count, np.nan), "limit_db": None} | given
-        names = [[f"{letter}{i}" for i in range(total)] for letter, total in
-                 (("d", each), ("r", values["receiver"].max() + 1), ("f", values["flight"].max() + 1))]
-        limit_db = -np.inf if values["limit_db"] is None else values["limit_db"]
-        return LinkData(values["level_db"], np.full(count, float(limit_db)), np.repeat(receiver_m, each, axis=0), device_m,
-                        np.tile(np.arange(each), len(receiver_m)), values["receiver"], values["flight"],
-                        values["time_s"], values["heading_deg"], *names, values.get("frequency_hz", 2.4e9),
-                        values.get("city"), True, frozenset(range(each)))
-    return make
+__all__ = ["make_links", "open_ground"]
 
 
 @pytest.fixture

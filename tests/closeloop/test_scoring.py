@@ -1,0 +1,71 @@
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from radiotwin.channel.log_distance import LogDistance, LogDistanceLine
+from radiotwin.closeloop.criteria import SelectionCriteria
+from radiotwin.closeloop.scoring import Candidate, fit_candidate
+from radiotwin.effects import fitting
+from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.position_errors import DevicePositionError
+
+DEVICES_M, MOVED_M = np.array([[0.0, 0.0, 10.0], [300.0, 200.0, 10.0]]), np.array([[14.0, -18.0, 0.0], [0.0, 0.0, 0.0]])
+
+
+class SlowLaw(LogDistance):
+    """A law whose exact levels are the quick ones, and counted."""
+
+    follows_paths = True
+
+    def __init__(self, line):
+        super().__init__(line)
+        self.followed = 0
+
+    def level_at(self, links, exact=False):
+        self.followed += exact
+        return self.predict(links.geometry)[0]
+
+
+@pytest.fixture
+def moved(make_links):
+    """A model of two anchors, one of them elsewhere, and its channel."""
+    rng = np.random.default_rng(0)
+    receiver_m = np.column_stack([rng.uniform(-150, 400, 300), rng.uniform(-150, 350, 300), rng.uniform(20, 60, 300)])
+    distance_m = np.linalg.norm(receiver_m[:, None] - (DEVICES_M + MOVED_M), axis=2).ravel()
+    links = make_links(DEVICES_M, receiver_m, level_db=-40 - 22 * np.log10(distance_m) + rng.normal(0, 0.5, 600))
+    channel = SlowLaw(LogDistanceLine(-40.0, -2.2, 0.5))
+    whole = FoldModel.build(links, channel, 5.0)
+    return SimpleNamespace(whole=whole, fits=[whole.fit()], links=links), channel
+
+
+class Sentenced(DevicePositionError):
+    """A position that its map speaks against."""
+
+    def contradicted(self, params, links):
+        return "a lake is there"
+
+
+def fitted(moved, evidence_nats, effect=DevicePositionError):
+    model, channel = moved
+    hypotheses = SimpleNamespace(of_named=lambda *_: evidence_nats)
+    channel.followed = 0
+    return fit_candidate(model, effect(), 0, SelectionCriteria(), hypotheses), channel.followed
+
+
+def test_no_paths_are_followed_for_what_correlated_errors_explain(moved, monkeypatch):
+    monkeypatch.setattr(fitting, "MAX_EXACT_NUMBERS", 1)  # a position has two
+    refused, followed = fitted(moved, -1.0)
+    assert "correlated" in refused.reason and "-1 nats" in refused.reason and not followed
+    found, followed = fitted(moved, 1.0)
+    assert isinstance(found, Candidate) and followed
+
+
+def test_of_few_numbers_paths_are_followed_whatever_quick_levels_say(moved):
+    found, followed = fitted(moved, -1.0)
+    assert isinstance(found, Candidate) and followed and found.whole.effects[-1].params.device == 0
+
+
+def test_no_paths_are_followed_for_what_the_map_speaks_against(moved):
+    refused, followed = fitted(moved, 1.0, Sentenced)
+    assert refused.reason == "a lake is there" and not followed
