@@ -27,6 +27,7 @@ DIRECTIONS = 12
 ROUNDS = 3  # of moves
 MAX_LINKS = 300  # of a device
 MIN_LINKS = 10
+MIN_MOVE_M = 2.0  # along paths, which put a device to about a metre
 MAX_LOSS_NATS = 0.01  # a link, of those that could be predicted before, where more can be now
 
 
@@ -44,7 +45,8 @@ def relocate_devices(model: CrossValidatedModel, links: LinkData, base: Base
 
     Returns:
         the moved one where that makes held-out links likelier, else the same. The same, too, where
-        all devices are known, or where paths are followed and the map is as it was.
+        all devices are known, or where paths are followed and the map is as it was or moves no
+        device.
     """
     unknown = [device for device in range(len(links.device_names)) if device not in links.anchors]
     if not unknown or not any(each.effect.is_cause for each in model.whole.effects):
@@ -55,14 +57,24 @@ def relocate_devices(model: CrossValidatedModel, links: LinkData, base: Base
                  for each, fit in zip(model.models, model.fits, strict=True)]
         twin = replace(twin, devices=_with_positions(twin.devices, moved[0].links.device_m))
     elif _corrected_map(model.whole) is not links.city:
-        located = [_located_anew(each, links, model.index != number, base)
-                   for number, each in enumerate(model.models, start=-1)]
-        moved, devices = [each for each, _ in located], located[0][1]
-        twin = replace(twin, devices=devices)
+        located = [_located_anew(model.whole, links, np.ones(len(links), bool), base)]
+        if not _is_moved(model.whole.links.device_m, located[0][0].links.device_m):
+            return model  # which takes folds minutes, too
+        located += [_located_anew(each, links, model.index != number, base)
+                    for number, each in enumerate(model.folds)]
+        moved = [each for each, _ in located]
+        twin = replace(twin, devices=located[0][1])
     else:
         return model
     found = replace(model.extended(moved, [each.fit() for each in moved]), twin=twin)
     return found if is_better(model.held_out_nll, found.held_out_nll) else model
+
+
+def _is_moved(before_m: np.ndarray, after_m: np.ndarray) -> bool:
+    """Return whether any device moves noticeably, is found or is lost; (k, 3), NaN for none."""
+    found = np.isfinite(before_m[:, 0]), np.isfinite(after_m[:, 0])
+    apart_m = np.linalg.norm(after_m - before_m, axis=1)
+    return bool((found[0] != found[1]).any() or (apart_m[found[0] & found[1]] > MIN_MOVE_M).any())
 
 
 def is_better(before_nll: np.ndarray, after_nll: np.ndarray) -> bool:

@@ -16,7 +16,7 @@ from scipy.sparse import csr_array, hstack, issparse, vstack
 
 from radiotwin.effects.base import DetectionEffect, LimitEffect
 from radiotwin.effects.fold_model import AppliedEffect, FoldModel
-from radiotwin.effects.params import Estimate, Variation
+from radiotwin.effects.params import NEAR_SHARE, Estimate, Variation
 from radiotwin.inference import student
 from radiotwin.inference.censored_regression import CensoredRegression, FitResult, Linearisation
 from radiotwin.inference.sandwich import Scores
@@ -138,11 +138,13 @@ def _secants(model: FoldModel, result: FitResult, number: int, variation: Variat
     if variation is None:
         return []
     found = []
-    for i, step in enumerate(variation.steps):
-        secant = _secant(model, result, number, variation, i, float(step))
+    # Of paths first those that folds have asked for, too.
+    steps = (NEAR_SHARE if variation.follows_paths else 1.0) * variation.steps
+    for i, (step, usual) in enumerate(zip(steps.tolist(), variation.steps.tolist(), strict=True)):
+        secant = _secant(model, result, number, variation, i, step)
         information = _information(model, result, secant)
         sd = np.sqrt(design_effect / (information + design_effect * secant.precision))
-        wanted = float(np.clip(sd, *(share * step for share in STEP_SHARES)))
+        wanted = float(np.clip(sd, *(share * usual for share in STEP_SHARES)))
         if not 0.5 < wanted / step < 2.0:
             secant = _secant(model, result, number, variation, i, wanted)
         found.append(secant)

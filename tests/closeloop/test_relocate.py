@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from radiotwin.closeloop import relocate
 from radiotwin.closeloop.bases import make_bases
 from radiotwin.closeloop.relocate import is_better, relocate_devices
 from radiotwin.effects.fold_model import FoldModel
@@ -50,3 +51,36 @@ def test_a_device_that_is_found_counts_for_more_than_chance_on_the_links_of_othe
     before_nll = np.where(np.arange(200) < lost, np.nan, 2.0)
     after_nll = np.where(np.isnan(before_nll), 2.0, 2.0 + change_nats)
     assert is_better(before_nll, after_nll) == kept
+
+
+class Following:
+    """A channel that follows paths, and is otherwise another one."""
+
+    follows_paths = True
+
+    def __init__(self, channel):
+        self._channel = channel
+
+    def __getattr__(self, name):
+        return getattr(self._channel, name)
+
+
+@pytest.mark.parametrize(("moved_m", "asked"), [(1.0, 1), (np.nan, 7), (12.0, 7)])
+def test_along_paths_folds_are_located_anew_only_where_a_device_moves(monkeypatch, moved_m, asked):
+    """By what the whole says; NaN: the device is lost over the corrected map."""
+    model = misplaced(3)
+    assert len(model.models) == 7
+    model = model.extended([replace(each, channel=Following(each.channel)) for each in model.models], model.fits)
+    located = []
+
+    def anew(each, links, mine, base):
+        located.append(mine.sum())
+        device_m = each.links.device_m.copy()
+        device_m[1, 0] += moved_m
+        return FoldModel.build(each.links, each.channel, each.dof, device_m=device_m, train=mine), model.twin.devices
+
+    monkeypatch.setattr(relocate, "_corrected_map", lambda each: "another map")
+    monkeypatch.setattr(relocate, "_located_anew", anew)
+    found = relocate_devices(model, model.links, make_bases(None, 0)["twin"])
+    assert len(located) == asked and located[0] == len(model.links)
+    assert found is model or asked > 1
