@@ -271,7 +271,7 @@ def _keep_best(result: SelectionResult, passed: list[Passed], supported: list[Pa
     most = criteria.max_repeats if not first.effect.repeatable else _on_one_mast(first.model)
     if rival is not None and most > 1:
         on_progress(f"step {step + 1}: more of {rival.score.name}")
-        several = _several(rival, block, hypotheses, seed, least, most, criteria, result.executor)
+        several = _several(result, rival, block, hypotheses, seed, least, most)
         if several and rival.score.reason:
             several = _if_likelier(result, several, first.score)
         steps = several or steps
@@ -332,8 +332,8 @@ def _on_one_mast(model: CrossValidatedModel) -> int:
     return len(devices) if on_mast else 0
 
 
-def _several(rival: Passed, block: np.ndarray, hypotheses: Hypotheses | None, seed: int,
-             min_nats: float, most: int, criteria: SelectionCriteria, executor: Executor,
+def _several(result: SelectionResult, rival: Passed, block: np.ndarray,
+             hypotheses: Hypotheses | None, seed: int, min_nats: float, most: int,
              ) -> list[tuple[CandidateScore, CrossValidatedModel]] | None:
     """Add an effect of which a step finds one again and again, until all have more than `min_nats`.
 
@@ -342,11 +342,11 @@ def _several(rival: Passed, block: np.ndarray, hypotheses: Hypotheses | None, se
     """
     steps = [(rival.score, rival.model)]
     score, extended = steps[0]
-    while len(extended.whole.effects) < criteria.max_effects and len(steps) < most:
+    while len(extended.whole.effects) < result.criteria.max_effects and len(steps) < most:
         if hypotheses is not None:
             hypotheses = Hypotheses.of(extended.whole, extended.fits[0], seed)
         score, more = fit_and_score(extended, rival.effect, block, 1, score.step + 1, seed,
-                                    criteria, executor, hypotheses)
+                                    result.criteria, result.executor, hypotheses)
         if more is None:
             return None
         extended = more
