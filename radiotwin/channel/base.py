@@ -106,6 +106,10 @@ class ChannelModel(ABC):
         """Return the index (n,) of the error scale: LoS 1, NLoS 0; 0 for all without classes."""
         return links.los.astype(int) if self._by_class(links) else np.zeros(len(links), dtype=int)
 
+    def error_groups(self, links: LinkGeometry) -> int:
+        """Return how many error scales there are, also where no link is of one of the classes."""
+        return 2 if self._by_class(links) else 1
+
     def _by_class(self, links: LinkGeometry) -> bool:
         return links.city is not None and self.uses_map
 

@@ -123,6 +123,10 @@ class ImagePaths(ChannelModel):
         return links.los.astype(int)
 
     @override
+    def error_groups(self, links: LinkGeometry) -> int:
+        return 2
+
+    @override
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         arrays, settings = self.law.state()
         return arrays, {"law": self.law.name, "law_settings": settings,

@@ -10,6 +10,7 @@ from radiotwin.closeloop.blending import make_blend, needs_rest
 from radiotwin.closeloop.run import Loop
 from radiotwin.effects.correlated_shadowing import CorrelatedShadowing
 from radiotwin.effects.effect_model import EffectModel
+from radiotwin.effects.position_errors import DevicePositionError
 from radiotwin.localize import RadiusCalibration, calibrate_radii, whole_area
 from radiotwin.scene import Scene
 from radiotwin.twin.twin import Twin
@@ -52,5 +53,9 @@ def _calibration(loop: Loop) -> RadiusCalibration:
         return RadiusCalibration()
     models = [EffectModel.of(fold, fit, causes_only=True).for_positions()
               for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
-    held_out = [links.select(model.index == number) for number in range(len(models))]
+    # A device that the loop found elsewhere is not where it was declared.
+    moved = {device for each in model.whole.effects if isinstance(each.effect, DevicePositionError)
+             for device in model.links.device[each.acts].tolist()}
+    known = replace(links, anchors=links.anchors - moved)
+    held_out = [known.select(model.index == number) for number in range(len(models))]
     return calibrate_radii(models, held_out, whole_area(models[0], links), 0)

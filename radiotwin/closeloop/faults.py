@@ -78,7 +78,8 @@ def select_faults(result: SelectionResult, effects: list[Effect], links: LinkDat
                 score = judge([score], model, hypotheses, result.criteria)[0][0]
             if extended is not None and not score.reason:
                 size_db = effect_size_db(extended, step)
-                score = replace(score, reason=why_not_borne_out(size_db))
+                why = why_not_borne_out(size_db)
+                score = replace(score, passed=not why, reason=why)
             if extended is not None and not score.reason:
                 kept = candidate
                 model = extended

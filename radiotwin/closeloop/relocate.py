@@ -58,7 +58,7 @@ def relocate_devices(model: CrossValidatedModel, links: LinkData, base: Base
         twin = replace(twin, devices=_with_positions(twin.devices, moved[0].links.device_m))
     elif _corrected_map(model.whole) is not links.city:
         located = [_located_anew(model.whole, links, np.ones(len(links), bool), base)]
-        if not _is_moved(model.whole.links.device_m, located[0][0].links.device_m):
+        if not _is_moved(model.whole, located[0][0]):
             return model  # which takes folds minutes, too
         located += [_located_anew(each, links, model.index != number, base)
                     for number, each in enumerate(model.folds)]
@@ -70,11 +70,11 @@ def relocate_devices(model: CrossValidatedModel, links: LinkData, base: Base
     return found if is_better(model.held_out_nll, found.held_out_nll) else model
 
 
-def _is_moved(before_m: np.ndarray, after_m: np.ndarray) -> bool:
-    """Return whether any device moves noticeably, is found or is lost; (k, 3), NaN for none."""
-    found = np.isfinite(before_m[:, 0]), np.isfinite(after_m[:, 0])
-    apart_m = np.linalg.norm(after_m - before_m, axis=1)
-    return bool((found[0] != found[1]).any() or (apart_m[found[0] & found[1]] > MIN_MOVE_M).any())
+def _is_moved(before: FoldModel, after: FoldModel) -> bool:
+    """Return whether any device with links moves noticeably, is found or is lost."""
+    apart_m = np.linalg.norm(after.links.device_m - before.links.device_m, axis=1)
+    moved = apart_m[before.links.device] > MIN_MOVE_M
+    return bool(((before.usable != after.usable) | (before.usable & moved)).any())
 
 
 def is_better(before_nll: np.ndarray, after_nll: np.ndarray) -> bool:

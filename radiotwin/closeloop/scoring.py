@@ -115,13 +115,15 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
     whole = add_effect(model.whole, effect, model.fits[0])
     if whole is None:
         return replace(refused, reason="nothing in the residual looks like it")
-    why = _why_no_paths(*whole, hypotheses)
+    links = model.whole.links.select(model.whole.usable)
+    why = effect.contradicted(whole[0].effects[-1].params, links)
     if why:
         return replace(refused, reason=why)
-    whole = along_paths(*whole, model.fits[0])
+    if _is_worth_paths(*whole, hypotheses):
+        whole = along_paths(*whole, model.fits[0])
     coefficients = whole[1].coefficients[whole[0].coefficient_slices[-1]]
     params = whole[0].effects[-1].params
-    why = effect.implausible(params, coefficients) or effect.contradicted(params, model.links)
+    why = effect.implausible(params, coefficients) or effect.contradicted(params, links)
     if why:
         return replace(refused, reason=why)
     gain = model.fits[0].objective - whole[1].objective
@@ -133,21 +135,14 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
     return Candidate(effect, *whole, gain, hypotheses.of_named(*whole))
 
 
-def _why_no_paths(model: FoldModel, fit: FitResult, hypotheses: Hypotheses | None) -> str | None:
-    """Return why a candidate, a model's last effect, is not worth that its paths are followed.
+def _is_worth_paths(model: FoldModel, fit: FitResult, hypotheses: Hypotheses | None) -> bool:
+    """Return whether the last effect explains so much that its paths may be followed many times.
 
-    None where it is, or where there are none.
+    What correlated errors of the base explain as well is judged by quick levels.
     """
-    last = model.effects[-1]
-    if not last.effect.always_exact:
-        return None
-    why = last.effect.contradicted(last.params, model.links)
-    if why or hypotheses is None or not takes_many_paths(model):
-        return why
-    evidence = hypotheses.of_named(model, fit)
-    if evidence >= 0:
-        return None
-    return f"errors of the base that are correlated explain what it does ({evidence:.0f} nats)"
+    if hypotheses is None or not takes_many_paths(model):
+        return True
+    return hypotheses.of_named(model, fit) >= 0
 
 
 def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.ndarray, tried: int,
@@ -235,6 +230,8 @@ def score_model(model: CrossValidatedModel, extended: CrossValidatedModel, score
     if total < criteria.min_gain_nats:
         reason = (f"gains {total:.0f} nats on held-out links, {criteria.min_gain_nats:.0f} are "
                   "needed")
+    elif total <= 0:
+        reason = "gains nothing on held-out links"
     elif p_value > criteria.max_p_value:
         reason = f"its gain may be chance (p = {p_value:.2g} after correction)"
     elif few_p > criteria.max_sign_flip_p_value:

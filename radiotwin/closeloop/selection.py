@@ -238,7 +238,8 @@ def _keep_together(result: SelectionResult, found: list[Passed], step: int) -> N
     """Keep effects that are probable together."""
     first = found[0].score
     for i, entry in enumerate(result.scores):
-        if entry.step == step and entry.name == first.name and entry.passed:
+        same = (entry.name, entry.variant) == (first.name, first.variant)
+        if entry.step == step and same and entry.passed:
             result.scores[i] = replace(first, kept=True)
             break
     result.scores += [replace(each.score, kept=True) for each in found[1:]]

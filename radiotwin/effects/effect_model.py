@@ -195,4 +195,4 @@ def device_sd_db(model: FoldModel, result: FitResult) -> float:
     mean_db = np.bincount(device, weights=rest_db)[enough] / count[enough]
     within = np.bincount(device, weights=rest_db**2)[enough] / count[enough] - mean_db**2
     noise = (within / (count[enough] - 1)).mean()
-    return float(np.sqrt(max(mean_db.var() - noise, 0.0)))
+    return float(np.sqrt(max(mean_db.var(ddof=1) - noise, 0.0)))

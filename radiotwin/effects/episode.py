@@ -234,8 +234,10 @@ def _best_window(ends_s: np.ndarray, time_s: np.ndarray, rest_db: np.ndarray, we
     allowed = (inside >= MIN_INSIDE) & (inside <= MAX_INSIDE * len(time_s))
     if not allowed.any():
         return None
-    centred, total = rest_db - weight @ rest_db / weight.sum(), weight.sum()
-    best = None
+    total = weight.sum()
+    if not total > 0:
+        return None
+    centred, best = rest_db - weight @ rest_db / total, None
     shapes: dict[Literal["loss", "attenuation"], np.ndarray] = {
         "loss": np.ones(len(cell)), "attenuation": distance_km}
     for form, shape in shapes.items():
@@ -248,7 +250,7 @@ def _best_window(ends_s: np.ndarray, time_s: np.ndarray, rest_db: np.ndarray, we
         nats = np.where(allowed & (xx > 0), 0.5 * xd**2 / power, -np.inf) - np.log(allowed.sum())
         nats = np.where(xd < 0, nats, -np.inf)  # what comes and goes takes away
         start, end = np.unravel_index(int(nats.argmax()), nats.shape)
-        if best is None or nats[start, end] > best.nats:
+        if nats[start, end] > (-np.inf if best is None else best.nats):
             likely = nats > nats[start, end] - INTERVAL_NATS
             starts, stops = np.flatnonzero(likely[:, end]), np.flatnonzero(likely[start])
             last_s = np.r_[-np.inf, np.maximum.accumulate(_last_s(cell, time_s, len(ends_s)))]

@@ -67,7 +67,7 @@ def along_paths(model: FoldModel, result: FitResult,
     effect, gain = model.effects[-1].effect, without.objective - result.objective
     if not effect.always_exact or gain < MIN_GAIN_NATS or not _changes_few(model):
         return model, result
-    found = kept("effect along paths", (model, result, without),
+    found = kept("effect-along-paths", (model, result, without),
                  lambda: _best_along_paths(model, result, without), _write_addition,
                  _reader(model.with_effects(model.effects[:-1]), effect))
     return found or (model, result)
@@ -76,7 +76,9 @@ def along_paths(model: FoldModel, result: FitResult,
 def takes_many_paths(model: FoldModel) -> bool:
     """Return whether `along_paths` follows paths many times: the last effect has many numbers."""
     last = model.effects[-1]
-    variation = last.effect.variation(last.params) if last.effect.always_exact else None
+    if not (last.effect.always_exact and model.channel.follows_paths):
+        return False
+    variation = last.effect.variation(last.params)
     return variation is not None and len(variation.values) > MAX_EXACT_NUMBERS
 
 

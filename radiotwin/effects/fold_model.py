@@ -66,6 +66,7 @@ class FoldModel:
         level_columns: (n, p0) what is fitted again of the channel: `ChannelModel.level_columns`.
         level_prior_sd_db: (p0,) prior standard deviations of it.
         group: (n,) index of the error scale.
+        groups: number of these, also where no link is of one.
         dof: degrees of freedom of the errors.
         effects: found so far.
     """
@@ -78,6 +79,7 @@ class FoldModel:
     level_columns: np.ndarray
     level_prior_sd_db: np.ndarray
     group: np.ndarray
+    groups: int
     dof: float
     effects: list[AppliedEffect] = field(default_factory=list)
 
@@ -106,7 +108,8 @@ class FoldModel:
             channel_db = channel.predict(geometry)[0]
         columns, prior_sd_db = channel.level_columns(geometry)
         return cls(links, usable if train is None else train & usable, usable, channel, channel_db,
-                   columns, prior_sd_db, channel.error_group(geometry), dof)
+                   columns, prior_sd_db, channel.error_group(geometry),
+                   channel.error_groups(geometry), dof)
 
     @property
     def level_at(self) -> LevelAt:
@@ -164,8 +167,12 @@ class FoldModel:
         return limit_db
 
     def fit(self, start: FitResult | None = None) -> FitResult:
-        """Fit to the training links."""
-        return censored_regression.fit(self.training, start)
+        """Fit to the training links; a class that none of them is of has another one's scale."""
+        found = censored_regression.fit(self.training, start)
+        there = np.unique(self.training.group)
+        scale_db = np.full(self.groups, found.scale_db[there].max())
+        scale_db[there] = found.scale_db[there]
+        return replace(found, scale_db=scale_db)
 
     def predict(self, result: FitResult) -> Linearisation:
         """Return mean and scale of the readings of all links, before the limit of detection."""

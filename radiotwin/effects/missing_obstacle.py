@@ -54,7 +54,7 @@ MAX_PROPOSALS = 4
 SHIFTS_M = (-8.0, 0.0, 8.0)  # from a cell's centre, to the east and to the north
 SQUARES_M, RECTANGLES_M = (6.0, 12.0, 24.0), ((20.0, 8.0), (36.0, 12.0), (40.0, 24.0))  # tried
 SHAPES = (*product(((side_m, side_m) for side_m in SQUARES_M), (0.0, 45.0)),
-          *product(RECTANGLES_M, (0.0, 45.0, 90.0, 135.0)))  # sides [m] and turn [deg]
+          *product(RECTANGLES_M, (-45.0, 0.0, 45.0, 90.0)))  # sides [m] and turn [deg]
 SCATTERED_DB = (0.0, -10.0)  # relative power in the shadow that shapes are tried with
 MAX_BUILT = 0.15  # of its ground and so far around it that is built in the map
 AROUND_M = 3.0  # outlines are off by metres: a box along a wall is a wall that is off

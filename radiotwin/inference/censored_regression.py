@@ -189,9 +189,9 @@ def fit(problem: CensoredRegression, start: FitResult | None = None) -> FitResul
             last.
     """
     p, groups = len(problem.prior_sd_db), int(problem.group.max()) + 1
-    if start is not None and len(start.coefficients) <= p and len(start.scale_db) == groups:
+    if start is not None and len(start.coefficients) <= p and len(start.scale_db) >= groups:
         beta = np.concatenate([start.coefficients, np.zeros(p - len(start.coefficients))])
-        scale_db = start.scale_db.copy()
+        scale_db = start.scale_db[:groups].copy()
     else:
         beta, scale_db = _least_squares(problem), np.full(groups, FIRST_SCALE_DB)
     precision = 1.0 / np.square(problem.prior_sd_db)

@@ -1,3 +1,4 @@
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -53,12 +54,11 @@ def fitted(moved, evidence_nats, effect=DevicePositionError):
     return fit_candidate(model, effect(), 0, SelectionCriteria(), hypotheses), channel.followed
 
 
-def test_no_paths_are_followed_for_what_correlated_errors_explain(moved, monkeypatch):
+def test_what_correlated_errors_explain_is_judged_without_its_paths(moved, monkeypatch):
     monkeypatch.setattr(fitting, "MAX_EXACT_NUMBERS", 1)  # a position has two
-    refused, followed = fitted(moved, -1.0)
-    assert "correlated" in refused.reason and "-1 nats" in refused.reason and not followed
-    found, followed = fitted(moved, 1.0)
-    assert isinstance(found, Candidate) and followed
+    for evidence_nats, is_followed in ((-1.0, False), (1.0, True)):
+        found, followed = fitted(moved, evidence_nats)
+        assert isinstance(found, Candidate) and bool(followed) == is_followed
 
 
 def test_of_few_numbers_paths_are_followed_whatever_quick_levels_say(moved):
@@ -69,3 +69,18 @@ def test_of_few_numbers_paths_are_followed_whatever_quick_levels_say(moved):
 def test_no_paths_are_followed_for_what_the_map_speaks_against(moved):
     refused, followed = fitted(moved, 1.0, Sentenced)
     assert refused.reason == "a lake is there" and not followed
+
+
+class OfUsable(DevicePositionError):
+    """A position that remembers of which devices the links are that the map is asked about."""
+
+    def contradicted(self, params, links):
+        self.asked = set(links.device.tolist())
+
+
+def test_links_of_devices_that_are_nowhere_do_not_speak_against_anything(moved):
+    model, _ = moved
+    lost = SimpleNamespace(whole=replace(model.whole, usable=model.links.device == 0), fits=model.fits, links=model.links)
+    effect = OfUsable()
+    assert isinstance(fit_candidate(lost, effect, 0, SelectionCriteria(), None), Candidate)
+    assert effect.asked == {0}

@@ -182,3 +182,24 @@ def test_without_a_candidate_there_is_no_step():
     before = replace(result)
     forward_selection(result, [], 0, lambda _: pytest.fail("something is being done"))
     assert vars(result) == vars(before)
+
+
+def test_what_gains_nothing_is_no_part_of_the_base_either(open_ground):
+    """No fold proposes it, so folds are as they were; nothing is claimed, and nothing is needed but a gain."""
+    links = prepare_links(open_ground.measured(open_ground.fly(0)), None)
+    folds = make_folds(links, 0)
+    model = cross_validate(links, LogDistanceBase(None, 0), folds, training_parts(links, folds))
+    same = CrossValidatedModel(model.whole, model.folds, model.fits, model.index, model.twin)
+    score = score_model(model, same, CandidateScore("roof_heights"), None, 1, 0, SelectionCriteria().of_no_claim)
+    assert score.nll_gain == 0 and not score.passed and "gains nothing" in score.reason
+
+
+def test_of_two_effects_of_one_name_the_one_that_is_probable_beside_another_is_kept(monkeypatch):
+    monkeypatch.setattr(selection, "_exactly", lambda model: model)
+    monkeypatch.setattr(selection, "with_moved_limits", lambda model: model)
+    sector, dipole = (CandidateScore("antenna_pattern", variant=variant, passed=True) for variant in ("", "dipole"))
+    result = SelectionResult(MODEL, scores=[sector, dipole])
+    other = CandidateScore("foliage", passed=True)
+    selection._keep_together(result, [Passed(None, dipole, None), Passed(None, other, None)], 0)
+    assert [(each.name, each.variant, each.kept) for each in result.scores] == [
+        ("antenna_pattern", "", False), ("antenna_pattern", "dipole", True), ("foliage", "", True)]

@@ -214,3 +214,20 @@ def test_the_window_of_a_fold_is_that_of_the_episode_if_they_are_mostly_the_same
                             end_within_s=(440.0, 440.0), form="loss")
     window = _Window(20.0, low_s, high_s, (low_s, low_s), (high_s, high_s), "loss")
     assert _is_same(window, params) == same
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_receiver_that_heard_one_reading_has_no_episode(make_links, view, seed):
+    """A drone hears all; a receiver far off is there for 90 links and hears one."""
+    rng = np.random.default_rng(seed)
+    device_m = np.array([[0.0, 0, 10], [200, 0, 10], [0, 200, 10]])
+    slots = np.array([(t * 3.0, 50.0, 40.0) for t in range(200)] + [(6000.0 + t, 6000.0, 1.5) for t in range(30)])
+    far = np.repeat(np.arange(230) >= 200, 3)
+    time_s = np.repeat(np.arange(230.0), 3)
+    links = make_links(device_m, slots, receiver=far.astype(int), flight=(time_s // 100).astype(int), time_s=time_s,
+                       limit_db=-120.0)
+    mean_db = -40 - 25 * np.log10(links.distance_m)
+    level_db = mean_db + rng.normal(0, 3, len(links))
+    level_db[far] = np.nan
+    level_db[np.flatnonzero(far)[7]] = -118.7
+    assert Episode().propose(view(replace(links, level_db=level_db), mean_db, 3.0)) == []

@@ -8,7 +8,7 @@ import trimesh
 
 from radiotwin.effects.boxes import Box
 from radiotwin.effects.foliage import Foliage
-from radiotwin.effects.missing_obstacle import MissingObstacle
+from radiotwin.effects.missing_obstacle import SHAPES, MissingObstacle
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
 
@@ -130,3 +130,12 @@ def test_a_box_that_is_seen_from_one_place_is_no_building(make_links, other_m, r
 def test_without_a_map_no_building_is_in_the_way_of_a_missing_one(make_links):
     links = make_links([[0.0, 0, 2.0]], [[100.0, 0, 20.0]])
     assert MissingObstacle().contradicted(MissingObstacle.Params(box=Box(50.0, 0.0, 9.0, 9.0, 9.0, 0.0)), links) is None
+
+
+def test_a_search_may_stay_where_it_begins():
+    """What begins outside the bounds is clipped in every trial, and nothing else is ever found."""
+    effect = MissingObstacle()
+    for (length_m, width_m), turn_deg in SHAPES:
+        box = Box(0.0, 0.0, length_m, width_m, 20.0, turn_deg)
+        variation = effect.variation(effect.Params(box=box))
+        assert ((variation.low <= variation.values) & (variation.values <= variation.high)).all()

@@ -29,6 +29,9 @@ class KnownLevels(LogDistance):
     def error_group(self, links):
         return links.los.astype(int)
 
+    def error_groups(self, links):
+        return 2
+
 
 @pytest.fixture
 def flown(make_links):
