@@ -31,7 +31,7 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     if shadowing is None and needs_rest(loop.prediction):
         shadowing = CorrelatedShadowing.fit(model.whole, model.fits[0], 0)
     fitted = replace(EffectModel.of(model.whole, model.fits[0], causes_only=True),
-                     **vars(_calibration(loop)), shadowing=shadowing,
+                     **vars(_calibration(loop, scene)), shadowing=shadowing,
                      blend=make_blend(model, loop.prediction, 0))
     provenance: dict[str, Any] = {"links": len(model.links),
                                   "radiotwin_version": radiotwin.__version__}
@@ -43,7 +43,7 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     return replace(model.twin, provenance=provenance, fitted=fitted)
 
 
-def _calibration(loop: Loop) -> RadiusCalibration:
+def _calibration(loop: Loop, scene: Scene | None) -> RadiusCalibration:
     """Return how far positions are to be believed that the loop's models locate as its twin does.
 
     That is without what only describes the rest: the twin does not have it, either.
@@ -58,4 +58,5 @@ def _calibration(loop: Loop) -> RadiusCalibration:
              for device in model.links.device[each.acts].tolist()}
     known = replace(links, anchors=links.anchors - moved)
     held_out = [known.select(model.index == number) for number in range(len(models))]
-    return calibrate_radii(models, held_out, whole_area(models[0], links), 0)
+    area_m = scene.config.extent.bounds if scene is not None else whole_area(models[0], links)
+    return calibrate_radii(models, held_out, area_m, 0)
