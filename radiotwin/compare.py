@@ -23,6 +23,7 @@ DEFAULT_MODELS = ("log_distance", "segmented_log_distance", "segmented_nn", "reg
 PUBLISHED_MODELS = ("tr36777_uma", "tr36777_umi", "al_hourani_urban", "p1411", "cost231_wi")
 WORKER_BYTES = 3 * 2**30  # of a process that fits a model
 CLASSES = ("all", "LoS", "NLoS")  # of links, as the tables name them
+LABELS = ("flight", "receiver", "device")  # columns of the predictions beside those of the models
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,10 +158,11 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene,
         errors of all of them
 
     Raises:
-        BadInput: nothing detected to judge on, a truth of another scene, or what `fit_twin`
-            refuses.
+        BadInput: nothing detected to judge on, a truth of another scene, a twin or map with the
+            name of a model, or what `fit_twin` refuses.
     """
     _check(test, scene, truth, twins or {})
+    _check_names([*(twins or {}), *(maps or {})], models)
     for twin in (twins or {}).values():
         twin.require_map(scene)  # refuses before the others are fitted, which takes long
     job = Job("comparing models", with_pieces(_FitModel(train, scene, seed)),
@@ -169,8 +171,7 @@ def compare_models(train: Measurements, test: Measurements, scene: Scene,
     fitted |= twins or {}
     true_m = true_positions(scene, train)
     los = _los(scene, true_m, test)
-    predictions = test.table[["flight", "receiver", "device"]].assign(measured_db=test.level_db,
-                                                                      los=los)
+    predictions = test.table[[*LABELS]].assign(measured_db=test.level_db, los=los)
     scores, locations = [], []
     for model, twin in fitted.items():
         predictions[model] = predict(twin, scene, test)
@@ -215,6 +216,15 @@ def _check(test: Measurements, scene: Scene, truth: RadioMap | None,
         if twin.level != test.level_column:
             raise BadInput(f"{name} predicts {twin.level}, the measurements hold "
                            f"{test.level_column}; they cannot be compared")
+
+
+def _check_names(others: list[str], models: tuple[str, ...]) -> None:
+    """Raise BadInput if what is judged beside the models would take the place of something."""
+    for name in others:
+        if name in {*models, *LABELS, "measured_db", "los"}:
+            raise BadInput(f"{name} is to be judged beside a model or a column of that name, and "
+                           "would take its place in the tables; rename it, or give it from another "
+                           "folder")
 
 
 def true_positions(scene: Scene,

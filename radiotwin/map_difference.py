@@ -12,6 +12,7 @@ from radiotwin.display.style import DIFFERENCE_COLOURS, plain, residual_range_db
 from radiotwin.display.summary import Summary, count, some
 from radiotwin.errors import BadInput
 from radiotwin.frames import is_same_frame, place
+from radiotwin.map_file import GROUND
 from radiotwin.map_view import OverDevices, map_table, origin_of, pick, plot_values
 from radiotwin.scene import Scene
 
@@ -46,7 +47,7 @@ class MapDifference(OverDevices):
             second: dataset of another one with the same devices over the same lattice.
 
         Raises:
-            BadInput: other devices, other positions, or another frame.
+            BadInput: other devices, other positions, other ground, or another frame.
         """
         names = [[str(name) for name in each["device"].values] for each in (first, second)]
         if set(names[0]) != set(names[1]):
@@ -60,6 +61,12 @@ class MapDifference(OverDevices):
                                f"{ours_m[0]:g} to {ours_m[-1]:g} m in {len(ours_m)} steps, and "
                                f"from {theirs_m[0]:g} to {theirs_m[-1]:g} m in {len(theirs_m)}; "
                                "make both for the same scene")
+        ground_m, other_m = (each[GROUND].values if GROUND in each else 0.0
+                             for each in (first, second))
+        if not np.allclose(ground_m, other_m, rtol=0, atol=SAME_M):
+            raise BadInput("the maps are over different ground, or one is of heights above the "
+                           "ground and the other of heights above the datum; make both for the "
+                           "same scene")
         origin, other = (origin_of({str(name): value for name, value in each.attrs.items()})
                          for each in (first, second))
         if origin is not None and other is not None and not is_same_frame(origin, other):

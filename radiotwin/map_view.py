@@ -14,6 +14,7 @@ from radiotwin.display.axes import add_colour_bar, add_legend, draw_cells, draw_
 from radiotwin.display.style import plain
 from radiotwin.display.summary import Summarised, some
 from radiotwin.errors import BadInput
+from radiotwin.map_file import GROUND
 from radiotwin.scene import Scene
 from radiotwin.tables import Origin
 
@@ -123,7 +124,8 @@ def map_table(dataset: xr.Dataset, variables: Sequence[str], origin: Origin | No
 
     Args:
         dataset: with dims (device, z, y, x).
-        variables: columns beside `device, x_m, y_m, z_m`.
+        variables: columns beside `device, x_m, y_m, z_m`, and `above_ground_m` where the map's
+            altitudes are that.
         origin: of the frame.
 
     Raises:
@@ -132,6 +134,9 @@ def map_table(dataset: xr.Dataset, variables: Sequence[str], origin: Origin | No
     names, *axes_m = (dataset[axis].values for axis in ("device", "z", "y", "x"))
     name, z_m, y_m, x_m = (each.ravel() for each in np.meshgrid(names, *axes_m, indexing="ij"))
     columns = {"device": name, "x_m": x_m, "y_m": y_m, "z_m": z_m}
+    if GROUND in dataset:
+        ground_m = np.broadcast_to(dataset[GROUND].values, [len(names), *map(len, axes_m)]).ravel()
+        columns |= {"z_m": z_m + ground_m, "above_ground_m": z_m}
     columns |= {each: dataset[each].values.ravel() for each in variables}
     position_m = np.column_stack([x_m, y_m]).astype(float)
     return geo_data_frame(pd.DataFrame(columns), origin, position_m=position_m)

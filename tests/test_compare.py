@@ -11,6 +11,7 @@ from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
 from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.twin import fit_twin
 
 
 @pytest.fixture(scope="module")
@@ -184,3 +185,12 @@ def test_models_that_are_fitted_in_other_processes_are_the_same_to_the_bit(small
     with two_workers("local", one_is_killed=False) as (executor, _), pieces.keep_pieces(tmp_path):
         assert tables(executor) == whole
     assert list(tmp_path.glob("positions-*"))  # kept there, for a command that is killed
+
+
+@pytest.mark.parametrize("name", ["log_distance", "measured_db"])
+def test_a_twin_with_the_name_of_a_model_or_a_column_is_refused(small_scene, flown, name):
+    """The row of the model was the twin's, without a word."""
+    train, test = split_flights(flown, 1)
+    twin = fit_twin(train, small_scene, model="log_distance")
+    with pytest.raises(BadInput, match="rename it"):
+        compare_models(train, test, small_scene, models=("log_distance",), twins={name: twin})

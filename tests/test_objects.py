@@ -237,3 +237,23 @@ def test_a_scene_pickles_without_its_map_and_works_in_another_process(small_scen
     code = "import pickle, sys; scene = pickle.load(open('scene.pkl', 'rb')); print(scene.city.height_at(30.0, 30.0))"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
     assert float(done.stdout.strip("[]\n")) == float(small_scene.city.height_at(30.0, 30.0)), done.stderr
+
+
+def over_ground(gain_db, ground_m):
+    lattice = Lattice(np.array([0.0, 10.0]), np.array([0.0, 10.0]), np.array([1.5]), ground_m=np.full((2, 2), ground_m))
+    gain_db = np.full((1, *lattice.shape), gain_db)
+    return rt.RadioMap.build(["a"], lattice, gain_db, np.ones(gain_db.shape, bool))
+
+
+def test_maps_over_other_ground_are_not_subtracted():
+    flat = Lattice(np.array([0.0, 10.0]), np.array([0.0, 10.0]), np.array([1.5]))
+    above_datum = rt.RadioMap.build(["a"], flat, np.full((1, *flat.shape), -80.0), np.ones((1, *flat.shape), bool))
+    assert (over_ground(-80.0, 80.0) - over_ground(-75.0, 80.0)).mean_db == -5.0
+    for other in (above_datum, over_ground(-75.0, 20.0)):
+        with pytest.raises(rt.BadInput, match="ground"):
+            over_ground(-80.0, 80.0) - other
+
+
+def test_a_table_of_a_map_above_the_ground_has_both_heights():
+    table = over_ground(-80.0, 80.0).to_geodataframe()
+    assert (table["z_m"] == 81.5).all() and (table["above_ground_m"] == 1.5).all()

@@ -107,6 +107,10 @@ def predict_coverage(source: Twin | RadioMap | str, scene: Scene,
     noise_figure_db = _noise_figure_db(scene, settings)
     noise_dbm = thermal_noise_dbm(bandwidth_hz) + noise_figure_db
     values = _rasters(gains, scene, chosen, grid, settings, noise_dbm, bandwidth_hz)
+    if settings.indoor_loss_db is not None and values["indoor"].any() \
+            and not np.isfinite(values["received_power_dbm"][values["indoor"]]).any():
+        raise BadInput(f"{gains.description} has no gain inside any building, so there is nothing "
+                       "that an indoor loss could be taken off; leave --indoor-loss-db out")
     attributes: dict[str, Any] = {
         "schema": SCHEMA, "model": gains.description, "scene": scene.config.name,
         "height_m": grid.height_m, "step_m": grid.step_m, "bandwidth_hz": bandwidth_hz,
@@ -184,6 +188,10 @@ def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Tra
         settings.height_m or DEFAULT_HEIGHT_M)
     if isinstance(source, Twin):
         return grid, TwinSource(source, scene, transmitters)
+    if source == "raytrace" and settings.indoor_loss_db is not None:
+        raise BadInput("no path over the map goes into a building, so there is nothing that an "
+                       "indoor loss could be taken off; leave --indoor-loss-db out, or take a law "
+                       "or a twin")
     return grid, over_scene(source, scene, transmitters)
 
 

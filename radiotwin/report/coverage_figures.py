@@ -139,7 +139,9 @@ def _draw_scale_bar(ax: Axes, bounds_m: tuple[float, float, float, float]) -> No
     x_min, x_max, y_min, y_max = bounds_m
     wanted_m = (x_max - x_min) / 5
     power = 10.0 ** np.floor(np.log10(wanted_m))
-    length_m = max(each * power for each in ROUND_LENGTHS if each * power <= wanted_m)
+    # The logarithm of what is just below a power of ten may be that of the power.
+    length_m = max((each * power for each in ROUND_LENGTHS if each * power <= wanted_m),
+                   default=wanted_m)
     margin_m, thick_m = 0.02 * (x_max - x_min), 0.006 * (y_max - y_min)
     text = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
     ax.add_patch(Rectangle((x_min + margin_m, y_min + margin_m), length_m, thick_m,

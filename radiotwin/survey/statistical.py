@@ -42,7 +42,8 @@ def segmented_truth(scene: Scene) -> RadioMap:
     gain_db, sigma_db, los = [], [], []
     for device_m in scene.device_m:
         seen = scene.city.line_of_sight(receiver_m, device_m[None])
-        log_distance = np.log10(np.sqrt(((receiver_m - device_m) ** 2).sum(axis=1)))
+        distance_m = np.sqrt(((receiver_m - device_m) ** 2).sum(axis=1))
+        log_distance = np.log10(np.maximum(distance_m, 1.0))  # the law begins at 1 m
         gain_db.append(np.where(seen, LOS_LAW.mean_db(log_distance),
                                 NLOS_LAW.mean_db(log_distance)))
         sigma_db.append(np.where(seen, LOS_LAW.sigma_db, NLOS_LAW.sigma_db))

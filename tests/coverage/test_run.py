@@ -1,6 +1,7 @@
 """Coverage of worlds whose shares are known from geometry."""
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,10 +9,11 @@ import shapely
 
 from radiotwin.antennas import Antenna, Pattern
 from radiotwin.coverage import CoverageSettings, Transmitter, predict_coverage
-from radiotwin.coverage.areas import Area
+from radiotwin.coverage.areas import Area, _covered
 from radiotwin.coverage.grid import CoverageGrid, ground_of
 from radiotwin.errors import BadInput
 from radiotwin.radiomap import RadioMap
+from radiotwin.report import coverage_figures
 from radiotwin.scene.lattice import Lattice
 
 FREE_SPACE_AT_1_M_DB = 20 * math.log10(299_792_458.0 / 2e9 / (4 * math.pi))
@@ -279,3 +281,26 @@ def test_a_noise_power_below_the_thermal_one(build, twin_of):
     scene = build(devices=[("a", 0.0, 0.0, 10.0)], noise_dbm=-110.0)
     with pytest.raises(BadInput, match="lies 6.0 dB below the thermal noise"):
         predict_coverage(twin_of([("a", 0.0, 0.0, 10.0)]), scene)
+
+
+def test_without_a_gain_indoors_there_is_nothing_to_take_a_loss_off(build, house):
+    """No path goes into a building; shares counted all of it as not covered."""
+    scene = build(house(100, 100, 300, 200, 20), devices=[("a", -200.0, 0.0, 30.0)])
+    settings = CoverageSettings(step_m=50.0, indoor_loss_db=15.0)
+    with pytest.raises(BadInput, match="goes into a building"):
+        predict_coverage("raytrace", scene, settings=settings)
+
+
+def test_of_a_power_without_a_deviation_nothing_is_certain():
+    power_dbm, sd_db = np.array([-70.0, -70.0, np.nan]), np.array([1.0, np.nan, np.nan])
+    found = _covered(power_dbm, sd_db, -85.0, 0.95)
+    assert found["share"] == pytest.approx(2 / 3) and found["share_reliable"] == found["mean_probability"] == 0.5
+    assert set(_covered(power_dbm[1:2], sd_db[1:2], -85.0, 0.95)) == {"threshold", "share"}
+
+
+@pytest.mark.parametrize("width_m", [50.0, 500.0, 499.99999999999994, 5000.0, 123.4])
+def test_a_scale_bar_is_about_a_fifth_of_the_width(width_m):
+    drawn = []
+    axes = SimpleNamespace(add_patch=lambda patch: drawn.append(patch.get_width()), annotate=lambda *_, **__: None)
+    coverage_figures._draw_scale_bar(axes, (12.8, 12.8 + width_m, 0.0, 20.0))
+    assert width_m / 15 < drawn[0] <= width_m / 5 * (1 + 1e-9)

@@ -143,3 +143,16 @@ def test_devices_are_matched_by_name(small_scene, truth):
     fewer = dataclasses.replace(truth, dataset=truth.dataset.isel(device=slice(3)))
     with pytest.raises(BadInput, match="lacks device 'd3'"):
         survey(small_scene, fewer)
+
+
+def test_where_a_receiver_stands_on_a_device_its_gain_is_that_at_one_metre(small_scene):
+    """The logarithm of no distance is infinite."""
+    config = small_scene.config
+    device = config.devices[0]
+    lattice = config.lattice.model_copy(update={"altitudes_m": [device.z_m]})
+    here = config.devices[0].model_copy(update={"x_m": float(small_scene.lattice.x_m[3]), "y_m": float(small_scene.lattice.y_m[3])})
+    scene = dataclasses.replace(small_scene, config=config.model_copy(update={
+        "devices": [here, *config.devices[1:]], "lattice": lattice}))
+    found = segmented_truth(scene)
+    assert np.isfinite(found.gain_db).all()
+    assert found.gain_db[0].max() == pytest.approx(-30.0)  # LoS at 1 m (Chen et al. 2023)
