@@ -68,7 +68,9 @@ def _layers(database: sqlite3.Connection) -> list[tuple[str, str, int]]:
             ["table_name", "column_name", "geometry_type_name", "srs_id"]):
         if str(table).lower() in registered and str(kind).upper() in _KINDS:
             require_table(database, str(table))
-            layers.append((str(table), str(column), int(srs)))
+            if not isinstance(srs, int):  # of SQLite's columns the type is a wish
+                raise sqlite3.DataError(f"srs_id of {str(table)[:100]!r} is {srs!r:.100}")
+            layers.append((str(table), str(column), srs))
     return layers
 
 

@@ -75,7 +75,7 @@ def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collectio
     """
     with file.open() as content:
         head, tail, whole, encoding = _scan(content, file, settings.encoding)
-    lines = head.decode(encoding, "replace").removeprefix("\ufeff").splitlines()
+    lines = _split(head.decode(encoding, "replace").removeprefix("\ufeff"))
     lines = (lines if whole else lines[:-1])[:_LINES]
     if names:
         before = settings.lines_before_header or 0
@@ -89,7 +89,7 @@ def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collectio
     decimal = settings.decimal or _decimal(file, delimiter, rows)
     after = settings.lines_after_table
     if after is None:
-        last = tail.decode(encoding, "replace").splitlines()
+        last = _split(tail.decode(encoding, "replace"))
         after = _trailer(lines[first:] if whole else last[1:], delimiter, header)
     stripped = [name.strip() for name in header]
     repeated = next((name for i, name in enumerate(stripped) if name and name in stripped[:i]), "")
@@ -126,11 +126,12 @@ def _scan(content: IO[bytes], file: LogFile,
           declared: str | None) -> tuple[bytes, bytes, bool, str]:
     """Return the beginning, the end, whether the beginning is all, and the encoding."""
     head = tail = content.read(_BLOCK_BYTES)
-    encoding = declared or next((name for bom, name in _BOMS if head.startswith(bom)), "utf-8")
+    encoding = codecs.lookup(declared).name if declared else next(
+        (name for bom, name in _BOMS if head.startswith(bom)), "utf-8")
     decoder = codecs.getincrementaldecoder(encoding)()
     readable, undefined, whole, block = True, False, True, head
     while block:
-        if b"\0" in block and not encoding.startswith("utf-16"):
+        if b"\0" in block and not encoding.startswith("utf-16"):  # as `codecs` spells it
             raise BadInput(f"{file} is not text (it has null characters); allowed are text, "
                            "Parquet and XLSX. If it is UTF-16 without a mark, give --encoding "
                            "utf-16-le")
@@ -155,6 +156,12 @@ def _scan(content: IO[bytes], file: LogFile,
     if encoding == "utf-16":  # the end of the file has no mark of the order of bytes
         encoding = "utf-16-le" if head.startswith(codecs.BOM_UTF16_LE) else "utf-16-be"
     return head, tail, whole, encoding
+
+
+def _split(text: str) -> list[str]:
+    """Return the lines of a text as its reader counts them, which `str.splitlines` does not."""
+    lines = re.split(r"\r\n|\r|\n", text)
+    return lines if lines[-1] else lines[:-1]
 
 
 def _fields(line: str, delimiter: str) -> list[str]:

@@ -49,10 +49,11 @@ def read_json_lines(file: LogFile) -> tuple[pd.DataFrame, np.ndarray]:
                     numbers.append(lines.number)
                     columns |= dict.fromkeys(row)
                     cells += len(row)
-                COLUMNS.check(len(columns), file)
-                ROWS.check(len(rows), file)
-                CELLS.check(len(rows) * len(columns), file)
-                DOCUMENT_BYTES.check(10 * cells, file)  # each is an object in memory
+                    # After each: one line may stand for many rows.
+                    COLUMNS.check(len(columns), file)
+                    ROWS.check(len(rows), file)
+                    CELLS.check(len(rows) * len(columns), file)
+                    DOCUMENT_BYTES.check(10 * cells, file)  # each is an object in memory
         except UnicodeDecodeError:
             raise BadInput(f"{file} is not text in UTF-8; save it as UTF-8") from None
     table = pd.DataFrame({name: pd.Series([row.get(name, "") for row in rows], dtype=str)

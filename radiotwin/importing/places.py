@@ -47,7 +47,10 @@ def at_times(source: Source, links: pd.DataFrame, table: pd.DataFrame | None) ->
     if table is None or SINCE not in table:
         return links
     place_of = pd.Series(table.index, index=table.index)
-    owner = place_of.str.replace(r"@\d+$", "", regex=True).to_numpy()
+    owner = place_of.str.replace(r"@\d+$", "", regex=True)
+    # Of `numbered` there are several and none without a number; others are called so.
+    numbered_ones = owner.duplicated(keep=False) & ~owner.isin(place_of)
+    owner = owner.where(numbered_ones, place_of).to_numpy()
     names = links["device"].to_numpy(dtype=object, copy=True)
     for device in dict.fromkeys(owner[place_of.to_numpy() != owner]):
         own = np.flatnonzero(links["device"].to_numpy() == device)

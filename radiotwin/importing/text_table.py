@@ -9,7 +9,7 @@ from itertools import islice
 import numpy as np
 import pandas as pd
 
-from radiotwin.budgets import CELLS, COLUMNS, ROWS
+from radiotwin.budgets import CELLS, COLUMNS, ROW_BYTES, ROWS
 from radiotwin.errors import BadInput
 from radiotwin.importing.dialect import COMMA, Dialect, fits, header_names
 from radiotwin.importing.lines import Lines
@@ -33,7 +33,7 @@ def read_text_table(file: LogFile, dialect: Dialect) -> tuple[pd.DataFrame, np.n
         BadInput: no header, a repeated name, or a row with too few or too many fields.
     """
     with file.open() as content, io.TextIOWrapper(content, dialect.encoding, newline="") as text:
-        lines = Lines(text, file)
+        lines = _QuotedLines(text, file)
         for _ in islice(lines, dialect.before):
             pass
         reader = csv.reader(lines, delimiter=dialect.delimiter, skipinitialspace=True,
@@ -47,8 +47,22 @@ def read_text_table(file: LogFile, dialect: Dialect) -> tuple[pd.DataFrame, np.n
             raise BadInput(f"{file} is not text in {dialect.encoding}; give --encoding") from None
 
 
+class _QuotedLines(Lines):
+    """Lines of rows, which quotation marks may carry over any number of lines."""
+
+    row_characters = 0  # of the row that is being read
+
+    def __next__(self) -> str:
+        line = super().__next__()
+        self.row_characters += len(line)
+        if self.row_characters > ROW_BYTES.limit:
+            ROW_BYTES.refuse(f"{self._source}: line {self.number}",
+                             f"a row of more than {ROW_BYTES.limit:,} characters")
+        return line
+
+
 def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
-          lines: Lines) -> tuple[pd.DataFrame, np.ndarray]:
+          lines: _QuotedLines) -> tuple[pd.DataFrame, np.ndarray]:
     names = list(dialect.names)
     if not names:
         fields = next(filter(None, reader), [])
@@ -79,11 +93,12 @@ def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
     return pd.concat(chunks, ignore_index=True), np.array(numbers, dtype=np.int64)
 
 
-def _without_last(reader: Iterator[list[str]], lines: Lines,
+def _without_last(reader: Iterator[list[str]], lines: _QuotedLines,
                   after: int) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows that are not blank, with their lines, without the last ones."""
     waiting: deque[tuple[int, list[str]]] = deque()
     for row in reader:
+        lines.row_characters = 0
         if any(field.strip() for field in row):
             waiting.append((lines.number, row))
             if len(waiting) > after:

@@ -1,5 +1,6 @@
 """Conversion of clock readings to seconds since 1970-01-01 UTC."""
 
+import re
 from zoneinfo import ZoneInfo, available_timezones
 
 import numpy as np
@@ -117,7 +118,7 @@ def _parse(source: Source, spec: str, text: pd.Series, time_format: str) -> pd.S
             fine = pd.to_datetime(text.where(text != ""), errors="coerce",
                                   format=f"{time_format}.%f", utc=bool(with_offset.any()))
             parsed = parsed.fillna(fine)
-    except ValueError as error:
+    except (ValueError, re.error) as error:  # pandas makes a regular expression of it
         raise BadInput(f"time_format {time_format!r} is not a strftime format: {error}; {ALLOWED}"
                        ) from None
     source.refuse(spec, text, parsed.isna() & (text != ""),

@@ -15,6 +15,9 @@ from radiotwin.importing.log_files import LogFile, open_archive, open_member
 
 _MAX_ROWS = 1_048_576  # of a sheet, by the format
 _BLOCK_BYTES = 2**20
+_PICTURES = ("xl/media/", "xl/embeddings/")
+_DOCTYPES = tuple("<!DOCTYPE".encode(name) for name in ("utf-8", "utf-16-le", "utf-16-be",
+                                                        "utf-32-le", "utf-32-be"))
 
 
 @dataclass(frozen=True)
@@ -68,18 +71,20 @@ def read_sheet(file: LogFile, sheet: str | None) -> Sheet:
 def _check(file: LogFile) -> None:
     """Refuse a workbook that is large when unpacked, or that declares XML entities."""
     with open_archive(file.path) as archive:
-        entries = [entry for entry in archive.infolist()
-                   if entry.filename.endswith((".xml", ".rels"))]
-        DOCUMENT_BYTES.check(sum(entry.file_size for entry in entries), file)
+        # A part may have any name: what it is, others say of it.
+        entries = archive.infolist()
+        DOCUMENT_BYTES.check(sum(entry.file_size for entry in entries
+                                 if not entry.filename.startswith(_PICTURES)), file)
         for entry in entries:
-            last = b""
+            last, is_named_xml = b"", entry.filename.lower().endswith((".xml", ".rels"))
             with open_member(archive, entry.filename, file) as content:
                 while block := content.read(_BLOCK_BYTES):
                     # Entities can stand for any amount of text; UTF-16 would hide them.
-                    if b"<!DOCTYPE" in last + block or b"\0" in block:
+                    if any(each in last + block for each in _DOCTYPES) \
+                            or is_named_xml and b"\0" in block:
                         raise BadInput(f"{file}: {entry.filename[:100]!r} is no XML of a workbook "
                                        "(it has a DOCTYPE or null characters); save it again")
-                    last = block[-16:]
+                    last = block[-64:]
 
 
 def _text(file: LogFile, sheet: Any) -> bytes:

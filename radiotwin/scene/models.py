@@ -64,8 +64,8 @@ def read_model(path: Path) -> list[ModelPart]:
     check_input(path, f"model ({', '.join(UP_AXES)})")
     if suffix == ".obj":
         vertices, groups = read_obj_groups(path)
-        parts = [ModelPart(name or path.stem, material,
-                           _compact(cut_polygons(path, vertices, polygons)))
+        check_vertices(vertices, str(path))
+        parts = [ModelPart(name or path.stem, material, _own_mesh(path, vertices, polygons))
                  for (name, material), polygons in groups.items()]
     elif suffix in (".glb", ".gltf"):
         parts = [ModelPart(name, material, RawMesh(vertices, faces))
@@ -127,6 +127,15 @@ def _ascii_corners(path: Path, data: bytes) -> np.ndarray:
         raise BadInput(f"{path} is not a readable STL file: it is cut off in row {row}; export it "
                        "again")
     return np.array(corners).reshape(-1, 3, 3)
+
+
+def _own_mesh(path: Path, vertices: np.ndarray, polygons: list[np.ndarray]) -> RawMesh:
+    """Return the mesh of one of many objects that share vertices (v, 3)."""
+    used = np.unique(np.concatenate([each.ravel() for each in polygons]))
+    if len(used) and (used[0] < 0 or used[-1] >= len(vertices)):
+        return cut_polygons(path, vertices, polygons)  # which says what is wrong
+    own = [np.searchsorted(used, each) for each in polygons]
+    return _compact(cut_polygons(path, vertices[used], own))
 
 
 def _compact(mesh: RawMesh) -> RawMesh:

@@ -176,3 +176,13 @@ def test_a_server_that_does_not_end_well(tmp_path, monkeypatch, answer, setting,
     with pytest.raises(RunFailed, match=message):
         overpass.download_osm(tmp_path / "a.osm", (47.4, 8.5, 47.41, 8.51))
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("srs", ["NULL", "'EPSG:25832'"])
+def test_a_reference_system_that_is_no_number(package, srs):
+    """Of SQLite's columns the type is a wish."""
+    rows = f"SELECT table_name, column_name, geometry_type_name, {srs} AS srs_id, z, m FROM gpkg_geometry_columns"
+    alter(package, f"CREATE TABLE copied AS {rows}", "DROP TABLE gpkg_geometry_columns",
+          "ALTER TABLE copied RENAME TO gpkg_geometry_columns")
+    with pytest.raises(BadInput, match="is not a readable GeoPackage .srs_id of 'houses'"):
+        read_geopackage(package)

@@ -1,5 +1,7 @@
 """How texts hold tables: found, declared, and refused where it is ambiguous."""
 
+import tracemalloc
+
 import pytest
 
 from radiotwin.errors import BadInput
@@ -140,3 +142,34 @@ def test_files_of_a_zip_are_read_where_they_are(tmp_path):
 def test_json_lines_that_are_none(read, content, message):
     with pytest.raises(BadInput, match=message):
         read(content, "log.jsonl")
+
+
+def test_lines_are_those_of_the_reader(read):
+    """A form feed ends no line there, and moved the header by one."""
+    _, table = read("Report\x0cpage 1\nmade by x\n" + text_of())
+    assert table == ROWS
+
+
+@pytest.mark.parametrize("name", ["UTF-16-LE", "utf_16_le", "UTF-16"])
+def test_an_encoding_may_be_spelt_in_any_way(read, name):
+    _, table = read(text_of().encode(name), encoding=name)
+    assert table == ROWS
+
+
+def test_a_row_over_many_lines_is_refused_before_it_fills_the_memory(read, monkeypatch):
+    monkeypatch.setenv("RADIOTWIN_MAX_ROW_BYTES", "1000")
+    whole = "a;b\n" + "".join(f'"{number}\nx";1\n' for number in range(500))
+    assert len(read(whole)[1]) == 501
+    with pytest.raises(BadInput, match="a row of more than 1,000 characters"):
+        read(whole + '"\nx";' * 2000)
+
+
+def test_a_line_of_many_receptions_is_refused_before_it_fills_the_memory(read, monkeypatch):
+    """A node's message is repeated for each gateway that heard it."""
+    fields = ",".join(f'"key{number}":1' for number in range(1000))
+    monkeypatch.setenv("RADIOTWIN_MAX_CELLS", "100_000")
+    tracemalloc.start()
+    with pytest.raises(BadInput, match="at most 100,000"):
+        read('{"rxpk":[' + ",".join(["{}"] * 2000) + "]," + fields + "}", "log.jsonl")
+    assert tracemalloc.get_traced_memory()[1] < 40e6
+    tracemalloc.stop()

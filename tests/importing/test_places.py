@@ -109,3 +109,13 @@ def test_clocks_that_are_right_are_not_told():
     jump = links_of(np.r_[x_m, 1e5], np.full(201, -80.0))
     assert not clock_notes(jump)  # one bad fix
     assert not clock_notes(links_of([0, 1], [-80, -80]).drop(columns="time_s"))
+
+
+def test_a_device_whose_name_ends_in_a_number_is_itself(bring_in, tmp_path):
+    """Of `b` and `b@7` each has one place; readings of the first were given to the second."""
+    (tmp_path / "sites.csv").write_text("device,x,y,z,since\nb,500,0,3,\nb@7,100,0,2,\n")
+    result = bring_in(log("09:00", "10:00"), devices=str(tmp_path / "sites.csv"), **GIVEN)
+    assert list(result.table["device"]) == ["b", "b"]
+    (tmp_path / "sites.csv").write_text("device,x,y,z,since\nb@7,100,0,2,\n")
+    again = bring_in(log("09:00", "10:00"), devices=str(tmp_path / "sites.csv"), **GIVEN)
+    assert list(again.table["device"]) == ["b", "b"]

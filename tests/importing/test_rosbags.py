@@ -189,3 +189,11 @@ def test_folders_and_names_that_are_none(tmp_path):
     (tmp_path / "bag" / "b.mcap").symlink_to(tmp_path / "a.mcap")
     with pytest.raises(BadInput, match="leads out of"):
         read_rosbag(tmp_path / "bag")
+
+
+def test_a_record_that_says_it_is_longer_than_the_file(tmp_path):
+    """A position beyond what the system can seek to was a traceback."""
+    start = b"\x89MCAP0\r\n"
+    (tmp_path / "long.mcap").write_bytes(start + struct.pack("<BQ", 0x7f, 2**61) + bytes(50))
+    with pytest.raises(BadInput, match="has no messages"):
+        read_rosbag(tmp_path / "long.mcap")

@@ -75,7 +75,7 @@ def test_times_of_parquet_need_a_zone_or_have_one():
     (["2022-07-06 12:00"], "ISO 8601", "../etc/passwd", "is unknown"),
     (["1"], "epoch s", "denver", "'denver' is unknown.*America/Denver"),
     (["2022-07-06 12:00", "soon"], "ISO 8601", "UTC", "row 3, column t: 'soon' is no time"),
-    (["2022"], "%Q", "UTC", "'%Q' is not a strftime format"),
+    (["2022"], "%Q", "UTC", "'%Q' is not a strftime format"), (["2022"], "%Y%Y", "UTC", "'%Y%Y' is not a strftime format"),
     (["1657108800", "1657108800250"], "epoch s", None, "row 3.*'1657108800250' lies outside of the years 1900 to 2200"),
     (["9999-12-31"], "ISO 8601", "UTC", "row 2.*'9999-12-31' lies outside"),
     (["soon"], "epoch s", None, "row 2, column t: 'soon' is not a number"),

@@ -226,3 +226,18 @@ def test_positions_across_the_date_line_and_north():
     at = fixes.at(np.array([0.0, 0.5, 2.0]), 5.0)
     np.testing.assert_allclose(at["longitude"], [179.9, 179.95, -179.9])
     np.testing.assert_allclose(at["heading_deg"], [350, 355, 10])
+
+
+def test_a_height_that_is_given_is_not_that_of_the_track(bring_in, track):
+    """A car's antenna is 1.5 m above the road; its receiver's fixes put it 500 m above the datum."""
+    path = track("drive.gpx", gpx(POINTS))
+    result = bring_in(LOG, columns=COLUMNS | {"above_ground": "always 1.5"}, time_format="epoch s", length_unit="m",
+                      track=[{"file": str(path)}])
+    assert (result.table["receiver_above_ground_m"] == 1.5).all()
+    assert "receiver_z_m" not in result.table or result.table["receiver_z_m"].isna().all()
+
+
+def test_an_offset_beyond_all_calendars_is_told(bring_in, track):
+    path = track("flight.gpx", gpx(POINTS))
+    with pytest.raises(BadInput, match="they have no time in common"):
+        bring_in(LOG, columns=COLUMNS, time_format="epoch s", track=[{"file": str(path), "time_offset_s": 1e12}])

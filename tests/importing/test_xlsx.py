@@ -75,3 +75,18 @@ def test_workbooks_that_are_bombs(bring_in, book, monkeypatch):
 def test_what_is_no_workbook(bring_in, content):
     with pytest.raises(BadInput, match="is no readable zip file|cannot be read as a workbook"):
         bring_in(content, "log.xlsx", columns=COLUMNS)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_a_sheet_of_another_name_is_checked_as_well(bring_in, book, tmp_path, encoding):
+    """What a part is, other parts say; its name may be anything."""
+    out = tmp_path / "renamed.xlsx"
+    with zipfile.ZipFile(book) as old, zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as new:
+        for name in old.namelist():
+            data = old.read(name)
+            if name.endswith("sheet1.xml"):
+                text = data.decode().replace("<?xml version='1.0' encoding='UTF-8' standalone='yes'?>", "")
+                data = ('<!DOCTYPE a [<!ENTITY b "c">]>' + text).encode(encoding)
+            new.writestr(name.replace("sheet1.xml", "sheet1.dat"), data.replace(b"sheet1.xml", b"sheet1.dat"))
+    with pytest.raises(BadInput, match="is no XML of a workbook .it has a DOCTYPE"):
+        bring_in(out.read_bytes(), "log.xlsx", columns=COLUMNS, length_unit="m")

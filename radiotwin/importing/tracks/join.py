@@ -10,7 +10,7 @@ from radiotwin.cells import listed
 from radiotwin.errors import BadInput
 from radiotwin.importing.lengths import METRES
 from radiotwin.importing.read_source import read_source
-from radiotwin.importing.settings import Settings, TrackFile
+from radiotwin.importing.settings import HEIGHTS, Settings, TrackFile
 from radiotwin.importing.source import Source
 from radiotwin.importing.tally import Tally
 from radiotwin.importing.times import ISO, seconds
@@ -49,6 +49,8 @@ def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
     notes: list[str] = []
     columns = {name: links[name].to_numpy(dtype=float, copy=True) for name in COLUMNS
                if name in links}
+    # A height that the log or the settings give is not that of the track.
+    has_height = links.reindex(columns=[*HEIGHTS]).notna().any(axis=1).to_numpy()
     without = np.ones(len(links), dtype=bool)
     for name in ("latitude", "x"):
         if name in links:
@@ -66,7 +68,8 @@ def add_tracks(source: Source, links: pd.DataFrame, settings: Settings,
         found = fixes.at(time_s[own] - track.time_offset_s, settings.track_max_gap_s)
         for name, values in found.items():
             column = columns.setdefault(name, np.full(len(links), np.nan))
-            column[own] = np.where(np.isnan(column[own]), values, column[own])
+            missing = np.isnan(column[own]) & ~(has_height[own] & (name == "altitude"))
+            column[own] = np.where(missing, values, column[own])
     links = links.assign(**columns).set_index("row")
     lost = without & np.isnan(columns["latitude"])
     return tally.drop(links, lost, f"no position of the track within {settings.track_max_gap_s:g} "
@@ -109,4 +112,7 @@ def _check_common(source: Source, track: TrackFile, time_s: np.ndarray, fixes: F
 
 
 def _stamp(time_s: float) -> str:
-    return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    try:
+        return datetime.fromtimestamp(time_s, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    except (ValueError, OverflowError, OSError):  # of years that no calendar has
+        return f"{time_s:g} s"

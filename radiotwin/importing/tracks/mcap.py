@@ -50,12 +50,15 @@ class _Walk:
         self._channels: dict[int, tuple[str, bool]] = {}  # topic, and whether of ROS 1
 
     def messages(self, file: IO[bytes], is_chunk: bool = False) -> Iterator[BagMessage]:
+        begin = file.tell()
+        end = file.seek(0, io.SEEK_END)
+        file.seek(begin)
         while len(start := file.read(9)) == 9:
             kind, size = struct.unpack("<BQ", start)
             if kind == _DATA_END:
                 return
             if kind not in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK) or kind == _CHUNK and is_chunk:
-                if size >= 2**62:
+                if size > end - file.tell():
                     return
                 file.seek(size, io.SEEK_CUR)
                 continue
