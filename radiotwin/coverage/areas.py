@@ -163,9 +163,11 @@ def _covered(power_dbm: np.ndarray, sd_db: np.ndarray | None, threshold_dbm: flo
     known.
     """
     found = {"threshold": threshold_dbm, "share": float((power_dbm >= threshold_dbm).mean())}
+    if sd_db is None:
+        return found
     # Nothing is certain of a power whose deviation a map does not tell.
-    known = np.isnan(power_dbm) | np.isfinite(sd_db) if sd_db is not None else np.zeros(0, bool)
-    if sd_db is not None and known.any():
+    known = np.isnan(power_dbm) | np.isfinite(sd_db)
+    if known.any():
         power_dbm, sd_db = power_dbm[known], sd_db[known]
         margin_db = float(ndtri(reliability)) * sd_db
         found["share_reliable"] = float((power_dbm - margin_db >= threshold_dbm).mean())

@@ -19,10 +19,10 @@ from radiotwin.inference.censored_regression import FitResult
 from radiotwin.pieces import KeptParts, Piece, keeps, kept
 from radiotwin.processes import resident_bytes
 
-EXACT_EVALUATIONS, MAX_EXACT_LINKS = 8, 1500  # the same where each follows paths, which is slow
+EXACT_EVALUATIONS, MAX_EXACT_LINKS = 8, 1500  # of `refine`, where each value follows paths
 MAX_FOLLOWED_LINKS = 5000  # that an effect changes: to follow paths of more takes many minutes
 MIN_EXACT_GAIN_NATS = 10.0  # that exact levels must gain to be refined on, and each descent
-MAX_EXACT_NUMBERS = 3  # of an effect whose exact levels are looked for where quick ones fit better
+MAX_EXACT_NUMBERS = 3  # of an effect whose paths are followed whatever its quick levels say
 MAX_EXACT_DESCENTS = 3  # the objective is rough, as paths open and close: a simplex stops early
 MAX_PROPOSALS = 4  # of one effect that are fitted
 MIN_GAIN_NATS = 5.0  # that a proposal must gain to be refined

@@ -36,8 +36,8 @@ def read_text_table(file: LogFile, dialect: Dialect) -> tuple[pd.DataFrame, np.n
         lines = _QuotedLines(text, file)
         for _ in islice(lines, dialect.before):
             pass
-        reader = csv.reader(lines, delimiter=dialect.delimiter, skipinitialspace=True,
-                            strict=True)
+        reader = _rows(csv.reader(lines, delimiter=dialect.delimiter, skipinitialspace=True,
+                                  strict=True), lines)
         try:
             return _read(file, dialect, reader, lines)
         except csv.Error as error:
@@ -61,8 +61,16 @@ class _QuotedLines(Lines):
         return line
 
 
+def _rows(reader: Iterator[list[str]], lines: _QuotedLines) -> Iterator[list[str]]:
+    """Yield all rows; what comes before the first, and each row, is counted by itself."""
+    lines.row_characters = 0
+    for row in reader:
+        lines.row_characters = 0
+        yield row
+
+
 def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
-          lines: _QuotedLines) -> tuple[pd.DataFrame, np.ndarray]:
+          lines: Lines) -> tuple[pd.DataFrame, np.ndarray]:
     names = list(dialect.names)
     if not names:
         fields = next(filter(None, reader), [])
@@ -93,12 +101,11 @@ def _read(file: LogFile, dialect: Dialect, reader: Iterator[list[str]],
     return pd.concat(chunks, ignore_index=True), np.array(numbers, dtype=np.int64)
 
 
-def _without_last(reader: Iterator[list[str]], lines: _QuotedLines,
+def _without_last(reader: Iterator[list[str]], lines: Lines,
                   after: int) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows that are not blank, with their lines, without the last ones."""
     waiting: deque[tuple[int, list[str]]] = deque()
     for row in reader:
-        lines.row_characters = 0
         if any(field.strip() for field in row):
             waiting.append((lines.number, row))
             if len(waiting) > after:

@@ -80,8 +80,8 @@ def _check(file: LogFile) -> None:
             with open_member(archive, entry.filename, file) as content:
                 while block := content.read(_BLOCK_BYTES):
                     # Entities can stand for any amount of text; UTF-16 would hide them.
-                    if any(each in last + block for each in _DOCTYPES) \
-                            or is_named_xml and b"\0" in block:
+                    text = last + block
+                    if any(each in text for each in _DOCTYPES) or is_named_xml and b"\0" in block:
                         raise BadInput(f"{file}: {entry.filename[:100]!r} is no XML of a workbook "
                                        "(it has a DOCTYPE or null characters); save it again")
                     last = block[-64:]

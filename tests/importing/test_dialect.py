@@ -173,3 +173,9 @@ def test_a_line_of_many_receptions_is_refused_before_it_fills_the_memory(read, m
         read('{"rxpk":[' + ",".join(["{}"] * 2000) + "]," + fields + "}", "log.jsonl")
     assert tracemalloc.get_traced_memory()[1] < 40e6
     tracemalloc.stop()
+
+
+def test_lines_before_the_table_are_no_part_of_its_first_row(read, monkeypatch):
+    monkeypatch.setenv("RADIOTWIN_MAX_ROW_BYTES", "1000")
+    _, table = read(("x" * 90 + "\n") * 15 + text_of(), lines_before_header=15)
+    assert table == ROWS
