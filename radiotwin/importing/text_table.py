@@ -35,7 +35,7 @@ def read_text_table(file: LogFile, dialect: Dialect) -> tuple[pd.DataFrame, np.n
     with file.open() as content, io.TextIOWrapper(content, dialect.encoding, newline="") as text:
         lines = _QuotedLines(text, file)
         for _ in islice(lines, dialect.before):
-            pass
+            lines.row_characters = 0
         reader = _rows(csv.reader(lines, delimiter=dialect.delimiter, skipinitialspace=True,
                                   strict=True), lines)
         try:
@@ -62,8 +62,7 @@ class _QuotedLines(Lines):
 
 
 def _rows(reader: Iterator[list[str]], lines: _QuotedLines) -> Iterator[list[str]]:
-    """Yield all rows; what comes before the first, and each row, is counted by itself."""
-    lines.row_characters = 0
+    """Yield all rows; each is counted by itself."""
     for row in reader:
         lines.row_characters = 0
         yield row
