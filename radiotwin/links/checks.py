@@ -9,7 +9,8 @@ from radiotwin.errors import BadInput
 from radiotwin.frames import is_same_frame, place
 from radiotwin.links.heights import height_notes
 from radiotwin.links.indoors import POSITION_SD_M, SURE, chance_inside
-from radiotwin.measurements import Measurements
+from radiotwin.links.link_data import LinkData
+from radiotwin.measurements import MAX_APART_M, Measurements
 from radiotwin.scene import Scene
 
 MIN_LINKS = 60  # that anything can be learnt from; half of them detected
@@ -117,7 +118,17 @@ def check_positions(receiver_m: np.ndarray, device_m: np.ndarray,
                            "metres; degrees are not converted")
     if both in notes:
         raise BadInput(notes[both])
-    return [*notes.values(), *(_off_the_map(receiver_m, scene) if scene is not None else [])]
+    if scene is None:
+        return list(notes.values())
+    outside = outside_map(receiver_m, scene)
+    if outside.mean() > MAX_OUTSIDE:
+        low, high, _ = _bounds_of(scene)
+        raise BadInput(
+            f"{outside.sum():,} of {len(outside):,} links have their receiver outside the 3D map, "
+            f"which goes from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) m: "
+            "give measurements and scene in one frame, in metres; "
+            "feet and degrees are not converted")
+    return [*notes.values(), *receiver_notes(receiver_m, scene)]
 
 
 def unmapped_ends(receiver_m: np.ndarray, device_m: np.ndarray, scene: Scene) -> np.ndarray:
@@ -149,20 +160,19 @@ def _bounds_of(scene: Scene) -> tuple[np.ndarray, np.ndarray, float]:
     return vertices_m[:, :2].min(axis=0), vertices_m[:, :2].max(axis=0), roof_m
 
 
-def _off_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
+def outside_map(receiver_m: np.ndarray, scene: Scene) -> np.ndarray:
+    """Return which receivers (n, 3) [m] are outside the 3D map, (n,) bool."""
+    low, high, _ = _bounds_of(scene)
+    return np.any((receiver_m[:, :2] < low) | (receiver_m[:, :2] > high), axis=1)
+
+
+def receiver_notes(receiver_m: np.ndarray, scene: Scene) -> list[str]:
+    """Return a note on receivers (n, 3) [m] inside buildings, below the ground, or too high."""
     known = np.isfinite(receiver_m).all(axis=1)
     inside, below = np.zeros((2, len(receiver_m)), dtype=bool)
     inside[known] = scene.city.inside(receiver_m[known])
     below[known] = inside[known] & scene.city.below_ground(receiver_m[known])
     inside &= ~below
-    low, high, _ = _bounds_of(scene)
-    outside = np.any((receiver_m[:, :2] < low) | (receiver_m[:, :2] > high), axis=1)
-    if outside.mean() > MAX_OUTSIDE:
-        raise BadInput(
-            f"{outside.sum():,} of {len(outside):,} links have their receiver outside the 3D map, "
-            f"which goes from ({low[0]:.0f}, {low[1]:.0f}) to ({high[0]:.0f}, {high[1]:.0f}) m: "
-            "give measurements and scene in one frame, in metres; "
-            "feet and degrees are not converted")
     deep = inside.copy()
     deep[inside] = chance_inside(scene.city, receiver_m[inside]) >= SURE
     sure = f"{deep.sum():,} of them surely, with positions off by {POSITION_SD_M:g} m"
@@ -170,6 +180,28 @@ def _off_the_map(receiver_m: np.ndarray, scene: Scene) -> list[str]:
             for odd, where in ((inside, f"inside a building ({sure}): {INDOORS}"),
                                (below, f"below the ground: {BURIED}"))
             if odd.any()] + height_notes(receiver_m, scene)
+
+
+def refuse_misplaced_anchors(links: LinkData, scene: Scene) -> None:
+    """Check that anchors are where a device can be.
+
+    Raises:
+        BadInput: one is far from the receivers, inside a building, or below the ground.
+    """
+    anchors = np.array(sorted(links.anchors), dtype=int)
+    anchors = anchors[np.isfinite(links.device_m[anchors]).all(axis=1)]
+    apart_m = np.abs(links.device_m[anchors, :2] - np.median(links.receiver_m[:, :2], axis=0))
+    for index in anchors[(apart_m > MAX_APART_M).any(axis=1)]:
+        raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} is more "
+                       f"than {MAX_APART_M / 1000:g} km from the middle of the receivers; both "
+                       "need one frame, in metres")
+    for index in anchors[scene.city.inside(links.device_m[anchors])]:
+        x_m, y_m, z_m = links.device_m[index]
+        below = scene.city.below_ground(links.device_m[[index]])[0]
+        where = "below the ground" if below else "inside a building"
+        raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} at "
+                       f"({x_m:g}, {y_m:g}, {z_m:g}) m is {where} of the scene; correct "
+                       "its position, or the scene's frame")
 
 
 def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,

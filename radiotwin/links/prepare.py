@@ -15,7 +15,10 @@ from radiotwin.links.checks import (
     check_tilts,
     copied_rows,
     find_fill_value,
+    outside_map,
+    receiver_notes,
     refuse_empty_levels,
+    refuse_misplaced_anchors,
     require_one_frame,
     unheard_devices,
     unmapped_ends,
@@ -44,14 +47,22 @@ def join_links(measurements: Measurements, scene: Scene) -> LinkData:
         n links; positions of unknown devices are NaN in x and y, whatever the file gives.
 
     Raises:
-        BadInput: measurements and scene are in different frames.
+        BadInput: measurements and scene are in different frames, or an anchor is far from the
+            receivers or inside a building.
     """
     require_one_frame(measurements, scene)
     device_m = measurements.device_m.copy()
     device_m[~measurements.is_anchor, :2] = np.nan
-    return _link_data(measurements, measurements.table.reset_index(drop=True), scene,
-                      measurements.level_db, measurements.receiver_m, device_m,
-                      measurements.device_index, np.arange(len(device_m)), [])
+    receiver_m = measurements.receiver_m
+    notes, outside = receiver_notes(receiver_m, scene), outside_map(receiver_m, scene)
+    if outside.any():
+        notes.append(f"{outside.sum():,} of {len(outside):,} links have their receiver outside the "
+                     "3D map")
+    links = _link_data(measurements, measurements.table.reset_index(drop=True), scene,
+                       measurements.level_db, receiver_m, device_m, measurements.device_index,
+                       np.arange(len(device_m)), notes)
+    refuse_misplaced_anchors(links, scene)
+    return links
 
 
 def prepare_links(measurements: Measurements, scene: Scene | None,
@@ -70,7 +81,8 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
 
     Raises:
         BadInput: nothing that can be used is left, or positions or levels that cannot be what they
-            are said to be, or measurements and scene are in different frames.
+            are said to be, or measurements and scene are in different frames, or an anchor is
+            inside a building.
     """
     table = measurements.table.reset_index(drop=True)
     level_db, receiver_m = measurements.level_db, measurements.receiver_m
@@ -137,6 +149,8 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     device = (np.cumsum(placed) - 1)[device_index[keep]]
     links = _link_data(measurements, table[keep], scene, level_db[keep], receiver_m[keep],
                        device_m[placed], device, np.flatnonzero(placed), notes)
+    if scene is not None and not to_locate:
+        refuse_misplaced_anchors(links, scene)
     notes += [RESTART_NOTE] * links.time_restarts
     return links
 

@@ -14,8 +14,6 @@ from radiotwin.channel.base import MIN_DETECTED
 from radiotwin.channel.published import PublishedLaw
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkData, LinkGeometry, link_geometry
-from radiotwin.links.checks import BURIED, INDOORS
-from radiotwin.links.heights import height_notes
 from radiotwin.localize import (
     DeviceEstimate,
     LocalizeSettings,
@@ -23,7 +21,6 @@ from radiotwin.localize import (
     localize,
     read_device,
 )
-from radiotwin.measurements import MAX_APART_M
 from radiotwin.pieces import kept
 from radiotwin.scene import Scene
 from radiotwin.twin.twin import Twin
@@ -44,7 +41,6 @@ def fit_links(links: LinkData, scene: Scene, channel: type[ChannelModel], seed: 
     Raises:
         BadInput: as of `fit_twin`.
     """
-    _check_positions(links, scene)
     is_anchor = np.isin(np.arange(len(links.device_m)), sorted(links.anchors))
     anchors_m = np.where(is_anchor[:, None], links.device_m, np.nan)
     if issubclass(channel, PublishedLaw):
@@ -167,36 +163,6 @@ def _locate(links: LinkData, scene: Scene, channel: ChannelModel, unknown: np.nd
 def _device(name: str, found: DeviceEstimate) -> TwinDevice:
     return TwinDevice(name, found.x_m, found.y_m, found.z_m, "unknown", bool(found.located),
                       float(found.credible_radius_m), found.second_mode)
-
-
-def _check_positions(links: LinkData, scene: Scene) -> None:
-    """Raise BadInput for anchors inside buildings or far away, warn about receivers likewise."""
-    anchors = np.array(sorted(links.anchors), dtype=int)
-    anchors = anchors[np.isfinite(links.device_m[anchors]).all(axis=1)]
-    apart_m = np.abs(links.device_m[anchors, :2] - np.median(links.receiver_m[:, :2], axis=0))
-    for index in anchors[(apart_m > MAX_APART_M).any(axis=1)]:
-        raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} is more "
-                       f"than {MAX_APART_M / 1000:g} km from the middle of the receivers; both "
-                       "need one frame, in metres")
-    for index in anchors[scene.city.inside(links.device_m[anchors])]:
-        x_m, y_m, z_m = links.device_m[index]
-        below = scene.city.below_ground(links.device_m[[index]])[0]
-        where = "below the ground" if below else "inside a building"
-        raise BadInput(f"devices, row {index + 2}: anchor {links.device_names[index]!r} at "
-                       f"({x_m:g}, {y_m:g}, {z_m:g}) m is {where} of the scene; correct "
-                       "its position, or the scene's frame")
-    receiver_m, corners_m = links.receiver_m[:, :2], scene.city.vertices[:, :2]
-    outside = (receiver_m < corners_m.min(axis=0)) | (receiver_m > corners_m.max(axis=0))
-    inside, below = (scene.city.inside(links.receiver_m),
-                     scene.city.below_ground(links.receiver_m))
-    for odd, where in ((inside & ~below, f"inside a building: {INDOORS}"),
-                       (inside & below, f"below the ground: {BURIED}"),
-                       (outside.any(axis=1), "outside the 3D map")):
-        if odd.any():
-            warnings.warn(f"{odd.sum():,} of {len(odd):,} links have their receiver {where}",
-                          stacklevel=4)
-    for note in height_notes(links.receiver_m, scene):
-        warnings.warn(note, stacklevel=4)
 
 
 def level_of(links: LinkData) -> str:

@@ -50,6 +50,9 @@ def fit_over_wrong_map(links: LinkData, scene: Scene, seed: int, start: Twin | N
     shift_m = _shift(links, seed)
     on_map = _moved(links, shift_m)
     with_copies = _with_copies(on_map)
+    if start is not None:
+        back_m = -shift_m[0], -shift_m[1], -shift_m[2]
+        start = replace(start, devices=[_moved_device(each, back_m) for each in start.devices])
     by_paths = fit_along_paths(with_copies, scene, seed, start, executor)
     assert isinstance(by_paths.channel, ImagePaths)
     unsure = _calibrated(by_paths.devices, on_map)

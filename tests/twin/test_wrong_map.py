@@ -5,13 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from radiotwin.channel.segmented_log_distance import SegmentedLogDistance
 from radiotwin.compare import predict
 from radiotwin.links import prepare_links
 from radiotwin.localize.estimate import TwinDevice
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene.citymap import CityMap
 from radiotwin.survey import fly_survey
-from radiotwin.twin import Twin, fit_twin
+from radiotwin.twin import Twin, fit_twin, fit_wrong_map
+from radiotwin.twin.fit_links import fit_links
 from radiotwin.twin.fit_wrong_map import LOST_M, _calibrated, _with_copies
 
 SHIFT_M = np.array([2.5, -1.5])
@@ -98,3 +100,29 @@ def test_a_copy_that_is_not_located_says_nothing(narrow_street):
     own = [TwinDevice(name, 0.0, 0.0, 1.5, "unknown", True, 8.0, None) for name in links.device_names]
     copies = [TwinDevice("copy", 1e4, 1e4, 1.5, "unknown", False, 10.0, None) for _ in links.anchors]
     assert [each.credible_radius_m for each in _calibrated(own + copies, links)] == [8.0] * len(own)
+
+
+def test_where_the_map_is_shifted_back_an_anchor_beside_a_wall_is_right_and_an_earlier_twin_moves_too(
+        narrow_street, monkeypatch):
+    scene, measured = narrow_street.scene, narrow_street.measured
+    links = prepare_links(measured, scene)
+    anchor_m = links.device_m[sorted(links.anchors)]
+    steps_m = np.stack(np.meshgrid(np.arange(-60.0, 61, 3), np.arange(-60.0, 61, 3), [0.0]), axis=-1).reshape(-1, 3)
+    shift_m = next(step_m for step_m in steps_m if scene.city.inside(anchor_m + step_m).any())
+    assert not scene.city.inside(anchor_m).any()
+    seen = {}
+
+    def paths(moved, scene, seed, start, executor):
+        law = fit_links(moved, scene, SegmentedLogDistance, seed)
+        seen.update(law=law, start=start)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(fit_wrong_map, "_shift", lambda links, seed: (shift_m[0], shift_m[1], 1.0))
+    monkeypatch.setattr(fit_wrong_map, "fit_along_paths", paths)
+    earlier = fit_twin(measured, scene, model="segmented_log_distance", seed=0)
+    with pytest.raises(KeyboardInterrupt):
+        fit_twin(measured, scene, model="path_kriging", seed=0, start=earlier)
+    for device, before in zip(seen["start"].devices, earlier.devices, strict=True):
+        np.testing.assert_allclose([device.x_m, device.y_m], [before.x_m + shift_m[0], before.y_m + shift_m[1]])
+    on_map_m = [(each.x_m, each.y_m) for each in seen["law"].devices if each.role == "anchor"]
+    np.testing.assert_allclose(on_map_m[:len(anchor_m)], (anchor_m + shift_m)[:, :2])
