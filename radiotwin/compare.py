@@ -66,7 +66,7 @@ class Comparison:
         if len(summary):
             tables.append(("Error of the unknown devices' positions [m]",
                            {"model": "left"} | dict.fromkeys(
-                               ("devices", "median", "90 %", "worst"), "right"),
+                               ("located", "median", "90 %", "worst"), "right"),
                            [[self._label(row.model), int(row.devices), row.median_m, row.p90_m,
                              row.worst_m]
                             for row in summary.itertuples()]))
@@ -79,9 +79,12 @@ class Comparison:
         return f"{model} (no fit)" if published else model
 
     def location_summary(self) -> pd.DataFrame:
-        """Return median, 90th percentile and worst position error [m] of each model."""
+        """Return median, 90th percentile and worst position error [m] of each model.
+
+        `devices` is how many it located, of those whose true position is known.
+        """
         def summary(errors: pd.Series) -> pd.Series:
-            return pd.Series({"devices": len(errors), "median_m": errors.median(),
+            return pd.Series({"devices": errors.count(), "median_m": errors.median(),
                               "p90_m": errors.quantile(0.9), "worst_m": errors.max()})
         if self.locations.empty or self.locations["error_m"].isna().all():
             return pd.DataFrame(columns=["model", "devices", "median_m", "p90_m", "worst_m"])
@@ -101,7 +104,7 @@ def published_models(frequency_hz: float) -> tuple[str, ...]:
     def holds(name: str) -> bool:
         law = channel_named(name)
         assert issubclass(law, PublishedLaw)
-        low_hz, high_hz = law.validity.frequency_hz
+        low_hz, high_hz = law.frequency_range_hz
         return low_hz / MAX_FACTOR <= frequency_hz <= high_hz * MAX_FACTOR
 
     return tuple(filter(holds, PUBLISHED_MODELS))

@@ -114,7 +114,7 @@ def print_rows(title: str, columns: dict[str, str], rows: list[list]) -> None:
     Args:
         title: line above it.
         columns: heading -> `left` or `right`.
-        rows: cells; floats are printed with two decimals, NaN as a dash.
+        rows: cells; floats are printed with two decimals (small ones with two digits), NaN as a dash.
     """
     names = [heading or f"column {number}" for number, heading in enumerate(columns, start=1)]
     collected.setdefault("tables", []).append(
@@ -152,5 +152,5 @@ def print_table(table: Table, to: Console) -> None:
 
 def _text(cell: Any) -> str:
     if isinstance(cell, float):
-        return "–" if cell != cell else f"{cell:.2f}"
+        return "–" if cell != cell else f"{cell:.2g}" if 0 < abs(cell) < 0.005 else f"{cell:.2f}"
     return printable(str(cell)).replace("\n", "\\n").replace("\t", "\\t")

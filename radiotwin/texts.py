@@ -21,6 +21,18 @@ def shown(text: str, max_length: int = MAX_TEXT) -> str:
     return _HIDDEN.sub(lambda found: ascii(found[0])[1:-1], cut)
 
 
+def percent(share: float) -> str:
+    """Return a share as a percentage that is neither 0 nor 100 where the share is not."""
+    if 0 < share < 0.01:
+        return "under 1%"
+    return "over 99%" if 0.99 < share < 1 else f"{share:.0%}"
+
+
+def shortly(value: float) -> str:
+    """Return a number with three digits, or all before the point."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"
+
+
 def shown_data(value: Any) -> Any:
     """Return data for a script with every text in it as `shown`, but for packed arrays."""
     if isinstance(value, str):

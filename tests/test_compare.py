@@ -64,6 +64,11 @@ def test_location_errors_are_distances(comparison, small_scene):
     errors = comparison.locations.query("model == 'log_distance'")["error_m"]
     assert summary.loc["log_distance", "worst_m"] == errors.max()
     assert summary.loc["log_distance", "median_m"] == errors.median()
+    lost = dataclasses.replace(comparison, locations=comparison.locations.assign(error_m=[
+        np.nan, *comparison.locations["error_m"][1:]]))
+    model = comparison.locations["model"].iloc[0]
+    fewer, all_of_them = (each.location_summary().set_index("model").loc[model, "devices"] for each in (lost, comparison))
+    assert fewer == all_of_them - 1
 
 
 def test_a_map_against_itself_has_no_error_and_a_shifted_one_has_its_shift(truth):

@@ -7,17 +7,24 @@ in urban environments', IEEE GLOBECOM 2014: excess losses, and their standard de
 frequency.
 
 The lower end is the terminal on the ground, the higher one the platform, as in the papers, whose
-platforms fly above all roofs.
+platforms fly above all roofs; where a map says how high those are, that is asked for.
 """
 
 from __future__ import annotations
 
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from typing_extensions import override
 
-from radiotwin.channel.published import Branch, PublishedLaw, Validity, free_space_db
+from radiotwin.channel.published import (
+    Branch,
+    PublishedLaw,
+    Validity,
+    free_space_db,
+    mean_roof_m,
+)
+from radiotwin.inference.gaussian import Limit
 from radiotwin.links import LinkGeometry
 
 FREQUENCIES_HZ = (0.7e9, 2.0e9, 5.8e9)  # between which excess losses are interpolated over log f
@@ -43,8 +50,19 @@ class _AlHourani(PublishedLaw):
     """The law; subclasses have the environment."""
 
     source = "Al-Hourani et al. 2014"
-    validity = Validity((0.7e9, 5.8e9), (1.0, np.inf))
+    frequency_range_hz = (0.7e9, 5.8e9)
     environment: ClassVar[Environment]
+
+    @override
+    def fit(self, links: LinkGeometry, level_db: np.ndarray, limit_db: Limit,
+            seed: int = 0) -> Self:
+        super().fit(links, level_db, limit_db, seed)
+        self.roof_m = mean_roof_m(links.city) if links.city is not None else 0.0
+        return self
+
+    @override
+    def validity(self, links: LinkGeometry) -> Validity:
+        return Validity(self.frequency_range_hz, (1.0, np.inf), (self.roof_m, np.inf))
 
     @override
     def branch(self, links: LinkGeometry, los: bool) -> Branch:

@@ -24,6 +24,7 @@ MIN_BELOW_ROOF_M = 1.0  # that the mobile is below the roofs, whatever their hei
 LOS_M = 20.0  # from which on the law along a street holds; it is free space there
 # The report has a standard deviation of 4 to 8 dB: its ends are taken for the two classes.
 LOS_SD_DB, NLOS_SD_DB = 4.0, 8.0
+BASE_M, MOBILE_M = (4.0, 50.0), (1.0, 3.0)  # heights that the report is for
 
 
 class WalfischIkegami(PublishedLaw):
@@ -31,9 +32,13 @@ class WalfischIkegami(PublishedLaw):
 
     name = "cost231_wi"
     source = "COST 231 final report, Walfisch-Ikegami"
-    validity = Validity((0.8e9, 2.0e9), (20.0, 5000.0), (4.0, 50.0), (1.0, 3.0))
+    frequency_range_hz = (0.8e9, 2.0e9)
     needs_map = True
     city_factor: ClassVar[float] = 0.7  # of k_f
+
+    @override
+    def validity(self, links: LinkGeometry) -> Validity:
+        return Validity(self.frequency_range_hz, (20.0, 5000.0), BASE_M, MOBILE_M)
 
     @override
     def branch(self, links: LinkGeometry, los: bool) -> Branch:
@@ -47,7 +52,7 @@ class WalfischIkegami(PublishedLaw):
 
     def _roof_to_street_db(self, links: LinkGeometry) -> np.ndarray:
         """Return L_rts (n,) [dB]: from the last roof down to the mobile, Ikegami's part."""
-        mobile_m = np.clip(ends_m(links)[1], *self.validity.low_m)
+        mobile_m = np.clip(ends_m(links)[1], *MOBILE_M)
         below_m = np.maximum(self.roof_m - mobile_m, MIN_BELOW_ROOF_M)
         orientation_db = 4.0 - 0.114 * (STREET_ANGLE_DEG - 55)
         return (-16.9 - 10 * np.log10(STREET_M) + 10 * np.log10(self.frequency_hz / 1e6)
@@ -55,7 +60,7 @@ class WalfischIkegami(PublishedLaw):
 
     def _many_screens_db(self, links: LinkGeometry) -> np.ndarray:
         """Return L_msd (n,) [dB]: over the rows of roofs, Walfisch and Bertoni's part."""
-        base_m = np.clip(ends_m(links)[0], *self.validity.high_m)
+        base_m = np.clip(ends_m(links)[0], *BASE_M)
         over_m, kilometres = base_m - self.roof_m, links.distance_m / 1e3
         above = over_m > 0
         shadow_db = np.where(above, -18 * np.log10(1 + np.maximum(over_m, 0.0)), 0.0)

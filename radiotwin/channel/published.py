@@ -4,8 +4,8 @@ They are priors, where no device of known position was measured, and baselines e
 has two branches, with line of sight and without. A 3D map decides which one holds; without a map
 they are mixed by the law's probability of line of sight.
 
-Recommendations are written for a fixed station and a terminal. Here either end may be the higher
-one, and paths are reciprocal: the laws know a higher and a lower end, heights above the ground.
+Recommendations are written for a fixed station and a terminal. Paths are reciprocal, so most laws
+here know a higher and a lower end, heights above the ground.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from radiotwin.errors import BadInput
 from radiotwin.inference.gaussian import Limit
 from radiotwin.links import LinkGeometry
 from radiotwin.scene.citymap import CityMap
+from radiotwin.texts import percent, shortly
 
 MAX_FACTOR = 2.0  # beyond its range of frequencies to which a law is extrapolated, with a warning
 MIN_ROOF_M = 2.5  # of what counts as a building
@@ -29,8 +30,12 @@ GRID = 128  # points to each side of the map, at which its roofs are looked up
 MAX_ROOF_M = 1e4  # of a stored roof
 
 
+Bounds = tuple[float | np.ndarray, float | np.ndarray]
+"""Least and greatest value, of all links or (n,) of each."""
+
+
 class Validity(NamedTuple):
-    """Range that a law was published for, each as (least, greatest).
+    """Range that a law was published for.
 
     Attributes:
         frequency_hz: of the radio [Hz].
@@ -38,10 +43,10 @@ class Validity(NamedTuple):
         high_m, low_m: height of the higher and of the lower end [m].
     """
 
-    frequency_hz: tuple[float, float]
-    distance_m: tuple[float, float]
-    high_m: tuple[float, float] = (0.0, np.inf)
-    low_m: tuple[float, float] = (0.0, np.inf)
+    frequency_hz: Bounds
+    distance_m: Bounds
+    high_m: Bounds = (0.0, np.inf)
+    low_m: Bounds = (0.0, np.inf)
 
 
 class Branch(NamedTuple):
@@ -56,7 +61,7 @@ class PublishedLaw(ChannelModel):
 
     Attributes:
         source: recommendation, and the section or table used.
-        validity: what it was published for.
+        frequency_range_hz: least and greatest frequency that any of its branches holds for [Hz].
         needs_map: whether it has no probability of line of sight, so that a map must decide.
         frequency_hz: of the radio [Hz].
         with_map: whether `los` of links decides the branch.
@@ -67,7 +72,7 @@ class PublishedLaw(ChannelModel):
     uses_map = True
     needs_map: ClassVar[bool] = False
     source: ClassVar[str]
-    validity: ClassVar[Validity]
+    frequency_range_hz: ClassVar[tuple[float, float]]
 
     def __init__(self, frequency_hz: float = np.nan, with_map: bool = False, roof_m: float = 0.0,
                  power_dbm: float = 0.0) -> None:
@@ -77,6 +82,10 @@ class PublishedLaw(ChannelModel):
     @abstractmethod
     def branch(self, links: LinkGeometry, los: bool) -> Branch:
         """Return loss and shadowing of n links, if all have line of sight, or if none has."""
+
+    @abstractmethod
+    def validity(self, links: LinkGeometry) -> Validity:
+        """Return what the branches that n links take were published for."""
 
     def los_probability(self, links: LinkGeometry) -> np.ndarray:
         """Return the probability (n,) of line of sight; needed unless `needs_map`."""
@@ -91,7 +100,7 @@ class PublishedLaw(ChannelModel):
             BadInput: the frequency is unknown or far outside the law's range, or a law that needs
                 a map with buildings has none.
         """
-        low_hz, high_hz = self.validity.frequency_hz
+        low_hz, high_hz = self.frequency_range_hz
         if not low_hz / MAX_FACTOR <= links.frequency_hz <= high_hz * MAX_FACTOR:
             given = ("is not known; give frequency_hz" if np.isnan(links.frequency_hz)
                      else f"is {links.frequency_hz / 1e9:g} GHz; take another model")
@@ -127,33 +136,41 @@ class PublishedLaw(ChannelModel):
     def outside(self, links: LinkGeometry) -> list[str]:
         """Return a sentence on each quantity that lies outside the law's validity."""
         found = []
-        for what, value, (least, most), unit in self._quantities(links):
+        for what, value, least, most, unit in self._quantities(links):
             odd = (value < least) | (value > most)
-            if odd.any():
-                ends = sorted({f"{value[odd].min():.3g}", f"{value[odd].max():.3g}"}, key=float)
-                share = "" if what == "frequency" else f" in {odd.mean():.0%} of the links"
-                found.append(f"{self.name} is used outside what {self.source} was published for: "
-                             f"the {what} is {' to '.join(ends)} {unit}{share}, published is "
-                             f"{least:g} to {most:g} {unit}")
+            if not odd.any():
+                continue
+            ends = sorted({shortly(value[odd].min()), shortly(value[odd].max())}, key=_value)
+            share = "" if (value == value[0]).all() and odd.all() else f" in {percent(odd.mean())}"
+            ranges = sorted(set(zip(least[odd].tolist(), most[odd].tolist(), strict=True)))
+            published = " or ".join(_range(*each) for each in ranges)
+            found.append(f"{self.name} is used outside what {self.source} was published for: the "
+                         f"{what} is {' to '.join(ends)} {unit}{share and share + ' of the links'}"
+                         f", published is {published} {unit}")
         return found
 
     def inside(self, links: LinkGeometry) -> np.ndarray:
         """Return whether all quantities of each link lie within the law's validity (n,)."""
         result = np.ones(len(links), dtype=bool)
-        for _, value, (least, most), _ in self._quantities(links):
+        for _, value, least, most, _ in self._quantities(links):
             result &= (value >= least) & (value <= most)
         return result
 
     def _quantities(self, links: LinkGeometry,
-                    ) -> list[tuple[str, np.ndarray, tuple[float, float], str]]:
-        """Return name, values (n,) or (1,), published range and unit of what validity bounds."""
+                    ) -> list[tuple[str, np.ndarray, np.ndarray, np.ndarray, str]]:
+        """Return name, values, least and greatest published ones, (n,) each, and the unit."""
         high_m, low_m = ends_m(links)
-        least_hz, most_hz = self.validity.frequency_hz
-        return [("frequency", np.atleast_1d(self.frequency_hz / 1e9),
-                 (least_hz / 1e9, most_hz / 1e9), "GHz"),
-                ("distance", links.distance_m, self.validity.distance_m, "m"),
-                ("height of the higher end", high_m, self.validity.high_m, "m"),
-                ("height of the lower end", low_m, self.validity.low_m, "m")]
+        valid = self.validity(links)
+        least_hz, most_hz = valid.frequency_hz
+        frequency_ghz = np.full(len(links), self.frequency_hz / 1e9)
+        every = [("frequency", frequency_ghz, (np.divide(least_hz, 1e9), np.divide(most_hz, 1e9)),
+                  "GHz"),
+                 ("distance", links.distance_m, valid.distance_m, "m"),
+                 ("height of the higher end", high_m, valid.high_m, "m"),
+                 ("height of the lower end", low_m, valid.low_m, "m")]
+        return [(what, value, np.broadcast_to(least, value.shape),
+                 np.broadcast_to(most, value.shape), unit)
+                for what, value, (least, most), unit in every if len(value)]
 
     @override
     def state(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -169,7 +186,7 @@ class PublishedLaw(ChannelModel):
             raise ValueError("with_map is neither true nor false")
         if cls.needs_map and not settings["with_map"]:
             raise ValueError(f"{cls.name} needs a map")
-        low_hz, high_hz = cls.validity.frequency_hz
+        low_hz, high_hz = cls.frequency_range_hz
         frequency_hz = require_number(settings, "frequency_hz", low_hz / MAX_FACTOR,
                                       high_hz * MAX_FACTOR)
         roof_m = require_number(settings, "roof_m", MIN_ROOF_M if cls.needs_map else 0.0,
@@ -178,13 +195,19 @@ class PublishedLaw(ChannelModel):
                    require_number(settings, "power_dbm", -MAX_DB, MAX_DB))
 
 
+def heights_m(links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
+    """Return the heights (n,) above the ground of devices and of receivers [m]."""
+    device_m, receiver_m = links.device_m[:, 2], links.receiver_m[:, 2]
+    if links.city is not None and links.city.terrain is not None:
+        device_m = device_m - links.city.ground_height_m(*links.device_m[:, :2].T)
+        receiver_m = receiver_m - links.city.ground_height_m(*links.receiver_m[:, :2].T)
+    return device_m, receiver_m
+
+
 def ends_m(links: LinkGeometry) -> tuple[np.ndarray, np.ndarray]:
     """Return the heights (n,) above the ground of the higher and of the lower end of links [m]."""
-    heights_m = links.device_m[:, 2], links.receiver_m[:, 2]
-    if links.city is not None and links.city.terrain is not None:
-        heights_m = (heights_m[0] - links.city.ground_height_m(*links.device_m[:, :2].T),
-                     heights_m[1] - links.city.ground_height_m(*links.receiver_m[:, :2].T))
-    return np.maximum(*heights_m), np.minimum(*heights_m)
+    both_m = heights_m(links)
+    return np.maximum(*both_m), np.minimum(*both_m)
 
 
 def ground_m(links: LinkGeometry) -> np.ndarray:
@@ -206,3 +229,14 @@ def mean_roof_m(city: CityMap) -> float:
     height_m = city.height_at(*np.meshgrid(x_m, y_m)) - city.ground_height_m(*np.meshgrid(x_m, y_m))
     roofs_m = height_m[height_m > MIN_ROOF_M]
     return float(roofs_m.mean()) if len(roofs_m) else 0.0
+
+
+def _range(least: float, most: float) -> str:
+    """Return the words for a published range."""
+    if np.isinf(most):
+        return f"{least:g} and more"
+    return f"{least:g} to {most:g}"
+
+
+def _value(text: str) -> float:
+    return float(text.replace(",", ""))

@@ -1,12 +1,12 @@
 """3GPP TR 36.777 for aerial terminals, with TR 38.901 below its range of heights.
 
-Above 22.5 m the higher end is the aerial terminal of TR 36.777 V15.0.0, Annex B, at its height. The
-lower end, a device near the ground, stands where the report has a base station at 25 m (UMa) or
-10 m (UMi). The formulas there do not contain the base station's height; the probability of line of
-sight was simulated for it, and is too high for a device in the street.
+A receiver above 22.5 m that is the higher end is the aerial terminal of TR 36.777 V15.0.0, Annex B,
+at its height. The lower end, a device near the ground, stands where the report has a base station
+at 25 m (UMa) or 10 m (UMi). The formulas there do not contain the base station's height; the
+probability of line of sight was simulated for it, and is too high for a device in the street.
 
-Up to 22.5 m the higher end is the base station of TR 38.901 V16.1.0, Sec. 7.4, and the lower end
-its terminal, with an environment height of 1 m.
+Otherwise the higher end, such as a mast, is the base station of TR 38.901 V16.1.0, Sec. 7.4, and
+the lower end its terminal, with an environment height of 1 m.
 """
 
 from __future__ import annotations
@@ -24,11 +24,13 @@ from radiotwin.channel.published import (
     ends_m,
     free_space_db,
     ground_m,
+    heights_m,
 )
 from radiotwin.links import LinkGeometry
 
-AERIAL_M = 22.5  # height of the higher end above which TR 36.777 holds
+AERIAL_M = 22.5  # height of a receiver above which TR 36.777 holds
 MAX_HEIGHT_M, MAX_NLOS_HEIGHT_M = 300.0, 100.0  # of TR 36.777; the second for UMa-AV without LoS
+MAX_AERIAL_M, MAX_DISTANCE_M = 4000.0, 5000.0  # distances of TR 36.777 and of TR 38.901
 MIN_TERMINAL_M = 1.5
 ENVIRONMENT_M = 1.0  # effective environment height of TR 38.901
 
@@ -36,11 +38,21 @@ ENVIRONMENT_M = 1.0  # effective environment height of TR 38.901
 class _AerialLaw(PublishedLaw):
     """Heights and distances as the reports have them, and the choice between them."""
 
-    validity = Validity((0.5e9, 100e9), (10.0, 5000.0), (MIN_TERMINAL_M, MAX_HEIGHT_M),
-                        (MIN_TERMINAL_M, AERIAL_M))
+    frequency_range_hz = (0.5e9, 100e9)
+    station_m: ClassVar[float]  # height of the base station of the reports [m]
+    max_nlos_m: ClassVar[float]  # height of an aerial terminal, without line of sight [m]
     intercept_db: ClassVar[float]  # of TR 38.901 with LoS, before the breakpoint
     exponent: ClassVar[float]
     beyond_db: ClassVar[float]  # factor of the breakpoint's term
+
+    @override
+    def validity(self, links: LinkGeometry) -> Validity:
+        aerial = self._is_aerial(links)
+        hidden = aerial & ~links.los if self.with_map else np.zeros(len(links), dtype=bool)
+        return Validity(
+            self.frequency_range_hz, (10.0, np.where(aerial, MAX_AERIAL_M, MAX_DISTANCE_M)),
+            (MIN_TERMINAL_M, np.where(hidden, self.max_nlos_m, MAX_HEIGHT_M)),
+            (MIN_TERMINAL_M, np.where(aerial, max(self.station_m, AERIAL_M), AERIAL_M)))
 
     def terrestrial_los_db(self, links: LinkGeometry) -> np.ndarray:
         """Return the loss (n,) [dB] of TR 38.901, Table 7.4.1-1, with line of sight."""
@@ -59,17 +71,19 @@ class _AerialLaw(PublishedLaw):
                 np.clip(low_m, MIN_TERMINAL_M, AERIAL_M))
 
     def _is_aerial(self, links: LinkGeometry) -> np.ndarray:
-        return ends_m(links)[0] > AERIAL_M
+        device_m, receiver_m = heights_m(links)
+        return (receiver_m > AERIAL_M) & (receiver_m >= device_m)
 
     def _log_ghz(self) -> float:
         return float(np.log10(self.frequency_hz / 1e9))
 
 
 class UrbanMacro(_AerialLaw):
-    """UMa-AV of TR 36.777; UMa of TR 38.901 up to 22.5 m."""
+    """UMa-AV of TR 36.777; UMa of TR 38.901 for receivers up to 22.5 m."""
 
     name = "tr36777_uma"
     source = "3GPP TR 36.777 Annex B UMa-AV, TR 38.901 UMa"
+    station_m, max_nlos_m = 25.0, MAX_NLOS_HEIGHT_M
     intercept_db, exponent, beyond_db = 28.0, 2.2, 9.0
 
     @override
@@ -101,10 +115,11 @@ class UrbanMacro(_AerialLaw):
 
 
 class UrbanMicro(_AerialLaw):
-    """UMi-AV of TR 36.777; UMi street canyon of TR 38.901 up to 22.5 m."""
+    """UMi-AV of TR 36.777; UMi street canyon of TR 38.901 for receivers up to 22.5 m."""
 
     name = "tr36777_umi"
     source = "3GPP TR 36.777 Annex B UMi-AV, TR 38.901 UMi"
+    station_m, max_nlos_m = 10.0, MAX_HEIGHT_M
     intercept_db, exponent, beyond_db = 32.4, 2.1, 9.5
 
     @override

@@ -154,6 +154,7 @@ def locate(
     from radiotwin.cells import write_csv
     from radiotwin.files import atomic_path, require_suffix, require_writable
     from radiotwin.inputs import keep_inputs
+    from radiotwin.localize.without_map import MIN_LINKS
     from radiotwin.measurements import read_devices, read_measurements
     from radiotwin.scene import Scene
     from radiotwin.scene.folder import files_of
@@ -180,5 +181,6 @@ def locate(
                                        "within the 90 % radius": "right"},
                    [[error["devices"], error["median_m"], error["ninety_m"],
                      f"{error['within']:.0%}"]])
-    say(f"wrote {out}: {len(positions)} of {unknown} unknown devices; half of the 90 % radii are "
-        f"below {positions['radius_m'].median():.0f} m")
+    radii = f"half of the 90 % radii are below {positions['radius_m'].median():.0f} m" \
+        if len(positions) else f"each needs {MIN_LINKS} links and more"
+    say(f"wrote {out}: {len(positions)} of {unknown} unknown devices; {radii}")

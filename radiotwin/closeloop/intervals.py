@@ -123,6 +123,6 @@ def _checked(parameter: Parameter, found: int, folds: int) -> Parameter:
         with np.errstate(divide="ignore"):
             ends, bounds = np.log(ends), np.log(bounds)
     span = min(np.ptp(bounds), allowed.period) if np.isfinite(bounds).all() else allowed.period
-    span = min(span, LEVELS_DB) if parameter.unit == "dB" else span
+    span = min(span, LEVELS_DB) if parameter.unit in ("dB", "dBm") else span
     determined = bool(np.ptp(ends) <= MAX_SHARE * span) and found >= MIN_FOLDS * folds
     return replace(parameter, low=low, high=high, determined=determined)

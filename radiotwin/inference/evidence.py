@@ -9,9 +9,11 @@ FLIPS = 4_000  # sign flips drawn: a p-value of 0.1 is known to 0.005
 def cross_fit_p_value(gains: np.ndarray) -> float:
     """Return a bound on the probability of such held-out gains if the effect is not there.
 
-    A likelihood ratio whose parameters were fitted elsewhere is at most 1 on average then, and so
-    is its mean over the folds; by Markov's inequality (Wasserman, Ramdas and Balakrishnan 2020,
-    'Universal inference', PNAS 117(29), the cross-fit test).
+    A likelihood ratio whose parameters were fitted elsewhere is 1 on average then, if the model
+    without the effect is known, and so is its mean over the folds; by Markov's inequality
+    (Wasserman, Ramdas and Balakrishnan 2020, 'Universal inference', PNAS 117(29), the cross-fit
+    test). Here that model is fitted elsewhere, too, so that the average is above 1 where links are
+    few.
 
     Args:
         gains: (folds,) gain in log-likelihood of each fold [nats].

@@ -12,6 +12,7 @@ from radiotwin.links.indoors import POSITION_SD_M, SURE, chance_inside
 from radiotwin.links.link_data import LinkData
 from radiotwin.measurements import MAX_APART_M, Measurements
 from radiotwin.scene import Scene
+from radiotwin.texts import percent
 
 MIN_LINKS = 60  # that anything can be learnt from; half of them detected
 MIN_LINKS_OF_RECEIVER = 5
@@ -77,7 +78,7 @@ def check_names(measurements: Measurements) -> list[str]:
     used = np.isin(np.arange(len(measurements.devices)), measurements.device_index)
     idle = measurements.devices["device"][~used]
     if len(idle):
-        notes.append(f"no link is to device {_shortened(idle)}")
+        notes.append(f"no link is to {_named('device', idle)}")
     return notes
 
 
@@ -226,11 +227,12 @@ def useless_receivers(table: pd.DataFrame, level_db: np.ndarray,
     dead = (links > 0) & np.isinf(low)
     stuck = (heard > MIN_LINKS_OF_RECEIVER) & (low == high)  # not one that heard once
     few = (links > 0) & (links < MIN_LINKS_OF_RECEIVER) & ~dead
-    count = f"{links[few].max(initial=0)} {'only' if few.sum() < 2 else 'at most'}"
+    has = "has {} only" if few.sum() < 2 else "have {} at most"
+    reads = "reads" if stuck.sum() < 2 else "read"
     values = _shortened([f"{value:g}" for value in low[stuck]])
-    return [(dead[end], f"receiver {_shortened(names[dead])} never detected anything"),
-            (stuck[end], f"receiver {_shortened(names[stuck])} always reads {values}"),
-            (few[end], f"receiver {_shortened(names[few])} has {count}; "
+    return [(dead[end], f"{_named('receiver', names[dead])} never detected anything"),
+            (stuck[end], f"{_named('receiver', names[stuck])} always {reads} {values}"),
+            (few[end], f"{_named('receiver', names[few])} {has.format(links[few].max(initial=0))}; "
                        f"{MIN_LINKS_OF_RECEIVER} are needed")]
 
 
@@ -253,8 +255,9 @@ def unheard_devices(table: pd.DataFrame, level_db: np.ndarray,
     links, heard = (np.bincount(end[rows], minlength=len(names))
                     for rows in (keep, keep & np.isfinite(level_db)))
     dead = (links >= MIN_LINKS) & (heard == 0)
-    return dead[end], (f"device {_shortened(names[dead])} was never detected; "
-                       "is it on, and in range?")
+    was, on = ("was", "is it") if dead.sum() < 2 else ("were", "are they")
+    return dead[end], (f"{_named('device', names[dead])} {was} never detected; {on} on, and in "
+                       "range?")
 
 
 def find_fill_value(level_db: np.ndarray) -> tuple[float | None, float]:
@@ -286,17 +289,21 @@ def ceiling_notes(receiver: np.ndarray, names: Sequence[str], level_db: np.ndarr
     for number, levels in pd.Series(level_db).dropna().groupby(receiver[np.isfinite(level_db)]):
         values, counts = np.unique(levels, return_counts=True)
         if len(levels) >= MIN_LINKS and len(values) > HEAP_RATIO and _is_heap(counts[::-1]):
-            found.append(f"{names[number]} ({counts[-1] / len(levels):.0%} at {values[-1]:g})")
+            found.append(f"{names[number]} ({percent(counts[-1] / len(levels))} at {values[-1]:g})")
     if not found:
         return []
-    which = _shortened(found)
-    return [f"readings are heaped at the highest value of receiver {which}: it reads no "
-            "more, and what was stronger is taken for just that"]
+    return [f"readings are heaped at the highest value of {_named('receiver', found)}: nothing "
+            "higher is read, and what was stronger is taken for just that"]
 
 
 def _is_heap(counts: np.ndarray) -> bool:
     """Return whether the first of counts (m,) of neighbouring values is more than a tail has."""
     return bool(counts[0] >= MIN_HEAP and counts[0] > HEAP_RATIO * counts[1:6].max())
+
+
+def _named(noun: str, names: Sequence[object] | np.ndarray | pd.Series) -> str:
+    """Return names with what they are of: receiver a, receivers a, b."""
+    return f"{noun}{'s' if len(names) > 1 else ''} {_shortened(names)}"
 
 
 def _shortened(names: Iterable[object]) -> str:

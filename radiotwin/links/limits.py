@@ -14,6 +14,7 @@ from scipy.special import logsumexp, ndtr, stdtr
 from radiotwin.links.crude_level import crude_level
 from radiotwin.links.evidence import design_effect, evidence_blocks
 from radiotwin.links.link_data import LinkData
+from radiotwin.texts import percent
 
 MIN_READINGS, MIN_BLANKS = 30, 10  # of a receiver, to have a limit estimated
 BIN_DB, FINE_DB = 0.5, 0.05  # of predicted levels, and of readings, that count as equal: saves time
@@ -272,8 +273,8 @@ def _notes(links: LinkData, rows: list[np.ndarray], own_db: np.ndarray,
         below = int((read_db < declared_db).sum())
         lie = "no reading lies near it"
         if below:
-            lie = (f"{below:,} of {len(read_db):,} readings ({below / len(read_db):.1%}) lie below "
-                   f"it, down to {read_db.min():g}")
+            lie = (f"{below:,} of {len(read_db):,} readings ({percent(below / len(read_db))}) lie "
+                   f"below it, down to {read_db.min():g}")
         notes.append(f"{_declared(links, declared_db)} is not that of the readings: {lie}. "
                      f"{_used_instead(links, own_db, found, other)}")
     elif len(known_db) and np.ptp(known_db) > DIFFER_DB:

@@ -29,8 +29,10 @@ from radiotwin.links.limits import estimate_limits
 from radiotwin.links.link_data import LinkData
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
+from radiotwin.texts import percent
 
 MAX_EXTENT_M = 100_000.0  # farther apart, two ends are not of one campaign and frame
+MAX_OTHER_FREQUENCY = 0.1  # share; levels by frequency differ by 1 dB and less then
 ASSUMED_HEIGHT_M = 1.5  # of an end whose height is blank: a hand-held phone's
 
 
@@ -118,7 +120,7 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
         leave_out(low_z, "their receiver's height is empty, and the 3D map needs it: fill in "
                   "receiver_z_m, or import the file again with above_ground=always 1.5")
     elif low_z.any():
-        notes.append(f"{low_z.sum():,} receiver heights are empty and taken for "
+        notes.append(f"heights of receivers are empty in {low_z.sum():,} rows, and taken for "
                      f"{ASSUMED_HEIGHT_M} m")
         receiver_m = np.where(np.isnan(receiver_m), ASSUMED_HEIGHT_M, receiver_m)
     if scene is not None and not to_locate:
@@ -127,7 +129,8 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
                   "the way; a scene built with a wider --bbox would keep them")
     flat = np.isnan(declared_z_m).sum()
     if flat:
-        notes.append(f"{flat:,} device heights are empty and taken for {ASSUMED_HEIGHT_M} m")
+        notes.append(f"heights of devices are empty in {flat:,} rows, and taken for "
+                     f"{ASSUMED_HEIGHT_M} m")
     placed = np.asarray(np.isfinite(device_m).all(axis=1) | (scene is not None) | to_locate)
     leave_out(~placed[device_index],
               "without a scene, devices of unknown position cannot be located")
@@ -138,7 +141,7 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
         at_fill = (level_db == fill_db) & keep
         level_db = np.where(at_fill, np.nan, level_db)
         notes.append(f"{at_fill.sum():,} links read exactly {fill_db:g}, the lowest value, "
-                     f"{share:.0%} of all: taken for not detected")
+                     f"{percent(share)} of all: taken for not detected")
     leave_out(*unheard_devices(table, level_db, keep))
     least, heard = 1 if to_locate else MIN_LINKS, int(np.isfinite(level_db[keep]).sum())
     if keep.sum() < least or heard < least // 2:
@@ -169,12 +172,15 @@ def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | N
                      "is in degrees, clockwise from north")
     notes += ceiling_notes(receiver, receiver_names, level_db)
     is_gain = measurements.level_column == "gain_db"
+    frequency_hz = _frequency_hz(measurements, scene)
+    notes += _other_frequencies(_column(measurements.devices, "frequency_hz")[kept_devices],
+                                frequency_hz)
     anchors = frozenset(np.flatnonzero(measurements.is_anchor[kept_devices]).tolist())
     links = LinkData(
         level_db, np.full(len(level_db), -np.inf), receiver_m, device_m, device, receiver,
         flight, _column(table, "time_s"), heading_deg % 360,
         list(measurements.devices["device"].iloc[kept_devices]), list(receiver_names),
-        list(flight_names), _frequency_hz(measurements, scene),
+        list(flight_names), frequency_hz,
         scene.city if scene is not None else None,
         is_gain, anchors, notes, _column(table, "pitch_deg"), _column(table, "roll_deg"),
         _column(table, "quality"),
@@ -193,6 +199,18 @@ def _frequency_hz(measurements: Measurements, scene: Scene | None) -> float:
     if "frequency_hz" in measurements.devices:
         return float(measurements.devices["frequency_hz"].median())
     return float("nan")
+
+
+def _other_frequencies(declared_hz: np.ndarray, frequency_hz: float) -> list[str]:
+    """Return a note where devices (k,) work at other frequencies than what is computed at."""
+    other = np.abs(declared_hz / frequency_hz - 1) > MAX_OTHER_FREQUENCY
+    if not other.any():
+        return []
+    known_ghz = np.unique(declared_hz[np.isfinite(declared_hz)]) / 1e9
+    span = " to ".join(f"{each:g}" for each in known_ghz[[0, -1]][:len(known_ghz)])
+    return [f"devices work at {span} GHz, and all are computed at {frequency_hz / 1e9:g} GHz: "
+            "losses of walls, edges and trees are those of that frequency; give measurements of "
+            "one band at a time, with a scene of its frequency_hz"]
 
 
 def _column(table: pd.DataFrame, name: str) -> np.ndarray:

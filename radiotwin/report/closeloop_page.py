@@ -148,11 +148,14 @@ def _evidence(effect: dict) -> str:
     evidence = effect["evidence"]
     if effect.get("probability") is not None:
         text += f"Probability that it is there: {words.probability(effect['probability'])}. "
-    if effect.get("size_db") is not None:
-        size = effect["size_db"]
+    size = effect.get("size_db")
+    if size is not None and size["value"] is None:
+        text += "It changes no level, only which links are blank. "
+    elif size is not None:
         text += f"It changes the links that it acts on by {words.number(size['value'])} dB (RMS"
         text += f"; 90 % interval {_interval(size)}). " if _interval(size) != "–" else "). "
-    text += f"That held-out links gain by chance: p {_p_value(evidence['p_value'])}."
+    if evidence["p_value"] is not None:
+        text += f"That held-out links gain by chance: p {_p_value(evidence['p_value'])}."
     same = [name_label(name) for name in effect.get("indistinguishable_from", [])]
     alike = [name_label(name) for name in effect.get("confused_with", [])
              if name_label(name) not in same]

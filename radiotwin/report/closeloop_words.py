@@ -111,8 +111,12 @@ def drivers(report: dict) -> list[str]:
 
 
 def is_reference(parameter: dict) -> bool:
-    """Return whether a parameter is that of the member which the others are compared with."""
-    return parameter["value"] == parameter["low"] == parameter["high"] == 0
+    """Return whether a parameter is that of the member which the others are compared with.
+
+    Others may be known exactly, and 0, such as where a building is that is gone.
+    """
+    known = parameter["value"] == parameter["low"] == parameter["high"] == 0
+    return known and parameter.get("unit") == "dB"
 
 
 def number(value: float | None) -> str:
@@ -121,7 +125,7 @@ def number(value: float | None) -> str:
         return "–"
     if isinstance(value, int):
         text = f"{value:,}"
-    elif 0.005 <= abs(value) < 0.1:
+    elif 0 < abs(value) < 0.1:
         text = f"{value:.2g}"
     else:
         text = f"{value:.2f}" if abs(value) < 1000 else f"{value:,.0f}"

@@ -171,12 +171,15 @@ def test_without_a_map_both_branches_are_mixed():
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_the_ends_may_change_places_and_what_was_stored_predicts_the_same(law, tmp_path):
+@pytest.mark.parametrize("high_m", [20.0, 60.0])
+def test_the_ends_may_change_places_and_what_was_stored_predicts_the_same(law, high_m, tmp_path):
+    """But for TR 36.777: a receiver at 60 m is a UAV, and a device there is a mast."""
     fitted = law(2e9, True, roof_m=15.0, power_dbm=20.0)
     for los in (True, False):
-        links = link(60.0, ground_m=300.0, los=los)
+        links = link(high_m, ground_m=300.0, los=los)
         turned = dataclasses.replace(links, device_m=links.receiver_m, receiver_m=links.device_m)
-        np.testing.assert_allclose(fitted.predict(links), fitted.predict(turned))
+        if law not in (UrbanMacro, UrbanMicro) or high_m < 22.5:
+            np.testing.assert_allclose(fitted.predict(links), fitted.predict(turned))
         assert fitted.predict(links)[0] == law(2e9, True, roof_m=15.0).predict(links)[0] + 20.0
         save_channel(fitted, tmp_path / "channel.safetensors")
         np.testing.assert_array_equal(load_channel(tmp_path / "channel.safetensors").predict(links),
@@ -213,12 +216,69 @@ def test_roofs_count_by_their_area(block):
     assert mean_roof_m(block) == pytest.approx(15.0, abs=0.5)
 
 
+def mast(high_m, ground_m, los=True):
+    """The link of a mast, a device at `high_m`, with a phone, a receiver at 1.5 m."""
+    links = link(high_m, ground_m=ground_m, los=los)
+    return dataclasses.replace(links, device_m=links.receiver_m, receiver_m=links.device_m)
+
+
+@pytest.mark.parametrize("law, ground_m, los_db, nlos_db, probability", [
+    # TR 38.901, Table 7.4.1-1 and -2, base station at 25 or 10 m, terminal at 1.5 m, 2 GHz: breakpoints at
+    # 4 * 24 * 0.5 * 2e9 / 299792458 = 320.2 m and 4 * 9 * 0.5 * 2e9 / 299792458 = 120.1 m
+    (UrbanMacro, 200.0, 84.709, 109.601, 0.12805), (UrbanMacro, 500.0, 96.879, 125.055, 0.03634),
+    (UrbanMicro, 100.0, 80.453, 99.467, 0.23098)])
+def test_a_mast_is_a_base_station_however_high(law, ground_m, los_db, nlos_db, probability):
+    high_m = 25.0 if law is UrbanMacro else 10.0
+    for los, expected_db in ((True, los_db), (False, nlos_db)):
+        assert loss_db(law(2e9, True), mast(high_m, ground_m, los)) == pytest.approx(expected_db, abs=2e-3)
+    assert law(2e9).los_probability(mast(high_m, ground_m))[0] == pytest.approx(probability, abs=1e-5)
+    assert loss_db(law(2e9), mast(23.0, 200.0)) == pytest.approx(loss_db(law(2e9), mast(22.0, 200.0)), abs=0.2)
+
+
+@pytest.mark.parametrize("law, links, expected", [
+    (UrbanMacro(2e9, True), link(60.0, 25.0, distance_m=400.0), []),  # as in the report
+    (UrbanMicro(2e9, True), link(60.0, 25.0, distance_m=400.0),
+     ["the height of the lower end is 25 m, published is 1.5 to 22.5 m"]),
+    (UrbanMacro(2e9, True), link(150.0, distance_m=400.0), []),
+    (UrbanMacro(2e9, True), link(150.0, distance_m=400.0, los=False),
+     ["the height of the higher end is 150 m, published is 1.5 to 100 m"]),
+    (UrbanMacro(2e9), link(150.0, distance_m=4500.0), ["the distance is 4,500 m, published is 10 to 4000 m"]),
+    (UrbanMacro(2e9), link(20.0, distance_m=4500.0), []),
+    (P1411(0.9e9, True, roof_m=20.0), link(10.0, distance_m=400.0), []),
+    (P1411(0.9e9, True, roof_m=20.0), link(60.0, distance_m=400.0),
+     ["the frequency is 0.9 GHz, published is 2.2 to 73 GHz"]),
+    (P1411(3e9, True, roof_m=20.0), link(10.0, distance_m=1000.0), ["the distance is 1,000 m, published is 5 to 660 m"]),
+    (P1411(3e9, True, roof_m=20.0), link(60.0, distance_m=200.0, los=False),
+     ["the distance is 200 m, published is 260 to 1200 m"]),
+    (AlHouraniUrban(2e9, True, roof_m=15.0), link(2.0, distance_m=100.0),
+     ["the height of the higher end is 2 m, published is 15 and more m"]),
+    (AlHouraniUrban(2e9, True, roof_m=15.0), link(16.0, distance_m=100.0), [])])
+def test_each_branch_has_the_range_that_it_was_published_for(law, links, expected):
+    notes = law.outside(links)
+    assert len(notes) == len(expected) and all(each in note for each, note in zip(expected, notes))
+    assert law.inside(links).tolist() == [not expected]
+
+
+def test_al_hourani_asks_for_roofs_where_there_are_some(block):
+    assert AlHouraniUrban().fit(link(60.0, ground_m=300.0, frequency_hz=2e9, city=block), np.zeros(1),
+                                None).roof_m == pytest.approx(15.0, abs=0.5)
+    assert AlHouraniUrban().fit(link(60.0, ground_m=300.0, frequency_hz=2e9), np.zeros(1), None).roof_m == 0
+
+
 def test_what_is_outside_is_named_once_each():
     law = WalfischIkegami(2.4e9, True, roof_m=15.0)
-    notes = law.outside(link(60.0, 1.5, distance_m=400.0))
+    two = [link(60.0, 1.5, distance_m=400.0), link(70.0, 1.5, distance_m=400.0)]
+    both = LinkGeometry(*(np.concatenate([getattr(each, name) for each in two])
+                          for name in ("device_m", "receiver_m", "los", "device")))
+    notes = law.outside(both)
     assert len(notes) == 2
     assert "the frequency is 2.4 GHz, published is 0.8 to 2 GHz" in notes[0]
-    assert "height of the higher end is 60 m in 100% of the links, published is 4 to 50 m" in notes[1]
+    assert "height of the higher end is 60 to 70 m in 100% of the links, published is 4 to 50 m" in notes[1]
+    many = LinkGeometry(*(np.repeat(getattr(both, name), [1, 399], axis=0)
+                          for name in ("device_m", "receiver_m", "los", "device")))
+    few = WalfischIkegami(1e9, True, roof_m=15.0).outside(
+        dataclasses.replace(many, receiver_m=np.where(many.receiver_m == 70.0, 30.0, many.receiver_m)))
+    assert len(few) == 1 and "is 60 m in under 1% of the links" in few[0]
     assert WalfischIkegami(900e6, True, roof_m=15.0).outside(link(30.0, distance_m=400.0)) == []
 
 

@@ -167,3 +167,9 @@ def test_the_size_of_what_one_fold_does_not_find_is_still_told():
     lacking = replace(model, folds=[without, *model.folds[1:]], fits=[model.fits[0], without.fit(), *model.fits[2:]])
     assert effect_size_db(lacking, 0).low > 0
     assert effect_parameters(lacking)[0].keys() == effect_parameters(model)[0].keys()
+
+
+@pytest.mark.parametrize("unit", ["dB", "dBm"])
+@pytest.mark.parametrize("sd_db, determined", [(1.0, True), (90.0, False)])
+def test_a_level_of_any_reference_is_determined_or_not(unit, sd_db, determined):
+    assert intervals._checked(Parameter.normal(-100.0, sd_db, unit), 6, 6).determined == determined

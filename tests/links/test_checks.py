@@ -22,7 +22,7 @@ def test_a_receiver_that_reads_no_more_than_some_level_is_told(seed, step_db):
     receiver, level_db = readings(seed, step_db, highest_db=-90.0)
     (note,) = ceiling_notes(receiver, ["good", "deaf"], level_db)
     share = (level_db[receiver == 1] == -90).sum() / np.isfinite(level_db[receiver == 1]).sum()
-    assert f"receiver deaf ({share:.0%} at -90): it reads no more" in note
+    assert f"of receiver deaf ({share:.0%} at -90): nothing higher is read" in note
 
 
 @pytest.mark.parametrize("step_db", [0.01, 1.0, 3.0, 10.0])

@@ -29,6 +29,32 @@ def test_what_cannot_be_used_is_left_out_and_noted(open_ground):
         assert part in notes, part
 
 
+def test_names_in_notes_agree_with_their_verbs(open_ground):
+    measurements = open_ground.measured(open_ground.fly(0, limit_db=-500.0))
+    table = measurements.table
+    table.loc[:29, "receiver"] = np.repeat(["dead1", "dead2"], 15)
+    table.loc[:29, "gain_db"] = np.nan
+    table.loc[30:59, "receiver"] = np.repeat(["stuck1", "stuck2"], 15)
+    table.loc[30:59, "gain_db"] = -77.0
+    table.loc[60:65, "receiver"] = np.repeat(["few1", "few2"], 3)
+    notes = " ".join(prepare_links(measurements, None).notes)
+    for part in ("receivers dead1, dead2 never detected", "receivers stuck1, stuck2 always read -77",
+                 "receivers few1, few2 have 3 at most"):
+        assert part in notes, part
+
+
+def test_devices_of_other_frequencies_are_mentioned(open_ground):
+    measurements = open_ground.measured(open_ground.fly(0))
+    own_hz = float(measurements.devices["frequency_hz"].iloc[0]) if "frequency_hz" in measurements.devices else 2.4e9
+    devices = measurements.devices.assign(frequency_hz=own_hz)
+    assert prepare_links(replace(measurements, devices=devices), None).notes == []
+    near = devices.assign(frequency_hz=np.where(np.arange(len(devices)) == 0, 1.05 * own_hz, own_hz))
+    assert prepare_links(replace(measurements, devices=near), None).notes == []
+    two = devices.assign(frequency_hz=np.where(np.arange(len(devices)) == 0, 0.8e9, 2.6e9))
+    (note,) = prepare_links(replace(measurements, devices=two), None).notes
+    assert note.startswith("devices work at 0.8 to 2.6 GHz, and all are computed at 2.6 GHz")
+
+
 def test_a_receiver_that_heard_once_is_not_stuck_and_equal_rows_without_a_time_are_measurements(open_ground):
     measurements = open_ground.measured(open_ground.fly(0, limit_db=-500.0))
     table, n = measurements.table, len(measurements.table)

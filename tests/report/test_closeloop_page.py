@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from radiotwin.cli import loop
 from radiotwin.errors import BadInput
 from radiotwin.report.closeloop_page import write_closeloop_page
-from radiotwin.report.closeloop_words import about, closeloop_summary, drivers, rivals
+from radiotwin.report.closeloop_words import about, closeloop_summary, drivers, number, rivals
 from radiotwin.report.labels import join_names, parameter_label, variable_label
 
 SCORES = {"n": 900, "bias_db": 0.04, "std_db": 3.0, "correlation": 0.9, "rmse_db": 3.0, "mae_db": 2.2, "nll": 2.5}
@@ -122,6 +122,19 @@ def test_what_an_effect_may_be_taken_for_is_said(tmp_path):
     assert "nothing in the residual looks like it" in text
 
 
+@pytest.mark.parametrize("value, text", [(0.0, "0.00"), (0.003, "0.003"), (-0.00214, "−0.0021"), (0.07, "0.07"),
+                                         (-6.5, "−6.50"), (12345.6, "12,346"), (3, "3"), (None, "–")])
+def test_no_number_is_rounded_to_nothing(value, text):
+    assert number(value) == text
+
+
+def test_only_a_level_of_0_db_is_what_others_are_compared_with(tmp_path):
+    parameters = {"offset_db[r0]": {"value": 0.0, "low": 0.0, "high": 0.0, "unit": "dB"},
+                  "x_m": {"value": 0.0, "low": 0.0, "high": 0.0, "unit": "m"}}
+    text = page(report(effects=[DRIFT | {"parameters": parameters}]), tmp_path)
+    assert text.count("0 (reference)") == 1
+
+
 def test_how_probable_it_is_and_what_would_have_been_seen_is_said(tmp_path):
     text = page(report(effects=[DRIFT | {"probability": 0.6, "size_db": {
         "value": 4.0, "low": 3.0, "high": 5.0, "unit": "dB", "determined": True}}]), tmp_path)
@@ -130,6 +143,11 @@ def test_how_probable_it_is_and_what_would_have_been_seen_is_said(tmp_path):
         "pattern 0.12." in text  # 0.4 are left
     assert "by 4.00 dB (RMS; 90 % interval 3.00 to 5.00)" in text
     assert "would have been named from" in text and "4.2 dB/km" in text
+    nothing = {"value": None, "low": None, "high": None, "unit": "dB", "determined": False}
+    blanks = page(report(effects=[DRIFT | {"size_db": nothing, "evidence": DRIFT["evidence"] | {"p_value": None}}]),
+                  tmp_path)
+    assert "It changes no level, only which links are blank." in blanks
+    assert "by – dB" not in blanks and "p –" not in blanks
     assert "belong to places" in closeloop_summary(report("none"))
 
 

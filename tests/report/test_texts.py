@@ -4,7 +4,7 @@ import pytest
 
 from radiotwin.display.style import plain
 from radiotwin.report.style import shorten
-from radiotwin.texts import MAX_TEXT, shown, shown_data
+from radiotwin.texts import MAX_TEXT, percent, shortly, shown, shown_data
 
 
 @pytest.mark.parametrize("text, expected", [
@@ -24,6 +24,17 @@ def test_data_for_a_script_keeps_its_arrays():
     packed = {"type": "uint8", "shape": [3], "data": "A" * 10_000}
     assert shown_data({"name": "\x1b", "values": packed, "list": ["\u202e", 1, None]}) == {
         "name": r"\x1b", "values": packed, "list": [r"\u202e", 1, None]}
+
+
+@pytest.mark.parametrize("share, text", [(0, "0%"), (1e-6, "under 1%"), (0.0099, "under 1%"), (0.01, "1%"), (0.5, "50%"),
+                                         (0.99, "99%"), (0.9999, "over 99%"), (1, "100%")])
+def test_no_share_is_rounded_to_nothing_or_all(share, text):
+    assert percent(share) == text
+
+
+@pytest.mark.parametrize("value, text", [(0.8, "0.8"), (123.4, "123"), (6012.0, "6,012"), (-1e5, "-100,000")])
+def test_numbers_have_three_digits_or_all_before_the_point(value, text):
+    assert shortly(value) == text
 
 
 def test_names_in_figures_are_no_formulas_and_short():
