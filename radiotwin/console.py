@@ -114,7 +114,7 @@ def print_rows(title: str, columns: dict[str, str], rows: list[list]) -> None:
     Args:
         title: line above it.
         columns: heading -> `left` or `right`.
-        rows: cells; floats are printed with two decimals (small ones with two digits), NaN as a dash.
+        rows: cells; of floats two decimals or, of small ones, digits are printed, of NaN a dash.
     """
     names = [heading or f"column {number}" for number, heading in enumerate(columns, start=1)]
     collected.setdefault("tables", []).append(

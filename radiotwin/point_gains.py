@@ -10,6 +10,7 @@ import xarray as xr
 from radiotwin.budgets import ROWS
 from radiotwin.errors import BadInput
 from radiotwin.export.ns3 import write_ns3
+from radiotwin.export.place import check_map_place
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin
@@ -34,6 +35,10 @@ def export_ns3(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray, fold
     """
     points_m = np.asarray(points_m, dtype=float).reshape(-1, 3)
     placed = _placed(source, scene)
+    if placed.empty and isinstance(source, RadioMap):
+        raise BadInput(f"{scene.folder / 'scene.toml'} declares none of the map's devices "
+                       f"({', '.join(source.devices[:20])}), and a node needs a position: declare "
+                       "them there as [[devices]], or give the twin that the map is of")
     names = list(placed["device"]) if devices is None else list(dict.fromkeys(devices))
     for name in names:
         if name not in set(placed["device"]):
@@ -58,23 +63,23 @@ def gains_at(source: Twin | RadioMap, scene: Scene, points_m: np.ndarray,
         (k, n) gain [dB]; NaN inside buildings, and where a map has none.
 
     Raises:
-        BadInput: points off the lattice of a map.
+        BadInput: points off the lattice of a map, or a source that is not of this scene's place.
     """
     points_m = np.asarray(points_m, dtype=float).reshape(-1, 3)
     inside = scene.city.inside(points_m)
     if isinstance(source, RadioMap):
+        check_map_place("the radio map", source.attributes, scene)
         places = np.unravel_index(source.lattice.index_of(points_m), source.lattice.shape)
         z, y, x = (xr.DataArray(place, dims="point") for place in places)
         gain_db = source.dataset["gain_db"].sel(device=list(devices)).isel(
             z=z, y=y, x=x).transpose("device", "point").values.astype(float)
     else:
         source.require_map(scene)
+        source.warn_of_another_scene(scene, scene.content_hash())
         row_of = {each.device: row for row, each in enumerate(source.devices)}
         index = np.repeat([row_of[name] for name in devices], len(points_m))
         links = source.links(np.tile(points_m, (len(devices), 1)), index, scene)
-        level_db = source.predict(links).mean_db
-        if source.level == "rssi_dbm":
-            level_db = level_db - scene.config.radio.tx_power_dbm
+        level_db = source.predict(links).mean_db - source.power_dbm(scene)
         gain_db = level_db.reshape(len(devices), len(points_m))
     return np.where(inside, np.nan, gain_db)
 

@@ -10,6 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 
 PARENT_CHECK_S = 1.0
+_GROUPS = Path("/sys/fs/cgroup")
 
 
 def die_with_parent(parent: int) -> None:
@@ -55,13 +56,28 @@ def _machine_bytes() -> int | None:
 
 
 def _group_bytes() -> int | None:
-    """Return what a container may still take: control groups of version 2, then 1."""
-    for limit, used in (("memory.max", "memory.current"),
-                        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes")):
+    """Return what a container may still take: control groups of version 2, then 1.
+
+    Pages of files that were not used lately count as used, and are given back where memory is
+    short.
+    """
+    for limit, used, of, files in (
+            ("memory.max", "memory.current", "memory.stat", "inactive_file"),
+            ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes", "memory/memory.stat",
+             "total_inactive_file")):
         with suppress(OSError, ValueError):  # "max" is no number
-            folder = Path("/sys/fs/cgroup")
-            return int((folder / limit).read_text()) - int((folder / used).read_text())
+            free = int((_GROUPS / limit).read_text()) - int((_GROUPS / used).read_text())
+            return free + _counted(_GROUPS / of, files)
     return None
+
+
+def _counted(path: Path, name: str) -> int:
+    """Return a number of a file with a name and a number in each line; 0 where it is not there."""
+    with suppress(OSError, ValueError):
+        for line in path.read_text().splitlines():
+            if line.startswith(f"{name} "):
+                return int(line.split()[1])
+    return 0
 
 
 def resident_bytes(pid: int) -> int:

@@ -1,5 +1,7 @@
 """Losses for ns-3: those of the twin or the map, for each pair, with positive sign."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -7,6 +9,9 @@ from typer.testing import CliRunner
 
 import radiotwin as rt
 from radiotwin.cli.commands import app
+from radiotwin.point_gains import gains_at
+from radiotwin.scene import Scene
+from radiotwin.tables import Origin
 
 INSIDE_M, POINTS_M = [30.0, 60.0, 5.0], np.array([[80.0, 120.0, 55.0], [200.0, 120.0, 55.0], [30.0, 60.0, 5.0]])
 
@@ -62,3 +67,50 @@ def test_the_command(small_scene, twin, tmp_path):
     assert done.exit_code == 0 and "14 pairs" in done.output and (tmp_path / "out" / "losses.csv").is_file()
     refused = CliRunner().invoke(app, ["export", str(tmp_path / "twin"), *options, "--to", "ns4"])
     assert isinstance(refused.exception, rt.BadInput) and "allowed is ns3" in str(refused.exception)
+
+
+def test_a_map_needs_devices_with_positions_and_its_place(small_scene, tmp_path):
+    truth = rt.segmented_truth(small_scene)
+    bare = Scene(small_scene.folder, small_scene.config.model_copy(update={"devices": [], "uavs": []}))
+    with pytest.raises(rt.BadInput, match="declares none of the map's devices .d0, d1.* give the twin"):
+        rt.export_ns3(truth, bare, POINTS_M[:2], tmp_path / "ns3")
+    here, there = (placed_at(small_scene, latitude_deg) for latitude_deg in (47.0, 47.1))
+    with pytest.raises(rt.BadInput, match="is a map of another place"):
+        gains_at(truth.placed(here.config.origin), there, POINTS_M[:2], ["d0"])
+
+
+def placed_at(scene, latitude_deg):
+    origin = Origin(latitude_deg=latitude_deg, longitude_deg=8.0, altitude_m=0.0)
+    return Scene(scene.folder, scene.config.model_copy(update={"origin": origin}))
+
+
+def test_a_twin_knows_its_frame(small_scene, tmp_path):
+    here, there = placed_at(small_scene, 47.0), placed_at(small_scene, 47.1)
+    flown = rt.fly_survey(here, "segmented", flights=1)
+    made = rt.fit_twin(flown, here, model="log_distance")
+    made.save(tmp_path / "twin")
+    twin = rt.Twin.load(tmp_path / "twin")
+    assert twin.origin == here.config.origin
+    assert np.isfinite(gains_at(twin, here, POINTS_M[:2], ["d0"])).all()
+    for use in (lambda: gains_at(twin, there, POINTS_M[:2], ["d0"]), lambda: twin.radio_map(there),
+                lambda: rt.fit_twin(replace(flown, origin=None), there, model="log_distance", start=twin)):
+        with pytest.raises(rt.BadInput, match="the twin is in the frame about 47, 8, the scene .* about 47.1, 8"):
+            use()
+
+
+def test_received_powers_are_gains_above_the_power_that_is_told(small_scene):
+    """With 14 dBm sent, levels are 14 dB above the gains; and the readings' own limit of detection is the map's."""
+    flown = rt.fly_survey(small_scene, "segmented", flights=1)
+    table = flown.table.assign(rssi_dbm=flown.table["gain_db"] + 14).drop(columns="gain_db")
+    radio = small_scene.config.radio.model_copy(update={"tx_power_dbm": 14.0})
+    told = Scene(small_scene.folder, small_scene.config.model_copy(update={"radio": radio}))
+    gains = rt.fit_twin(flown, small_scene, model="log_distance")
+    powers = rt.fit_twin(replace(flown, table=table), told, model="log_distance")
+    own_db = gains_at(gains, small_scene, POINTS_M[:2], ["d0", "d1"])
+    np.testing.assert_allclose(gains_at(powers, told, POINTS_M[:2], ["d0", "d1"]), own_db, atol=0.05)
+    attributes = powers.radio_map(told).dataset.attrs
+    assert attributes["tx_power_dbm"] == 14 and attributes["gain_limit_db"] == pytest.approx(powers.limit_db - 14)
+    assert "tx_power_dbm" not in gains.radio_map(small_scene).dataset.attrs
+    with pytest.warns(UserWarning, match="default of .*scene.toml is taken, 0 dBm"):
+        too_high_db = gains_at(powers, small_scene, POINTS_M[:2], ["d0", "d1"])
+    np.testing.assert_allclose(too_high_db, own_db + 14, atol=0.05)

@@ -142,8 +142,8 @@ def _world(source: Path, scene: Path | None, model: str | None) -> "Scene":
 @contextmanager
 def _gains(source: Path, world: "Scene", model: str | None) -> "Iterator[Twin | RadioMap | str]":
     """Open the twin or the radio map, or give the name of the law."""
+    from radiotwin.export.place import check_map_place
     from radiotwin.radiomap import RadioMap
-    from radiotwin.report import check_map_place
 
     if (source / "scene.toml").exists():
         yield model or "p1411"

@@ -42,9 +42,9 @@ class LocalPool(Pool):
         wanted = min(self._most or min(room, on_gpu, _cores() // resources.cores), count)
         if self._most is None and wanted < 2:
             return []
-        if room < (self._most or 1):
+        if room < wanted:
             raise RunFailed(
-                f"{self._most} worker(s) may take {resources.memory_bytes / 2**30:.1f} GiB of "
+                f"{wanted} worker(s) may take {resources.memory_bytes / 2**30:.1f} GiB of "
                 f"memory each, and {room} would fit into what is free on this machine; ask for "
                 "fewer, choose a lower quality, or a machine with more memory")
         if on_gpu < wanted:

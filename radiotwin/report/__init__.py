@@ -10,12 +10,12 @@ from radiotwin.report.folders import (
     write_closeloop_folder,
     write_comparison_folder,
 )
-from radiotwin.report.map_export import check_map_place, check_map_target, export_map
+from radiotwin.report.map_export import check_map_target, export_map
 from radiotwin.report.map_figures import write_picture
 from radiotwin.report.run_folder import Run, read_run
 from radiotwin.report.run_page import write_report
 
-__all__ = ["Run", "check_closeloop_folder", "check_map_place", "check_map_target",
+__all__ = ["Run", "check_closeloop_folder", "check_map_target",
            "closeloop_summary", "export_map", "read_run", "write_closeloop_figures",
            "write_closeloop_folder", "write_closeloop_page", "write_comparison_figures",
            "write_comparison_folder", "write_coverage_pictures", "write_picture", "write_report"]

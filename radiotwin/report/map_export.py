@@ -1,13 +1,11 @@
 """Write the radio map of a file or of a twin in the format of another program, or as a picture."""
 
 import math
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-from radiotwin.errors import BadInput
 from radiotwin.export import EXPORTERS, check_format, select, write_map
+from radiotwin.export.place import check_map_place
 from radiotwin.map_file import MapStream, is_zarr
 from radiotwin.map_writing import check_target, size_of
 from radiotwin.radiomap import RadioMap
@@ -17,7 +15,6 @@ from radiotwin.twin import Twin
 
 FORMATS: dict[str, Callable[[RadioMap, Scene, Path], None]] = EXPORTERS | {".png": write_picture}
 TOLD_LINKS = 1_000_000
-MAX_ORIGIN_DIFFERENCE = 1e-6  # [degrees, or metres of altitude] of one place, after rounding
 
 
 def check_map_target(path: Path | str, scene: Scene) -> None:
@@ -72,27 +69,3 @@ def export_map(source: RadioMap | Twin, scene: Scene, path: Path | str, *,
         tell(f"{path}: {size_of(shape, len(selected.devices))}")
     write_map(selected, scene, path, FORMATS)
     return selected
-
-
-def check_map_place(name: str, attributes: dict[str, Any], scene: Scene) -> None:
-    """Refuse a map of another city, which would get the outlines and the origin of this one.
-
-    Args:
-        name: of the map in messages.
-        attributes: of the map.
-        scene: that is given with it.
-
-    Raises:
-        BadInput: their origins differ.
-    """
-    origin = scene.config.origin
-    for key, value in ({} if origin is None else origin.model_dump()).items():
-        of_map = attributes.get(f"origin_{key}", value)
-        if abs(of_map - value) > MAX_ORIGIN_DIFFERENCE:
-            raise BadInput(f"{name} is a map of another place: its origin's {key} is {of_map:g}, "
-                           f"that of {scene.folder} is {value:g}; give the scene that it was made "
-                           "for, or trace again")
-    if attributes.get("scene_hash") not in (None, scene.content_hash()):
-        warnings.warn(f"{name} was made for another scene than {scene.folder}, or that has changed "
-                      "since: outlines, devices and the origin are those of the scene",
-                      stacklevel=3)

@@ -22,7 +22,7 @@ from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
 from radiotwin.geodesy import local_crs
 from radiotwin.inputs import read_toml
-from radiotwin.scene.lattice import check_lattice
+from radiotwin.scene.lattice import check_lattice, positions
 from radiotwin.scene.terrain import TerrainConfig
 from radiotwin.scene.vegetation import VegetationConfig
 from radiotwin.tables import MAX_COORDINATE_M, Metres, Number, Origin, Table
@@ -223,10 +223,11 @@ class SceneConfig(Table):
         for axis, low, high in (("x", self.extent.x_min_m, self.extent.x_max_m),
                                 ("y", self.extent.y_min_m, self.extent.y_max_m)):
             value = getattr(uav, f"{end}_{axis}_m")
+            last_m = low + (positions(low, high, step_m) - 1) * step_m
             steps = (value - low) / step_m
-            if not low <= value <= high or abs(steps - round(steps)) * step_m > 0.01:
+            if not low <= value <= last_m + 0.01 or abs(steps - round(steps)) * step_m > 0.01:
                 raise ValueError(f"uav {uav.uav!r}: {end}_{axis}_m = {value:g} is not on the "
-                                 f"lattice ({low:g} to {high:g} m in steps of {step_m:g} m)")
+                                 f"lattice ({low:g} to {last_m:g} m in steps of {step_m:g} m)")
 
     @property
     def gain_limit_db(self) -> float:

@@ -58,8 +58,8 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
         path: Mitsuba or Sionna RT XML file, or a model with a suffix of `UP_AXES`.
         overrides: Name of a material in the file -> ITU material to use for it.
         scale: Factor to metres; None: 1, with a warning if the city seems to be in another unit.
-        up: Axis that points up; None: z, with an error if another one seems to; that of `UP_AXES`
-            for models.
+        up: Axis that points up; None: y in glTF, where that is a rule, and z otherwise, with an
+            error if another one seems to.
         bbox: (x_min, y_min, x_max, y_max) after `scale` and `up` [m]: only shapes that reach into
             it are kept.
 
@@ -71,8 +71,8 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
             `bbox`.
     """
     source = _read_source(path, overrides)
-    up = up or UP_AXES.get(path.suffix.lower())
-    loaded = _load_meshes(path, source, scale or 1.0, up or "z", bbox)
+    of_format = UP_AXES.get(path.suffix.lower(), "z")
+    loaded = _load_meshes(path, source, scale or 1.0, up or of_format, bbox)
     materials, problems = source.materials_of(loaded.inside)
     names, name_problems = _safe_names([source.names[index] for index in loaded.inside])
     problems += name_problems + loaded.problems
@@ -88,7 +88,9 @@ def import_city(path: Path, overrides: Mapping[str, str], scale: float | None = 
     names, materials, surfaces, join_problems = _joined(names, materials, surfaces)
     ground = surfaces.ground_faces()
     problems += sense_problems + join_problems
-    problems += checks.check_up_axis(surfaces, ground) if up is None else []
+    # In glTF it is a rule that y is up; of other formats nobody knows.
+    if up is None and of_format == "z":
+        problems += checks.check_up_axis(surfaces, ground)
     problems += checks.check_units(surfaces) if scale is None else []
     city = ImportedCity(names, materials, surfaces, ground, problems)
     if bbox is not None:

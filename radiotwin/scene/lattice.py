@@ -14,11 +14,16 @@ def check_lattice(x_min_m: float, x_max_m: float, y_min_m: float, y_max_m: float
                   altitudes_m: Sequence[float]) -> None:
     """Raise BadInput if a lattice, see `Lattice.over`, has more positions than are allowed."""
     width_m, depth_m = x_max_m - x_min_m, y_max_m - y_min_m
-    positions = (width_m / step_m + 1) * (depth_m / step_m + 1) * len(altitudes_m)
-    if not positions <= POSITIONS.limit:
+    count = (width_m / step_m + 1) * (depth_m / step_m + 1) * len(altitudes_m)
+    if not count <= POSITIONS.limit:
         POSITIONS.refuse(
             f"lattice.step_m = {step_m:g} over an extent of {width_m:g} x {depth_m:g} m and "
-            f"{len(altitudes_m)} altitudes", f"{positions:.3g} positions")
+            f"{len(altitudes_m)} altitudes", f"{count:.3g} positions")
+
+
+def positions(low_m: float, high_m: float, step_m: float) -> int:
+    """Return how many positions a lattice has along an axis of an extent."""
+    return int(np.floor((high_m - low_m) / step_m + 1e-9)) + 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +61,7 @@ class Lattice:
             BadInput: Too many positions.
         """
         check_lattice(x_min_m, x_max_m, y_min_m, y_max_m, step_m, altitudes_m)
-        nx, ny = (int(np.floor((high - low) / step_m + 1e-9)) + 1
-                  for low, high in ((x_min_m, x_max_m), (y_min_m, y_max_m)))
+        nx, ny = positions(x_min_m, x_max_m, step_m), positions(y_min_m, y_max_m, step_m)
         return cls(x_min_m + step_m * np.arange(nx), y_min_m + step_m * np.arange(ny),
                    np.array(sorted(altitudes_m), dtype=float))
 

@@ -189,5 +189,7 @@ def _centres(scene: Scene, cells: int) -> tuple[np.ndarray, np.ndarray]:
     """Return x (nx,) and y (ny,) of cells over the extent [m]."""
     x_min, x_max, y_min, y_max = scene.config.extent.bounds
     cell_m = max(x_max - x_min, y_max - y_min) / cells
-    return (np.arange(x_min + cell_m / 2, x_max, cell_m),
-            np.arange(y_min + cell_m / 2, y_max, cell_m))
+    # At least two each way: contours and shades are of differences.
+    nx, ny = (max(round(side_m / cell_m), 2) for side_m in (x_max - x_min, y_max - y_min))
+    return (x_min + (np.arange(nx) + 0.5) * (x_max - x_min) / nx,
+            y_min + (np.arange(ny) + 0.5) * (y_max - y_min) / ny)

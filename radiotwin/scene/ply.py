@@ -4,6 +4,7 @@ trimesh reads PLY, too, but silently accepts a truncated ASCII file or a face th
 vertex, and refuses binary files that mix triangles with quadrilaterals.
 """
 
+import re
 import struct
 from array import array
 from collections.abc import Iterator
@@ -23,6 +24,7 @@ _STRUCT_CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I
                  "f8": "d"}
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _INDICES = ("vertex_indices", "vertex_index")  # names that programs give the list of a face
+_LINE_END = re.compile("\r\n|\n|\r")
 _BUDGETS = {"vertex": VERTICES, "face": FACES}
 
 
@@ -161,7 +163,8 @@ def _check_elements(path: Path, elements: list[_Element], size: int) -> None:
 
 
 def _lines(data: bytes) -> Iterator[str]:
-    return iter(data.decode("latin-1").splitlines())
+    # Unlike `splitlines`, not at bytes that are parts of characters in UTF-8.
+    return iter(_LINE_END.split(data.decode("latin-1")))
 
 
 def _truncated(path: Path, element: _Element, row: int) -> BadInput:

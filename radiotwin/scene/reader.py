@@ -74,6 +74,16 @@ def read_city(xml_path: Path | str) -> list[CityShape]:
             if material is not None]
 
 
+def mesh_paths(xml_path: Path | str) -> set[Path]:
+    """Return the files of meshes that a scene folder's `city.xml` names.
+
+    Raises:
+        BadInput: No such file, malformed XML, or a mesh outside the folder.
+    """
+    return {shape.mesh_path for shape in _declared(Path(xml_path)).shapes
+            if shape.mesh_path is not None}
+
+
 def _declared(xml_path: Path) -> DeclaredCity:
     if not os.path.lexists(xml_path):
         raise BadInput(f"{xml_path} does not exist; `radiotwin build-scene` makes a scene folder")

@@ -18,6 +18,7 @@ from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.config import DeviceConfig, SceneConfig, UavConfig, read_config
 from radiotwin.scene.height_errors import shape_height_sds_m
 from radiotwin.scene.lattice import Lattice
+from radiotwin.scene.reader import mesh_paths
 from radiotwin.scene.vegetation import Vegetation
 
 if TYPE_CHECKING:
@@ -311,9 +312,13 @@ class Scene(Summarised):
         digest = hashlib.sha256()
         meshes = sorted(path for path in self.folder.glob("meshes/*") if path.is_file())
         SHAPES.check(len(meshes), self.folder / "meshes")
-        for path in (self.xml_path, *meshes):
+        usual = {path.resolve() for path in meshes}
+        elsewhere = sorted(path for path in mesh_paths(self.xml_path)
+                           if path.resolve() not in usual)
+        for path in (self.xml_path, *meshes, *elsewhere):
             require_within(self.folder, path, str(self.folder))
-            digest.update(os.fsencode(path.name) + b"\0")
+            name = os.path.relpath(path, self.folder) if path in elsewhere else path.name
+            digest.update(os.fsencode(name) + b"\0")
             with open_input(path, "mesh") as file:
                 while block := file.read(_BLOCK_BYTES):
                     digest.update(block)

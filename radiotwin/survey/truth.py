@@ -4,6 +4,7 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
+from radiotwin.inputs import require_within
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.survey.statistical import segmented_truth
@@ -26,7 +27,7 @@ def read_truth(scene: Scene, truth: str = "traced") -> RadioMap:
         if not path.is_file():
             raise BadInput(f"{path} does not exist; run `radiotwin trace {scene.folder}` first, or "
                            "use --truth segmented")
-        return RadioMap.read(path)
+        return RadioMap.read(require_within(scene.folder, path, str(scene.folder)))
     return RadioMap.read(truth)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from radiotwin.errors import BadInput
 from radiotwin.files import atomic_path
-from radiotwin.inputs import read_bytes
+from radiotwin.inputs import read_bytes, require_within
 from radiotwin.interruption import note_finished
 
 
@@ -18,7 +18,7 @@ class BatchStore:
     """A folder of arrays that belong to one key.
 
     Args:
-        root: Parent folder.
+        scene_folder: Its folder `cache` holds them.
         key: Everything that decides the arrays; different keys have different folders.
 
     Attributes:
@@ -26,10 +26,12 @@ class BatchStore:
         folder: The folder.
     """
 
-    def __init__(self, root: Path, key: dict[str, Any]) -> None:
+    def __init__(self, scene_folder: Path, key: dict[str, Any]) -> None:
         text = json.dumps(key, sort_keys=True, indent=1)
         self.hash = hashlib.sha256(text.encode()).hexdigest()
-        self.folder = root / f"trace-{self.hash[:12]}"
+        self.folder = require_within(scene_folder,
+                                     scene_folder / "cache" / f"trace-{self.hash[:12]}",
+                                     str(scene_folder))
         if not (self.folder / "key.json").is_file():
             with atomic_path(self.folder / "key.json") as temporary:
                 temporary.write_text(text + "\n", encoding="utf-8")

@@ -1,5 +1,6 @@
 """The truth map: every lattice position, every device, resumable and checked."""
 
+import hashlib
 import math
 import warnings
 from importlib.metadata import version
@@ -24,6 +25,8 @@ from radiotwin.trace.sionna_scene import library_versions
 from radiotwin.trace.solver import IMPOSSIBLE_DB
 from radiotwin.trace.tiles import with_radius
 
+MAX_STEM = 100  # characters of a file's name
+
 
 def truth_path(scene: Scene, devices: list[str] | None = None) -> Path:
     """Return the file that a scene's traced map is written to unless another is named.
@@ -32,7 +35,11 @@ def truth_path(scene: Scene, devices: list[str] | None = None) -> Path:
         scene: that is traced.
         devices: names of those that are traced; None: all.
     """
-    return scene.folder / ("-".join(["truth", *(devices or [])])[:100] + ".nc")
+    name = "-".join(["truth", *(devices or [])])
+    if len(name) > MAX_STEM:  # what is cut off counts, too
+        digest = hashlib.sha256(name.encode()).hexdigest()[:12]
+        name = f"{name[:MAX_STEM]}-{digest}"
+    return scene.folder / f"{name}.nc"
 
 
 def trace_map(scene: Scene, settings: SolverSettings | None = None,
@@ -62,12 +69,17 @@ def trace_map(scene: Scene, settings: SolverSettings | None = None,
         RunFailed: No usable libLLVM, or gains that physics does not allow. Nothing is written then.
     """
     settings = with_radius(scene, settings or SolverSettings.of_quality())
-    out_path = truth_path(scene, devices) if out_path is None else out_path
+    if out_path is None:
+        out_path = require_within(scene.folder, truth_path(scene, devices), str(scene.folder))
     index = device_indices(scene, devices)
     if settings.solver == "map" and scene.lattice.ground_m is not None:
         raise BadInput("the solver 'map' averages over horizontal cells, and the lattice follows "
                        "the ground; take the solver 'paths', or above = \"datum\" in [lattice] of "
                        f"{scene.folder / 'scene.toml'}")
+    if settings.solver == "map" and not scene.lattice.step_m:
+        raise BadInput("the solver 'map' averages over cells between positions, and the lattice of "
+                       f"{scene.folder / 'scene.toml'} has one position only; take the solver "
+                       "'paths', or a smaller step_m")
     MAP_VALUES.check(len(index) * math.prod(scene.lattice.shape),
                      f"{scene.folder}: lattice positions times devices")
     check_target(out_path)
@@ -178,10 +190,7 @@ def open_store(scene: Scene, settings: SolverSettings) -> BatchStore:
     Raises:
         BadInput: The folder lies outside the scene's, or cannot be written.
     """
-    cache = require_within(scene.folder, scene.folder / "cache", str(scene.folder))
-    store = BatchStore(cache, _key(scene, settings))
-    require_within(scene.folder, store.folder, str(scene.folder))
-    return store
+    return BatchStore(scene.folder, _key(scene, settings))
 
 
 def _key(scene: Scene, settings: SolverSettings) -> dict[str, Any]:

@@ -56,11 +56,13 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
 
     Raises:
         BadInput: no anchor, nothing detected, links that no channel can be learnt from, an unknown
-            model, or devices that may be indoors with one that follows paths.
+            model, devices that may be indoors with one that follows paths, or an earlier twin in
+            another frame.
     """
     flights = measurements.flights
     measurements = _thinned(_usable(measurements), seed)
     if start is not None:
+        start.require_frame(scene)
         start.warn_of_another_scene(scene, scene.content_hash())
     channel = channel_named(model)
     if channel in (ImagePaths, PathKriging):

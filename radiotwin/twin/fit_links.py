@@ -172,5 +172,9 @@ def level_of(links: LinkData) -> str:
 
 def provenance(links: LinkData, scene: Scene | None) -> dict[str, Any]:
     """Return what a twin says of what it was made of."""
-    own = {} if scene is None else {"scene": scene.config.name, "scene_hash": scene.content_hash()}
+    own: dict[str, Any] = {}
+    if scene is not None:
+        own = {"scene": scene.config.name, "scene_hash": scene.content_hash()}
+        if scene.config.origin is not None:
+            own["origin"] = scene.config.origin.model_dump()
     return own | {"links": len(links), "radiotwin_version": radiotwin.__version__}

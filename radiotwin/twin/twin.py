@@ -21,6 +21,7 @@ from radiotwin.effects.correlated_shadowing import NAME as SHADOWING
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.effects.fold_model import FittedEffect
 from radiotwin.errors import BadInput
+from radiotwin.frames import is_same_frame, place
 from radiotwin.inference.gaussian import detection_probability
 from radiotwin.links import LinkData
 from radiotwin.links.prediction import Prediction
@@ -141,10 +142,12 @@ class Twin(Summarised):
         """Return mean and standard deviation of the level over a scene's lattice.
 
         For all devices that have a position, at faultless receivers. The mean is given below
-        sensitivity, too; attribute `gain_limit_db` says where detection ends.
+        sensitivity, too; attribute `gain_limit_db` says where detection ends, by the readings where
+        these have shown it.
 
         Raises:
-            BadInput: the twin was fitted without a 3D map, or predicts what no link has.
+            BadInput: the twin was fitted without a 3D map or in another frame, or predicts what no
+                link has.
         """
         return RadioMap.collect(self.map_stream(scene))
 
@@ -152,27 +155,31 @@ class Twin(Summarised):
         """Return the map of `radio_map`, made block by block when it is written.
 
         Raises:
-            BadInput: the twin was fitted without a 3D map.
+            BadInput: the twin was fitted without a 3D map, or in another frame.
         """
         self.require_map(scene)
         scene_hash = scene.content_hash()
         self.warn_of_another_scene(scene, scene_hash)
         known = np.flatnonzero(np.isfinite(self.device_m).all(axis=1))
         rows = {self.devices[i].device: int(i) for i in known}
-        offset_db = scene.config.radio.tx_power_dbm if self.level == "rssi_dbm" else 0.0
+        power_dbm = self.power_dbm(scene)
 
         def make(device: str, lattice: Lattice) -> dict[str, np.ndarray]:
             receiver_m = lattice.positions_m
             links = self.links(receiver_m, np.full(len(receiver_m), rows[device]), scene)
             predicted = self.predict(links)
-            values = {"gain_db": predicted.mean_db - offset_db, "los": links.los,
+            values = {"gain_db": predicted.mean_db - power_dbm, "los": links.los,
                       "sigma_db": predicted.sd_db}
             return {name: value.reshape(lattice.shape) for name, value in values.items()}
 
+        limit_db = scene.config.gain_limit_db if self.limit_db is None \
+            else self.limit_db - power_dbm
         attributes = {"source": f"twin:{self.description}",
                       "frequency_hz": scene.config.radio.frequency_hz,
-                      "gain_limit_db": scene.config.gain_limit_db, "scene_hash": scene_hash,
+                      "gain_limit_db": limit_db, "scene_hash": scene_hash,
                       "radiotwin_version": radiotwin.__version__}
+        if self.level == "rssi_dbm":
+            attributes["tx_power_dbm"] = power_dbm
         return MapStream(list(rows), scene.lattice, attributes, ("gain_db", "los", "sigma_db"),
                          make).placed(scene.config.origin)
 
@@ -264,6 +271,23 @@ class Twin(Summarised):
         """
         return cls(**decode_twin(record, channel, source))
 
+    def power_dbm(self, scene: Scene) -> float:
+        """Return the transmit power that is in the twin's levels [dBm]; of gains it is 0.
+
+        Warns:
+            Levels are received powers, and the scene has the default of 0 dBm.
+        """
+        if self.level == "gain_db":
+            return 0.0
+        radio = scene.config.radio
+        if radio.tx_power_dbm == type(radio)().tx_power_dbm:
+            warnings.warn(f"the twin's levels are received powers. Its gains are what they are "
+                          f"above the transmit power, for which the default of "
+                          f"{scene.folder / 'scene.toml'} is taken, {radio.tx_power_dbm:g} dBm: "
+                          "declare the devices' tx_power_dbm there, or gains are too high by it",
+                          stacklevel=3)
+        return radio.tx_power_dbm
+
     def warn_of_another_scene(self, scene: Scene, scene_hash: str) -> None:
         """Warn where the twin was learnt in another scene than one with this hash."""
         if self.provenance.get("scene_hash") not in (None, scene_hash):
@@ -271,8 +295,21 @@ class Twin(Summarised):
                           f"than {scene.folder}, or this one has changed since: geometry, radio or "
                           "declared devices differ", stacklevel=3)
 
+    def require_frame(self, scene: Scene) -> None:
+        """Check that the positions of the twin are not known to be in another frame than a scene's.
+
+        Raises:
+            BadInput: they are.
+        """
+        own, other = self.origin, scene.config.origin
+        if own is not None and other is not None and not is_same_frame(own, other):
+            raise BadInput(f"the twin is in the frame about {place(own)}, the scene {scene.folder} "
+                           f"in that about {place(other)}: positions would be elsewhere; build the "
+                           f"scene with --origin {own.latitude_deg:.10g},{own.longitude_deg:.10g}"
+                           f",{own.altitude_m:g}, or fit again with this one")
+
     def require_map(self, scene: Scene | None) -> None:
-        """Check that the twin was fitted with a 3D map exactly where one is given now.
+        """Check that the twin was fitted with a 3D map in this frame, or without one as now.
 
         Levels that were fitted to each class of line of sight need a map, and one level for all
         links cannot use one.
@@ -280,6 +317,8 @@ class Twin(Summarised):
         Raises:
             BadInput: it was not.
         """
+        if scene is not None:
+            self.require_frame(scene)
         if self.fitted is None or self.channel.follows_paths or not self.channel.uses_map:
             return
         with_map = len(self.fitted.level_coefficients) > 2  # a level and a slope for each class

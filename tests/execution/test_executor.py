@@ -7,8 +7,9 @@ import warnings
 import numpy as np
 import pytest
 
+from radiotwin import processes
 from radiotwin.errors import BadInput, RunFailed
-from radiotwin.execution import Executor, Job, Resources, open_executor
+from radiotwin.execution import Executor, Job, Resources, local, open_executor
 from radiotwin.execution.job import NoCache
 from radiotwin.threads import usable_cores
 from tests.execution.jobs import (
@@ -138,6 +139,26 @@ def test_a_worker_that_takes_too_much_memory_is_ended(executors):
 def test_more_memory_than_there_is_ends_in_one_message():
     with open_executor("2") as executor, pytest.raises(RunFailed, match="2 worker.s. may take .* and 0 would fit"):
         executor.run(Job("squares", square, Resources(memory_bytes=2**50)), range(3))
+
+
+def test_no_more_room_is_asked_for_than_there_are_pieces(monkeypatch):
+    monkeypatch.setattr(local, "free_memory_bytes", lambda: 3 * 2**30)
+    with open_executor("4") as executor:
+        assert executor.run(Job("squares", square, Resources(memory_bytes=2**30)), [1, 2]) == [1, 4]
+        with pytest.raises(RunFailed, match="4 worker.s. may take 1.0 GiB of memory each, and 3 would fit"):
+            executor.run(Job("squares", square, Resources(memory_bytes=2**30)), range(9))
+
+
+def test_pages_of_files_are_given_back(monkeypatch, tmp_path):
+    """A container of 8 GiB, 7 of which hold files that were read once."""
+    monkeypatch.setattr(processes, "_GROUPS", tmp_path)
+    for name, value in (("memory.max", 8 * 2**30), ("memory.current", 7.5 * 2**30)):
+        (tmp_path / name).write_text(f"{int(value)}\n")
+    assert processes._group_bytes() == 2**29
+    (tmp_path / "memory.stat").write_text(f"anon {2**28}\ninactive_file {7 * 2**30}\nactive_file 5\n")
+    assert processes._group_bytes() == 7.5 * 2**30
+    (tmp_path / "memory.max").write_text("max\n")
+    assert processes._group_bytes() is None
 
 
 def test_auto_does_what_it_has_no_memory_for_in_this_process():

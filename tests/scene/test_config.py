@@ -189,3 +189,16 @@ def test_a_pipe_is_no_scene_file(tmp_path):
     os.mkfifo(tmp_path / "scene.toml")
     with pytest.raises(BadInput, match="not a regular file"):
         read_config(tmp_path / "scene.toml")
+
+
+@pytest.mark.parametrize("end_m, is_there", [(80, True), (80.005, True), (99.995, False), (100, False)])
+def test_a_flight_ends_where_the_lattice_does(tmp_path, end_m, is_there):
+    """The extent is 5 mm short of a whole number of steps: the lattice's last column is that before."""
+    text = GOOD.replace("x_max_m = 100", "x_max_m = 99.995").replace("start_x_m = 20", f"start_x_m = {end_m}")
+    path = tmp_path / "scene.toml"
+    path.write_text(text)
+    if is_there:
+        assert read_config(path).uavs[0].start_x_m == end_m
+    else:
+        with pytest.raises(BadInput, match=r"not on the lattice \(0 to 80 m in steps of 20 m\)|lies outside"):
+            read_config(path)

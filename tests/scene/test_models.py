@@ -93,7 +93,8 @@ def test_a_material_of_unknown_name_is_told(tmp_path, city):
 
 def test_the_axis_of_a_model_can_be_declared(tmp_path, city):
     path = write(tmp_path, "a.obj", y_up(city))
-    assert "there is no ground" in import_city(path, {}).problems[0].message
+    assert "the axis y seems to point up, not z" in import_city(path, {}).problems[0].message
+    assert not import_city(write(tmp_path, "b.glb", city), {}).problems, "a rule of the format"
     found = import_city(path, {}, up="y")
     assert not found.problems and found.surfaces.vertices[:, 2].max() == pytest.approx(40)
 

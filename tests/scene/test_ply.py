@@ -139,3 +139,12 @@ def test_a_long_ragged_face_is_refused_before_it_is_unpacked(tmp_path):
                                          indices="property list uint int vertex_indices"))
     with pytest.raises(BadInput, match="20,000 corners in one face; at most 10,000"):
         read_ply(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize("ends", ["\n", "\r\n"])
+def test_lines_end_at_line_ends_only_whatever_language_a_comment_is_in(tmp_path, ends):
+    """In UTF-8, Å is the bytes C3 85; the second is a line end in Latin-1."""
+    rows = "".join(f"{x} {y} {z}\n" for x, y, z in VERTICES).encode() + b"3 0 1 2\n"
+    data = header("ascii", 5, 1).replace(b"made by hand", "Åsa х م".encode()) + rows
+    (tmp_path / "a.ply").write_bytes(data.replace(b"\n", ends.encode()))
+    assert np.array_equal(read_ply(tmp_path / "a.ply")[0], VERTICES)

@@ -1,10 +1,12 @@
 """Batches on disk."""
 
 import os
+import shutil
 
 import numpy as np
 import pytest
 
+from radiotwin.errors import BadInput
 from radiotwin.trace.batches import BatchStore
 
 
@@ -18,7 +20,18 @@ def test_array_comes_back_to_the_bit(tmp_path):
 def test_keys_do_not_see_each_other(tmp_path):
     BatchStore(tmp_path, {"a": 1}).put("batch", np.zeros(3))
     assert BatchStore(tmp_path, {"a": 2}).get("batch", 3) is None
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(list((tmp_path / "cache").iterdir())) == 2
+
+
+def test_a_link_out_of_the_scene_is_refused_before_anything_is_written(tmp_path):
+    scene, outside = tmp_path / "scene", tmp_path / "outside"
+    outside.mkdir()
+    own = BatchStore(scene, {"a": 1}).folder
+    shutil.rmtree(own)
+    own.symlink_to(outside)
+    with pytest.raises(BadInput, match="leads out of"):
+        BatchStore(scene, {"a": 1})
+    assert not list(outside.iterdir())
 
 
 @pytest.mark.parametrize("content", [b"", b"\x93NUMPY\x01", b"no array"])

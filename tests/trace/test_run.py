@@ -9,8 +9,11 @@ from radiotwin.errors import BadInput, RunFailed
 from radiotwin.radiomap import RadioMap
 from radiotwin.scene import Scene
 from radiotwin.scene.config import write_config
+from radiotwin.scene.ply import read_ply, write_ply
+from radiotwin.survey.truth import read_truth
 from radiotwin.tables import Origin
 from radiotwin.trace import SolverSettings, trace_map
+from radiotwin.trace.run import truth_path
 
 SETTINGS = SolverSettings(batch_receivers=100)
 BATCHES = 6  # of 2 x 16 x 16 positions
@@ -173,3 +176,42 @@ def test_an_impossible_link_is_left_out_counted_and_told(own_scene, law, tmp_pat
     with pytest.warns(UserWarning, match="carry more power"):
         trace_map(own_scene, SETTINGS, tmp_path / "again.nc")
     assert law.calls == calls and (tmp_path / "again.nc").read_bytes() == (tmp_path / "map.nc").read_bytes()
+
+
+def test_a_truth_that_leads_out_of_the_scene_is_neither_read_nor_replaced(own_scene, law, tmp_path):
+    trace_map(own_scene, SETTINGS, tmp_path / "elsewhere.nc")
+    (own_scene.folder / "truth.nc").symlink_to(tmp_path / "elsewhere.nc")
+    with pytest.raises(BadInput, match="leads out of"):
+        read_truth(own_scene)
+    with pytest.raises(BadInput, match="leads out of"):
+        trace_map(own_scene, SETTINGS)
+
+
+def test_long_lists_of_devices_have_files_of_their_own(own_scene):
+    names = [f"device{number:02d}" for number in range(20)]
+    first, other = truth_path(own_scene, names[:12]), truth_path(own_scene, [*names[:11], names[12]])
+    assert first != other and first == truth_path(own_scene, names[:12]) and len(first.name) < 130
+    assert truth_path(own_scene, ["d0", "d1"]).name == "truth-d0-d1.nc" and truth_path(own_scene).name == "truth.nc"
+
+
+def test_a_mesh_anywhere_in_the_folder_counts(own_scene):
+    """A stranger's city.xml may name meshes outside `meshes`; a changed one is another scene."""
+    folder = own_scene.folder
+    before = own_scene.content_hash()
+    mesh = sorted((folder / "meshes").glob("*.ply"))[0]
+    (folder / "geo").mkdir()
+    mesh.rename(folder / "geo" / mesh.name)
+    xml = (folder / "city.xml").read_text()
+    assert f"meshes/{mesh.name}" in xml
+    (folder / "city.xml").write_text(xml.replace(f"meshes/{mesh.name}", f"geo/{mesh.name}"))
+    moved = Scene.load(folder).content_hash()
+    vertices, (faces,) = read_ply(folder / "geo" / mesh.name)
+    write_ply(folder / "geo" / mesh.name, vertices * [1, 1, 2], faces)
+    assert len({before, moved, Scene.load(folder).content_hash()}) == 3
+
+
+def test_the_map_solver_needs_cells(own_scene, law):
+    lattice = own_scene.config.lattice.model_copy(update={"step_m": 1000.0})
+    one = Scene(own_scene.folder, own_scene.config.model_copy(update={"lattice": lattice, "uavs": []}))
+    with pytest.raises(BadInput, match="one position only"):
+        trace_map(one, SolverSettings(solver="map"), own_scene.folder / "truth.nc")
