@@ -126,7 +126,9 @@ class Trainer:
         assert self._plan is not None
         longest = len(self._plan) * (1 - min(self.episodes / self.horizon, 1.0))
         slots = self._rng.integers(0, int(longest) + 1, count)
-        slots[:int(np.ceil(GUIDED_SHARE * count))] = len(self._plan)
+        before, after = (int(np.ceil(GUIDED_SHARE * number)) for number in
+                         (self.episodes, self.episodes + count))
+        slots[:after - before] = len(self._plan)
         return slots
 
     def weights(self) -> dict[str, np.ndarray]:

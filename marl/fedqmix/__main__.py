@@ -38,7 +38,8 @@ def fedqmix(
     federation = checked(given, FederationSettings())
     name = f"{run.scene.name}-{run.truth}-{run.twin}-{run.algorithm}-{run.seed}"
     folder = out or Path("runs") / name
-    if engine == EngineSettings():  # one owner of all
+    of_federation = "federation" in given or engine != EngineSettings()
+    if not of_federation:  # one owner of all
         if federation != FederationSettings():
             raise BadInput("--strategy and what goes with it are of a federation; give "
                            "--federation or --party-scenes, too")
@@ -63,4 +64,4 @@ app.command()(with_output_options(fedqmix, prints_tables=True))
 
 if __name__ == "__main__":
     signals.leave(exit_status(app, "the finished rounds are kept: the same command with --resume "
-                                   "goes on"))
+                                   "goes on; but a federation starts anew, with another --out"))

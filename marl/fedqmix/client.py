@@ -51,7 +51,8 @@ class Party:
     Attributes:
         scene: its folder.
         folder: of its checkpoint and results.
-        number: of its replica: gives it random numbers of its own.
+        number: of its replica, whose random numbers it learns with. Its real flights are drawn by
+            the run's seed alone, as those of a single owner's replicas are.
         truth: see `RunSettings.truth`; real flights are simulated in this map.
         measurements: of flights that were flown; None: they are simulated.
         device: torch device.
@@ -233,7 +234,9 @@ class Client:
                         location_errors_m(self._scene, found))
         if self._measured is not None:
             row["real_episodes"] = len(self._measured.flights)
-        row["simulated_episodes"] = replica.episodes
+        row["simulated_episodes"] = replica.episodes  # it may have missed rounds
+        if run.twin == "truth":
+            row["real_episodes"] = replica.episodes + replica.selection_flights
         row["evaluation_flights"] = row["round"] * run.flights
         self._rows.append(row | self._spent)
         self._spent["round_s"] = 0.0

@@ -13,7 +13,9 @@ from marl.fedqmix.federation import Weights, average
 from marl.fedqmix.settings import EngineSettings, FederationSettings, check_federation
 from marl.fedqmix.shared import Shared, initial_weights, write_app
 from marl.figures import draw_curve
+from marl.mission import Known, make_mission
 from marl.settings import LearnerSettings, RunSettings
+from marl.sizes import check_sizes
 from marl.threads import keep_memory, limit_threads
 from radiotwin.alignment import in_scene_frame
 from radiotwin.console import notice, print_rows, say
@@ -23,7 +25,7 @@ from radiotwin.files import atomic_file, is_temporary, scratch_folder
 from radiotwin.measurements import read_measurements
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
-from radiotwin.survey import read_truth
+from radiotwin.survey import read_truth, segmented_truth
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,7 @@ class FederatedSession:
         parties = [Party(scene, self.out / "parties" / str(number), number, self.run.truth,
                          measured[number] if measured else None, device)
                    for number, scene in enumerate(scenes)]
-        sizes = [_checked(party) for party in parties]
+        sizes = [_checked(party, self.run, self.learner) for party in parties]
         if len(set(sizes)) != 1:
             which = next(number for number, size in enumerate(sizes) if size != sizes[0])
             raise BadInput(f"{scenes[0]} has {sizes[0][0]} UAVs and {sizes[0][1]} devices, "
@@ -181,11 +183,17 @@ def _listed(text: str) -> list[str]:
     return [each.strip() for each in text.split(",") if each.strip()]
 
 
-def _checked(party: Party) -> tuple[int, int]:
-    """Return the numbers of UAVs and devices of a party's scene, after a look at what it holds."""
+def _checked(party: Party, run: RunSettings, learner: LearnerSettings) -> tuple[int, int]:
+    """Return the numbers of UAVs and devices of a party's scene, after a look at what it holds.
+
+    Whether its UAVs can fly there, and whether what is learnt fits into memory, too.
+    """
     scene = Scene.load(party.scene)
     if party.measurements is not None:
         in_scene_frame(read_measurements(party.measurements), scene)
+        truth = segmented_truth(scene)  # which map it is does not matter here
     else:
-        scene.check_map(read_truth(scene, party.truth))
+        truth = read_truth(scene, party.truth)
+        scene.check_map(truth)
+    check_sizes(run, learner, make_mission(scene, truth, Known.truth(scene), run.assignment))
     return len(scene.config.uavs), len(scene.config.devices)

@@ -63,3 +63,12 @@ def test_directions_as_the_antenna_sees_them(azimuth_deg, tilt_deg, ray, seen):
 def test_any_shape_of_rays():
     rays = np.random.default_rng(0).normal(size=(4, 5, 3))
     assert Antenna(GRID, 12, 3).gain_dbi(rays).shape == (4, 5)
+
+
+@pytest.mark.parametrize(("azimuth_deg", "east_north", "gain_dbi"), [
+    (0, (1, 0), 5), (0, (-1, 0), -5), (90, (0, -1), 5), (90, (0, 1), -5), (225, (-1, 1), 5)])
+def test_azimuths_of_a_pattern_are_clockwise(azimuth_deg, east_north, gain_dbi):
+    """Of one that is stronger on its right: east of north, south of east."""
+    at_deg = np.arange(0.0, 360.0, 10.0)
+    lopsided = Pattern(at_deg, np.array([-90.0, 90.0]), np.tile(5 * np.sin(np.radians(at_deg)), (2, 1)))
+    assert Antenna(lopsided, azimuth_deg).gain_dbi(np.array([*east_north, 0.0])) == pytest.approx(gain_dbi)

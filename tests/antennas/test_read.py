@@ -3,7 +3,7 @@ import os
 import numpy as np
 import pytest
 
-from radiotwin.antennas import read_pattern
+from radiotwin.antennas import Antenna, read_pattern
 from radiotwin.errors import BadInput
 
 
@@ -119,3 +119,12 @@ def test_pipes_and_large_files_are_refused(tmp_path, monkeypatch):
     monkeypatch.setenv("RADIOTWIN_MAX_DOCUMENT_BYTES", "100")
     with pytest.raises(BadInput, match="at most 100"):
         read_pattern(write(tmp_path, msi()))
+
+
+def test_azimuths_of_an_msi_file_are_clockwise(tmp_path):
+    """A horizontal cut that falls to 20 dB on its right, at 90 degrees, and not on its left."""
+    pattern = read_pattern(write(tmp_path, msi(horizontal=lambda a: 20 * max(np.sin(np.radians(a)), 0.0),
+                                               vertical=lambda a: 0.0)))
+    assert pattern.at(np.array([90.0, -90.0, 270.0]), 0) == pytest.approx(15 - np.array([20, 0, 0]), abs=1e-2)
+    east, west = Antenna(pattern).gain_dbi(np.array([[1.0, 0, 0], [-1.0, 0, 0]]))
+    assert (east, west) == (pytest.approx(-5, abs=1e-2), pytest.approx(15, abs=1e-2))

@@ -81,3 +81,16 @@ def test_position_is_where_a_device_may_be():
 
     at = posterior_of(walled).modes(outside)[0][0]
     assert outside(at[None])[0] and np.linalg.norm(at - (100, 100)) < 2.0
+
+
+def test_a_power_widens_a_posterior_and_does_not_move_its_estimate():
+    """Of two peaks that touch, the higher and narrower one has most of the mean; a flatter power would have it between."""
+    def two(xy_m):
+        return np.log(np.exp(gaussian((80.0, 100.0), 4.0)(xy_m)) + 0.05 * np.exp(gaussian((95.0, 100.0), 8.0)(xy_m)))
+
+    sharp, wide = posterior_of(two, [(80.0, 100.0)]), posterior_of(two, [(80.0, 100.0)], 0.1)
+    (at, _), (same, _) = sharp.modes(everywhere)[0], wide.modes(everywhere)[0]
+    np.testing.assert_allclose(same, at, atol=0.5)
+    assert wide.radius(same) > 2 * sharp.radius(at)
+    mean = wide.mass @ wide.xy_m / wide.mass.sum()
+    assert np.hypot(*(mean - at)) > 3, "what the estimate does not do"

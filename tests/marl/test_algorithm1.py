@@ -1,18 +1,29 @@
 """Algorithm 1 on the small scene: what it measures, what it knows, and that a stopped run ends as an unbroken one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import marl.algorithm1
 import marl.qmix
-from marl.algorithm1 import Reality, learn_twin, location_errors_m, run_algorithm
+from marl.algorithm1 import (
+    Reality,
+    learn_twin,
+    location_errors_m,
+    measuring_policy,
+    run_algorithm,
+    twin_mission,
+)
 from marl.flights import evaluate
-from marl.heuristics import HeuristicPolicy
+from marl.heuristics import HeuristicPolicy, waypoint_actions
 from marl.mission import Known, make_mission
+from marl.planner import PlanPolicy
 from marl.settings import PRESETS, RunSettings
 from marl.training import Trainer
 from radiotwin.errors import BadInput
-from radiotwin.survey import segmented_truth
+from radiotwin.survey import fly_survey, segmented_truth
+from radiotwin.twin import fit_twin
 
 LEARNER = PRESETS["fast"].model_copy(update={"parallel": 10, "batch": 8, "replay": 60, "federate_every": 20,
                                              "selection_flights": 8})
@@ -170,3 +181,73 @@ def test_agents_see_estimates_in_the_twin_and_in_reality_alike(small_scene, monk
     seen.clear()
     execute(small_scene, run_settings(algorithm="qmix", privileged=True))
     np.testing.assert_allclose(seen[-1], true_m)
+
+
+@pytest.mark.parametrize("measure, first_flight, is_first, planned", [
+    ("policy", "waypoints", True, True), ("policy", "random", True, False),
+    ("waypoints", "random", False, True), ("policy", "waypoints", False, False)])
+def test_who_flies_a_real_flight(small_scene, reality, measure, first_flight, is_first, planned):
+    class Trained:
+        def policy(self, rng):
+            return "its own"
+
+    run = run_settings(measure=measure, first_flight=first_flight)
+    policy = measuring_policy(run, reality, None if is_first else "a twin", Known.anchors(small_scene), Trained(),
+                              np.random.default_rng(0))
+    assert isinstance(policy, PlanPolicy) == planned
+    assert planned or (isinstance(policy, HeuristicPolicy) if is_first else policy == "its own")
+
+
+def test_receivers_err_anew_in_each_flight(small_scene):
+    """In a truth of values, by what is asked for; the same plan is flown twice."""
+    statistical = segmented_truth(small_scene)
+    values = replace(statistical, dataset=statistical.dataset.drop_vars("sigma_db"))
+    known, worlds = Known.anchors(small_scene), []
+    for noise_db in (0.0, 3.0):
+        world = Reality(small_scene, values, "matching", noise_db, 5)
+        for _ in range(2):
+            plan = waypoint_actions(small_scene, world.mission(known), np.random.default_rng(1))
+            world.fly(PlanPolicy(plan), known)
+        worlds.append([table["gain_db"].to_numpy() for table in world.tables])
+    (exact, again), (first, second) = worlds
+    np.testing.assert_array_equal(exact, again)
+    errors_db = first - exact, second - exact
+    for error_db in errors_db:
+        known_db = error_db[np.isfinite(error_db)]
+        assert known_db.std() == pytest.approx(3.0, rel=4 / np.sqrt(2 * len(known_db)))
+    both = np.isfinite(errors_db).all(axis=0)
+    assert abs(np.corrcoef(*(each[both] for each in errors_db))[0, 1]) < 0.2
+
+
+def test_noise_that_was_asked_for_reaches_the_receivers(small_scene, monkeypatch):
+    made = []
+    monkeypatch.setattr(marl.algorithm1, "Reality", lambda *given: made.append(given) or Reality(*given))
+    statistical = segmented_truth(small_scene)
+    values = replace(statistical, dataset=statistical.dataset.drop_vars("sigma_db"))
+    run = RunSettings(truth="segmented", twin="log-distance", algorithm="random", real_episodes=1, episodes=4, flights=2,
+                      noise_db=3.0)
+    for truth in (values, statistical):
+        run_algorithm(run, LEARNER, small_scene, truth, None, False, lambda *_: None, lambda *_: None)
+    assert [noise_db for *_, noise_db, _ in made] == [3.0, 0.0], "a statistical truth scatters by itself"
+
+
+def test_errors_of_a_twin_last_as_long_as_its_residuals_say(small_scene):
+    """Of a truth whose errors belong to places; without measurements they are drawn anew in every slot."""
+    truth = segmented_truth(small_scene)
+    x_m, y_m = np.meshgrid(truth.lattice.x_m, truth.lattice.y_m)
+    waves_db = 5 * np.sin(2 * np.pi * x_m / 160) * np.sin(2 * np.pi * y_m / 160)
+    waved = truth.dataset.drop_vars("sigma_db").assign(gain_db=truth.dataset["gain_db"] + waves_db)
+    flown = fly_survey(small_scene, replace(truth, dataset=waved), flights=3, noise_db=0.5)
+    twin = fit_twin(flown, small_scene, model="segmented_log_distance")
+    run, known = run_settings(), Known.of(twin.devices)
+    lasting, brief = (twin_mission(small_scene, run, twin, known, each) for each in (flown, None))
+    assert lasting.shadowing_share > 0.3 and brief.shadowing_share == 0
+
+
+def test_flights_in_the_truth_that_choose_between_plans_are_counted(small_scene):
+    """Of each round: 20 episodes and 8 flights to judge what was learnt. Of the second round, too: 8 to judge the policy
+    before, and 2 with either of two plans."""
+    run = run_settings(twin="truth", algorithm="qmix", guide="planner").model_copy(update={
+        "real_episodes": 2, "episodes": 20, "planner_iterations": 50, "flights": 2})
+    outcome = execute(small_scene, run)
+    assert [row["real_episodes"] for row in outcome.rows] == [20 + 8, 2 * (20 + 8) + 8 + 2 * 2]

@@ -1,5 +1,6 @@
 """A party of a federation, driven from outside, and the means of several in one process."""
 
+import re
 import shutil
 from dataclasses import replace
 
@@ -121,6 +122,8 @@ def test_a_party_that_missed_rounds_goes_on(shared, parties):
     _, client = play(in_truth(shared), parties[0], means, (1, 4), keep=False)
     table = pd.read_csv(parties[0].folder / "metrics.csv")
     assert len(table) == 1 and table["simulated_episodes"][0] == 8
+    # In the truth all are real, and so are the flights that chose between the policies of one round.
+    assert table["real_episodes"][0] == 8 + shared.learner.selection_flights
     with pytest.raises(BadInput, match="round 4 is asked for; rounds 5 to 4"):
         client.train(4, means[0])
 
@@ -189,6 +192,7 @@ def test_more_parties_than_there_are_cannot_be_needed():
     (["--federation", "flower", "--algorithm", "qmix"], 2, "--algorithm fedqmix"),
     (["--federation", "flower", "--resume"], 2, "without --resume"),
     (["--strategy", "fedavgm"], 2, "of a federation"),
+    (["--federation", "in-process", "--min-clients", "4"], 2, "there are 2 parties"),
     (["--party-scenes", "a,b", "--strategy", "fedavgm", "--federate-all", "false"], 2, "it is Flower's"),
     (["--federation", "flower-app", "--strategy", "fedavgm"], 2, "--federate-all false"),
     (["--federation", "flower-app", "--min-clients", "4"], 2, "there are 2 parties"),
@@ -222,6 +226,22 @@ def test_scenes_of_other_sizes_are_refused(small_scene, tmp_path):
     run = RUN.model_copy(update={"scene": small_scene.folder})
     with pytest.raises(BadInput, match="equal"):
         FederatedSession(run, LEARNER, FederationSettings(), engine, tmp_path / "out").execute()
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("battery, settings, message", [
+    (1.0, {}, "battery"), (40.0, {"batch": 20_000, "hidden": 4096}, "memory|at most|GiB")])
+def test_what_cannot_be_trained_is_refused_before_anything_is_written(small_scene, tmp_path, battery, settings, message):
+    """A battery that does not reach the terminal; a batch that no memory holds."""
+    scene = tmp_path / "scene"
+    shutil.copytree(small_scene.folder, scene)
+    text = re.sub(r"battery = [\d.]+", f"battery = {battery}", (scene / "scene.toml").read_text())
+    (scene / "scene.toml").write_text(re.sub(r"start_x_m = [\d.]+", "start_x_m = 200.0", text))
+    engine = EngineSettings(party_scenes=f"{scene},{scene}")
+    learner = LEARNER.model_copy(update=settings)
+    with pytest.raises(BadInput, match=message):
+        FederatedSession(RUN.model_copy(update={"scene": scene}), learner, FederationSettings(), engine,
+                         tmp_path / "out").execute()
     assert not (tmp_path / "out").exists()
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import marl.replicas
-from marl.fedqmix.federation import average
+from marl.fedqmix.federation import average, weighted_mean
 from marl.mission import Known, make_mission
 from marl.qmix import QNetworks
 from marl.replicas import Replicas
@@ -43,6 +43,12 @@ def test_the_average_is_the_exact_mean():
     exact = sum(each["a"].astype(np.longdouble) for each in replicas) / 3
     np.testing.assert_array_equal(mean["a"], exact.astype(np.float32))
     assert mean["a"].dtype == np.float32
+
+
+def test_a_mean_counts_the_episodes_behind_each_replica():
+    replicas = [{"a": np.array([value], np.float32)} for value in (0.0, 4.0)]
+    assert weighted_mean(replicas, [3, 1])["a"][0] == 1 and weighted_mean(replicas, [1, 3])["a"][0] == 3
+    assert weighted_mean(replicas, [0, 2])["a"][0] == 4
 
 
 @pytest.mark.parametrize("federate_all", [False, True])

@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from marl.algorithm1 import run_algorithm
-from marl.checkpoint import load_checkpoint, save_checkpoint
+from marl.checkpoint import Damaged, load_checkpoint, save_checkpoint
 from marl.learner import make_learner
 from marl.mission import Known, make_mission
-from marl.resume import restored
+from marl.resume import _blocks, restored
 from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.survey import segmented_truth
@@ -142,3 +142,15 @@ def test_what_was_written_is_accepted(small_scene, stopped, tmp_path):
     assert (tmp_path / NAME).read_bytes() == (stopped / NAME).read_bytes()
     assert len(execute(small_scene, tmp_path).rows) == 2
     assert (tmp_path / "twin" / "twin.json").exists()
+
+
+@pytest.mark.parametrize("name, value, is_one", [
+    ("actor/loss", 0.5, True), ("td-error", 1, True), ("converged", True, True), ("loss", float("inf"), True),
+    ("", 1.0, False), ("a\nb", 1.0, False), ("x" * 200, 1.0, False), ("loss", "low", False), ("loss", None, False)])
+def test_a_learner_of_ones_own_logs_what_it_likes(name, value, is_one):
+    block = {"round": 1, "episodes": 4, name: value}
+    if is_one:
+        assert _blocks([block]) == [block]
+    else:
+        with pytest.raises(Damaged):
+            _blocks([block])

@@ -3,13 +3,18 @@
 import json
 import os
 
+import numpy as np
 import pytest
 
+import marl.session
+from marl.learner import make_learner
+from marl.mission import Known, make_mission
 from marl.session import Session, _world
 from marl.settings import LearnerSettings, RunSettings
 from radiotwin.errors import BadInput
 from radiotwin.radiomap import RadioMap
 from radiotwin.survey import segmented_truth
+from radiotwin.twin import Twin
 
 WORLD = {"city": "a", "scene.toml": "b", "truth": "c", "truth besides gain_db": "e"}
 
@@ -98,3 +103,28 @@ def test_a_value_that_differs_is_named(begun, tmp_path):
     with pytest.raises(BadInput, match="--batch 32") as error:
         begun._claim_folder(WORLD)
     assert len(str(error.value)) < 600
+
+
+def test_planners_beside_a_learner_plan_in_its_twin(small_scene, tmp_path, monkeypatch):
+    """And are judged in the truth, which they have not seen."""
+    planned_in = []
+
+    def spied(run, learner, mission, rounds, *more):
+        made = make_learner(run, learner, mission, rounds, *more)
+        prepare = made.prepare
+        monkeypatch.setattr(made, "prepare", lambda mission, *rest: planned_in.append((run.algorithm, mission)) or prepare(
+            mission, *rest))
+        return made
+
+    monkeypatch.setattr(marl.session, "make_learner", spied)
+    run = RunSettings(scene=small_scene.folder, truth="segmented", twin="log-distance", algorithm="greedy", real_episodes=1,
+                      episodes=4, planner_iterations=50, flights=2)
+    Session(run, LearnerSettings(), tmp_path / "run", False).execute()
+    twin = Twin.load(tmp_path / "run" / "twin")
+    known = Known.of(twin.devices)
+    in_twin = make_mission(small_scene, twin.radio_map(small_scene), known, run.assignment).snr_db
+    in_truth = make_mission(small_scene, segmented_truth(small_scene), known, run.assignment).snr_db
+    assert [name for name, _ in planned_in] == ["planner", "random"]
+    for _, mission in planned_in:
+        np.testing.assert_allclose(mission.snr_db, in_twin, atol=1e-3)
+        assert np.abs(mission.snr_db - in_truth).max() > 1

@@ -156,3 +156,12 @@ def test_where_a_receiver_stands_on_a_device_its_gain_is_that_at_one_metre(small
     found = segmented_truth(scene)
     assert np.isfinite(found.gain_db).all()
     assert found.gain_db[0].max() == pytest.approx(-30.0)  # LoS at 1 m (Chen et al. 2023)
+
+
+def test_a_receivers_error_is_1_db_unless_the_truth_has_its_own(small_scene, truth):
+    """A statistical truth scatters by itself; values of a map do not."""
+    values = dataclasses.replace(truth, dataset=truth.dataset.drop_vars("sigma_db"))
+    for world, sd_db in ((values, 1.0), (truth, 0.0)):
+        exact, usual = (survey(small_scene, world, **given) for given in ({"noise_db": 0.0}, {}))
+        error_db = usual.level_db - exact.level_db
+        assert np.isfinite(error_db).all() and error_db.std() == pytest.approx(sd_db, rel=4 / np.sqrt(2 * len(error_db)))
