@@ -1,7 +1,7 @@
 """The most that gas and rain can take from a link, by frequency.
 
 A small table of published specific attenuations, so that no result depends on an optional package.
-Compared with the package `itur` by its test: straight lines between rows are less than 4 % below it.
+Compared with the package `itur` by its test: between rows it is less than 4 % below that.
 """
 
 import numpy as np
