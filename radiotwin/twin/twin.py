@@ -281,11 +281,11 @@ class Twin(Summarised):
             return 0.0
         radio = scene.config.radio
         if radio.tx_power_dbm == type(radio)().tx_power_dbm:
-            warnings.warn(f"the twin's levels are received powers. Its gains are what they are "
-                          f"above the transmit power, for which the default of "
-                          f"{scene.folder / 'scene.toml'} is taken, {radio.tx_power_dbm:g} dBm: "
-                          "declare the devices' tx_power_dbm there, or gains are too high by it",
-                          stacklevel=3)
+            warnings.warn(f"the twin's levels are received powers, and gains are what they are "
+                          f"above the transmit power: the default of "
+                          f"{scene.folder / 'scene.toml'} is taken, {radio.tx_power_dbm:g} dBm. If "
+                          "the devices send at another power, write it there as tx_power_dbm; "
+                          "gains are off by the difference, and levels are not", stacklevel=3)
         return radio.tx_power_dbm
 
     def warn_of_another_scene(self, scene: Scene, scene_hash: str) -> None:
