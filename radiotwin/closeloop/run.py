@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from radiotwin.closeloop.bases import BASES, make_bases
+from radiotwin.closeloop.bases import BASES, LogDistanceBase, make_bases
 from radiotwin.closeloop.change_points import select_change_points
 from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.cross_validation import (
@@ -35,6 +35,7 @@ from radiotwin.effects.unexplained_trend import UnexplainedTrend
 from radiotwin.errors import BadInput
 from radiotwin.execution import Executor
 from radiotwin.links import LinkData, prepare_links, residual_variables
+from radiotwin.links.checks import refuse_misplaced_anchors
 from radiotwin.links.limits import limits_to_explain
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
@@ -182,6 +183,8 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
                        "base log-distance")
     criteria = criteria or SelectionCriteria()
     all_links = prepare_links(measurements, scene)
+    if scene is not None and base != LogDistanceBase.name:  # which needs no line of sight
+        refuse_misplaced_anchors(all_links, scene)
     links = limits_to_explain(thin_links(all_links, seed))
     folds = make_folds(links, seed, hold_out)
     names = [base]

@@ -83,8 +83,7 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
 
     Raises:
         BadInput: nothing that can be used is left, or positions or levels that cannot be what they
-            are said to be, or measurements and scene are in different frames, or an anchor is
-            inside a building.
+            are said to be, or measurements and scene are in different frames.
     """
     table = measurements.table.reset_index(drop=True)
     level_db, receiver_m = measurements.level_db, measurements.receiver_m
@@ -152,8 +151,6 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     device = (np.cumsum(placed) - 1)[device_index[keep]]
     links = _link_data(measurements, table[keep], scene, level_db[keep], receiver_m[keep],
                        device_m[placed], device, np.flatnonzero(placed), notes)
-    if scene is not None and not to_locate:
-        refuse_misplaced_anchors(links, scene)
     notes += [RESTART_NOTE] * links.time_restarts
     return links
 

@@ -12,7 +12,12 @@ from radiotwin.channel.path_kriging import PathKriging
 from radiotwin.errors import BadInput
 from radiotwin.execution import Executor
 from radiotwin.links import join_links, prepare_links
-from radiotwin.links.checks import COPIED, copied_rows, refuse_empty_levels
+from radiotwin.links.checks import (
+    COPIED,
+    copied_rows,
+    refuse_empty_levels,
+    refuse_misplaced_anchors,
+)
 from radiotwin.localize import LocalizeSettings
 from radiotwin.measurements import Measurements
 from radiotwin.scene import Scene
@@ -70,6 +75,7 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
             raise BadInput(f"model {model} follows paths outside buildings only; take another "
                            "model where unknown devices may be indoors")
         links = prepare_links(measurements, scene)
+        refuse_misplaced_anchors(links, scene)
         _warn(links.notes)
         fit = fit_along_paths if channel is ImagePaths else fit_over_wrong_map
         twin = fit(links, scene, seed, start, executor)

@@ -10,6 +10,8 @@ from radiotwin.closeloop.bases import LogDistanceBase
 from radiotwin.closeloop.cross_validation import cross_validate, training_parts
 from radiotwin.closeloop.folds import make_folds
 from radiotwin.closeloop.result_file import errors
+from radiotwin.closeloop.run import close_loop
+from radiotwin.errors import BadInput
 from radiotwin.links import prepare_links
 from radiotwin.links.limits import limits_to_explain
 from radiotwin.measurements import Measurements
@@ -51,7 +53,16 @@ def test_the_limit_is_that_of_the_readings_and_leaves_no_bias(small_scene):
     assert below > 0.3 and np.isnan(links.level_db).any()
     assert links.usual_limit_db == pytest.approx(LIMIT_DBM, abs=0.6)
     (note,) = [each for each in links.notes if "limit of detection" in each]
-    assert f"{below:.1%}" in note and "Used instead: -1" in note and "for phone" in note
+    assert f"{below:.0%}" in note and "Used instead: -1" in note and "for phone" in note
     assert abs(held_out(links)["bias_db"]) <= 0.5
     claimed = replace(links, limit_db=np.full(len(links), DEFAULT_DBM))
     assert abs(held_out(claimed)["bias_db"]) > 2.0
+
+
+def test_an_anchor_inside_a_building_is_refused_where_lines_of_sight_count(small_scene):
+    """Both are in one; the log-distance law asks for no line of sight."""
+    measured = walked(0, small_scene)
+    assert small_scene.city.inside(np.array(DEVICE_M)).any()
+    for base in ("twin", "raytrace", "auto"):
+        with pytest.raises(BadInput, match="devices, row 2: anchor 'd0' .*inside a building"):
+            close_loop(measured, small_scene, base)
