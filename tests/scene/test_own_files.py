@@ -128,6 +128,6 @@ def test_a_trace_writes_nothing_outside(small_scene, tmp_path):
     shutil.copytree(small_scene.folder, folder, ignore=shutil.ignore_patterns("cache"))
     (tmp_path / "elsewhere").mkdir()
     (folder / "cache").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(BadInput, match="cache leads out of"):
+    with pytest.raises(BadInput, match="cache.trace-.* leads out of"):
         trace_map(Scene.load(folder), SolverSettings(), tmp_path / "truth.nc")
     assert not list((tmp_path / "elsewhere").iterdir())
