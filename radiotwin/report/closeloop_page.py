@@ -218,13 +218,13 @@ def _value(parameter: dict) -> str:
     if words.is_reference(parameter):
         return "0 (reference)"
     known = parameter.get("determined", True)
-    return words.number(parameter["value"]) if known else "not determined"
+    return words.small(parameter["value"]) if known else "not determined"
 
 
 def _interval(parameter: dict) -> str:
     low, high = parameter["low"], parameter["high"]
     unknown = None in (low, high) or low == high
-    return "–" if unknown else f"{words.number(low)} to {words.number(high)}"
+    return "–" if unknown else f"{words.small(low)} to {words.small(high)}"
 
 
 def _p_value(value: float | None) -> str:

@@ -125,11 +125,18 @@ def number(value: float | None) -> str:
         return "–"
     if isinstance(value, int):
         text = f"{value:,}"
-    elif 0 < abs(value) < 0.1:
+    elif 0.005 <= abs(value) < 0.1:
         text = f"{value:.2g}"
     else:
         text = f"{value:.2f}" if abs(value) < 1000 else f"{value:,.0f}"
-    return text.replace("-", "−")
+    return "0.00" if text == "-0.00" else text.replace("-", "−")
+
+
+def small(value: float | None) -> str:
+    """Return the number of a parameter, which is not rounded to nothing however small it is."""
+    if value is None or not 0 < abs(value) < 0.005:
+        return number(value)
+    return f"{value:.2g}".replace("-", "−")
 
 
 def about(value: float) -> str:

@@ -10,7 +10,14 @@ from matplotlib.figure import Figure
 from radiotwin.cli import loop
 from radiotwin.errors import BadInput
 from radiotwin.report.closeloop_page import write_closeloop_page
-from radiotwin.report.closeloop_words import about, closeloop_summary, drivers, number, rivals
+from radiotwin.report.closeloop_words import (
+    about,
+    closeloop_summary,
+    drivers,
+    number,
+    rivals,
+    small,
+)
 from radiotwin.report.labels import join_names, parameter_label, variable_label
 
 SCORES = {"n": 900, "bias_db": 0.04, "std_db": 3.0, "correlation": 0.9, "rmse_db": 3.0, "mae_db": 2.2, "nll": 2.5}
@@ -124,8 +131,12 @@ def test_what_an_effect_may_be_taken_for_is_said(tmp_path):
 
 @pytest.mark.parametrize("value, text", [(0.0, "0.00"), (0.003, "0.003"), (-0.00214, "−0.0021"), (0.07, "0.07"),
                                          (-6.5, "−6.50"), (12345.6, "12,346"), (3, "3"), (None, "–")])
-def test_no_number_is_rounded_to_nothing(value, text):
-    assert number(value) == text
+def test_no_parameter_is_rounded_to_nothing(value, text):
+    assert small(value) == text
+
+
+def test_an_error_of_almost_nothing_is_0_without_a_sign():
+    assert [number(value) for value in (0.0004, -0.0004, 0.0, -0.0051)] == ["0.00", "0.00", "0.00", "−0.0051"]
 
 
 def test_only_a_level_of_0_db_is_what_others_are_compared_with(tmp_path):
