@@ -160,28 +160,33 @@ def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
     no_rays = np.zeros((0, SECTORS, 3), dtype=np.float32)
     nothing = _Followed(np.zeros(0, dtype=np.int64), np.zeros((0, len(COMPONENTS))), no_rays,
                         no_rays)
-    keys = [_keys(ends_m) for _, ends_m in wanted]
-    known = [_remembered.pop((city, position_m, frequency_hz), nothing)
-             for position_m, _ in wanted]
+    # Sectors of one mast are at one place: what one has followed serves the others.
+    at: dict[_Position, list[np.ndarray]] = {}
+    for position_m, ends_m in wanted:
+        at.setdefault(position_m, []).append(ends_m)
+    known = {position_m: _remembered.pop((city, position_m, frequency_hz), nothing)
+             for position_m in at}
     missing = {}
-    for number, ((position_m, ends_m), ends, old) in enumerate(zip(wanted, keys, known,
-                                                                   strict=True)):
+    for position_m, parts_m in at.items():
+        ends_m, old = np.concatenate(parts_m), known[position_m]
+        ends = _keys(ends_m)
         unknown = np.append(old.ends, -1)[np.searchsorted(old.ends, ends)] != ends
         if unknown.any():
             new, first = np.unique(ends[unknown], return_index=True)
-            missing[number] = new, (position_m, ends_m[unknown][first])
+            missing[position_m] = new, (position_m, ends_m[unknown][first])
     followed = _new_paths(city, [asked for _, asked in missing.values()], frequency_hz)
-    for (number, (new, _)), found in zip(missing.items(), followed, strict=True):
-        old, order = known[number], np.argsort(np.concatenate([known[number].ends, new]))
-        known[number] = _Followed(*(np.concatenate([each, more])[order]
-                                    for each, more in zip(old, (new, *found), strict=True)))
-    for (position_m, _), each in zip(wanted, known, strict=True):
+    for (position_m, (new, _)), found in zip(missing.items(), followed, strict=True):
+        old = known[position_m]
+        order = np.argsort(np.concatenate([old.ends, new]))
+        known[position_m] = _Followed(*(np.concatenate([each, more])[order]
+                                        for each, more in zip(old, (new, *found), strict=True)))
+    for position_m, each in known.items():
         _remembered[city, position_m, frequency_hz] = each
     while len(_remembered) > MIN_REMEMBERED \
             and sum(len(each.ends) for each in _remembered.values()) > MAX_REMEMBERED:
         _remembered.popitem(last=False)
-    return [(each, np.searchsorted(each.ends, ends))
-            for each, ends in zip(known, keys, strict=True)]
+    return [(known[position_m], np.searchsorted(known[position_m].ends, _keys(ends_m)))
+            for position_m, ends_m in wanted]
 
 
 def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],

@@ -7,10 +7,11 @@ import trimesh
 from radiotwin.channel import followed_paths
 from radiotwin.channel.followed_paths import path_gains
 from radiotwin.links import LinkGeometry
+from radiotwin.paths import powers
 from radiotwin.pieces import keep_pieces
 from radiotwin.scene.citymap import CityMap
 
-DEVICES, RECEIVERS = 4, 12
+DEVICES, PLACES, RECEIVERS = 4, 3, 12
 
 
 @pytest.fixture
@@ -52,3 +53,19 @@ def test_what_is_remembered_is_bounded(geometry, monkeypatch):
     monkeypatch.setattr(followed_paths, "MAX_REMEMBERED", 0)
     path_gains(geometry)
     assert len(followed_paths._remembered) == followed_paths.MIN_REMEMBERED
+
+
+def test_sectors_of_one_mast_are_followed_once(geometry, monkeypatch):
+    """Two of the devices stand at one place; each had the other's paths forgotten."""
+    asked, follow = [], powers.path_powers
+
+    def spied(city, device_m, receiver_m, *more):
+        asked.append(len(receiver_m))
+        return follow(city, device_m, receiver_m, *more)
+
+    monkeypatch.setattr(powers, "path_powers", spied)
+    followed_paths._remembered.clear()
+    first = path_gains(geometry)
+    assert len(asked) == PLACES and sum(asked) == len(geometry)
+    np.testing.assert_array_equal(path_gains(geometry), first)
+    assert len(asked) == PLACES, "all is remembered"
