@@ -160,19 +160,20 @@ def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
     no_rays = np.zeros((0, SECTORS, 3), dtype=np.float32)
     nothing = _Followed(np.zeros(0, dtype=np.int64), np.zeros((0, len(COMPONENTS))), no_rays,
                         no_rays)
+    keys = [_keys(ends_m) for _, ends_m in wanted]
     # Sectors of one mast are at one place: what one has followed serves the others.
-    at: dict[_Position, list[np.ndarray]] = {}
-    for position_m, ends_m in wanted:
-        at.setdefault(position_m, []).append(ends_m)
+    at: dict[_Position, list[int]] = {}
+    for number, (position_m, _) in enumerate(wanted):
+        at.setdefault(position_m, []).append(number)
     known = {position_m: _remembered.pop((city, position_m, frequency_hz), nothing)
              for position_m in at}
     missing = {}
-    for position_m, parts_m in at.items():
-        ends_m, old = np.concatenate(parts_m), known[position_m]
-        ends = _keys(ends_m)
+    for position_m, numbers in at.items():
+        ends, old = np.concatenate([keys[number] for number in numbers]), known[position_m]
         unknown = np.append(old.ends, -1)[np.searchsorted(old.ends, ends)] != ends
         if unknown.any():
             new, first = np.unique(ends[unknown], return_index=True)
+            ends_m = np.concatenate([wanted[number][1] for number in numbers])
             missing[position_m] = new, (position_m, ends_m[unknown][first])
     followed = _new_paths(city, [asked for _, asked in missing.values()], frequency_hz)
     for (position_m, (new, _)), found in zip(missing.items(), followed, strict=True):
@@ -185,8 +186,8 @@ def _follow(city: CityMap, wanted: list[tuple[_Position, np.ndarray]],
     while len(_remembered) > MIN_REMEMBERED \
             and sum(len(each.ends) for each in _remembered.values()) > MAX_REMEMBERED:
         _remembered.popitem(last=False)
-    return [(known[position_m], np.searchsorted(known[position_m].ends, _keys(ends_m)))
-            for position_m, ends_m in wanted]
+    return [(known[position_m], np.searchsorted(known[position_m].ends, ends))
+            for (position_m, _), ends in zip(wanted, keys, strict=True)]
 
 
 def _new_paths(city: CityMap, asked: list[tuple[_Position, np.ndarray]],

@@ -128,7 +128,7 @@ def with_defaults(transmitters: list[Transmitter], scene: Scene, tx_power_dbm: f
         BadInput: a power that nobody declared.
     """
     radio = scene.config.radio
-    if tx_power_dbm is None and radio.tx_power_dbm != type(radio)().tx_power_dbm:
+    if tx_power_dbm is None and radio.declares_power:
         tx_power_dbm = radio.tx_power_dbm
     unknown = [each.name for each in transmitters if each.tx_power_dbm is None]
     if unknown and tx_power_dbm is None:

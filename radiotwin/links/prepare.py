@@ -18,7 +18,6 @@ from radiotwin.links.checks import (
     outside_map,
     receiver_notes,
     refuse_empty_levels,
-    refuse_misplaced_anchors,
     require_one_frame,
     unheard_devices,
     unmapped_ends,
@@ -49,8 +48,7 @@ def join_links(measurements: Measurements, scene: Scene) -> LinkData:
         n links; positions of unknown devices are NaN in x and y, whatever the file gives.
 
     Raises:
-        BadInput: measurements and scene are in different frames, or an anchor is far from the
-            receivers or inside a building.
+        BadInput: measurements and scene are in different frames.
     """
     require_one_frame(measurements, scene)
     device_m = measurements.device_m.copy()
@@ -60,11 +58,9 @@ def join_links(measurements: Measurements, scene: Scene) -> LinkData:
     if outside.any():
         notes.append(f"{outside.sum():,} of {len(outside):,} links have their receiver outside the "
                      "3D map")
-    links = _link_data(measurements, measurements.table.reset_index(drop=True), scene,
-                       measurements.level_db, receiver_m, device_m, measurements.device_index,
-                       np.arange(len(device_m)), notes)
-    refuse_misplaced_anchors(links, scene)
-    return links
+    return _link_data(measurements, measurements.table.reset_index(drop=True), scene,
+                      measurements.level_db, receiver_m, device_m, measurements.device_index,
+                      np.arange(len(device_m)), notes)
 
 
 def prepare_links(measurements: Measurements, scene: Scene | None,

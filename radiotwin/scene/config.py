@@ -73,6 +73,11 @@ class RadioConfig(Table):
                 f"{self.tx_power_dbm:g}, or nothing is ever detected")
         return self
 
+    @property
+    def declares_power(self) -> bool:
+        """Whether the transmit power is another than the default, which nobody may have meant."""
+        return self.tx_power_dbm != type(self)().tx_power_dbm
+
 
 class Extent(Table):
     """The part of the plane that UAVs fly over and devices are searched in."""

@@ -84,6 +84,7 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
     _check_heights(measurements)
     settings = LocalizeSettings(allow_indoor=allow_indoor)
     links = join_links(measurements, scene)
+    refuse_misplaced_anchors(links, scene)
     _warn(links.notes)
     twin = fit_links(links, scene, channel, seed, start, settings)
     twin.provenance.update(flights=flights, seed=seed)

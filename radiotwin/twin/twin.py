@@ -280,7 +280,7 @@ class Twin(Summarised):
         if self.level == "gain_db":
             return 0.0
         radio = scene.config.radio
-        if radio.tx_power_dbm == type(radio)().tx_power_dbm:
+        if not radio.declares_power:
             warnings.warn(f"the twin's levels are received powers, and gains are what they are "
                           f"above the transmit power: the default of "
                           f"{scene.folder / 'scene.toml'} is taken, {radio.tx_power_dbm:g} dBm. If "
