@@ -1,4 +1,4 @@
-"""A hash of values by their content: what two runs agree on, wherever they run."""
+"""Hash of values by their content, the same in every process and on every machine."""
 
 from __future__ import annotations
 

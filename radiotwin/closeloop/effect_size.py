@@ -1,4 +1,4 @@
-"""How much of an effect is there, in decibels, as links say that took no part in finding it.
+"""Size of an effect in decibels, by links that took no part in finding it.
 
 Of each held-out link: what the effect changes in the prediction, once all else has been fitted
 again without it, against what the link lacks without it. The slope of that regression is 1 where

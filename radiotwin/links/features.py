@@ -1,4 +1,4 @@
-"""Features of a link for a regression without physics: its ends, and what lies between."""
+"""Inputs of a regression without physics: position, geometry and angles of a link."""
 
 from __future__ import annotations
 
