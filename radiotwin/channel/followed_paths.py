@@ -135,13 +135,13 @@ def _by_device(geometry: LinkGeometry) -> Iterator[tuple[np.ndarray, _Followed, 
     batch = np.cumsum(count) // BATCH_LINKS
     for number in np.unique(batch):
         rows = [np.flatnonzero(geometry.device == device) for device in devices[batch == number]]
-        wanted = [(_position_m(geometry, row), geometry.receiver_m[mine])
+        wanted = [(followed_from_m(geometry, row), geometry.receiver_m[mine])
                   for row, mine in zip(first[batch == number], rows, strict=True)]
         yield from ((mine, *found) for mine, found in zip(
             rows, _follow(city, wanted, geometry.frequency_hz), strict=True))
 
 
-def _position_m(geometry: LinkGeometry, row: int) -> _Position:
+def followed_from_m(geometry: LinkGeometry, row: int) -> _Position:
     """Return where paths of the device of a link are followed from [m]."""
     assert geometry.city is not None
     position_m = geometry.device_m[row]

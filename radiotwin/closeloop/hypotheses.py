@@ -207,6 +207,9 @@ def _slopes(model: FoldModel, fit: FitResult) -> Columns:
     variation = applied.effect.variation(applied.params)
     if variation is None:
         return Columns(np.zeros((int(model.train.sum()), 0)), np.zeros(0))
+    here = variation.params(variation.values)
+    if here != applied.params:  # it varies with quicker levels than it has
+        model = model.with_effects([*model.effects[:-1], model.apply(applied.effect, here)])
     mean_db, slopes_db = model.training.predict(fit).mean_db, []
     # Of paths those that folds will ask for, too.
     share = NEAR_SHARE if variation.follows_paths else STEP_SHARE

@@ -175,6 +175,10 @@ class Effect(ABC):
 
         return Variation(values, steps, low, high, changed)
 
+    def reach(self, links: LinkData, params: Any) -> np.ndarray | None:
+        """Return which (n,) links similar parameters may act on; None for any."""
+        return None
+
     def exact(self, params: Any) -> Any | None:
         """Return the same, asking the channel for exact levels; None where nothing changes."""
         return None

@@ -180,9 +180,12 @@ def _best_addition(model: FoldModel, effect: Effect, result: FitResult,
 
 def _best_along_paths(model: FoldModel, result: FitResult,
                       without: FitResult) -> tuple[FoldModel, FitResult]:
-    best = with_exact_levels(model, result)
+    best = with_exact_levels(*_over_known_paths(model, result))
     if not _is_exact(best[0]) and model.channel.follows_paths:
         best = _exactly_beside(*best)
+    variation = best[0].effects[-1].effect.variation(best[0].effects[-1].params)
+    if variation is None or not variation.follows_paths:
+        return best
     before = without.objective
     for _ in range(MAX_EXACT_DESCENTS):
         if not _is_exact(best[0]) or before - best[1].objective < MIN_EXACT_GAIN_NATS:
@@ -234,6 +237,33 @@ def _exactly_beside(model: FoldModel, result: FitResult) -> tuple[FoldModel, Fit
     return beside if beside[1].objective < result.objective else (model, result)
 
 
+def _over_known_paths(model: FoldModel, result: FitResult,
+                      is_near: bool = False) -> tuple[FoldModel, FitResult]:
+    """Search for exact parameters of the last effect with levels that are nearly exact.
+
+    Those of known paths (`missing_obstacle`), of which a value takes milliseconds.
+
+    Args:
+        model: that is searched from; returned where it is better, or the effect knows none.
+        result: its fit.
+        is_near: whether it is known to be near the best.
+    """
+    last = model.effects[-1]
+    exact = last.effect.exact(last.params) if model.channel.follows_paths else None
+    variation = None if exact is None else last.effect.variation(exact)
+    if variation is None or variation.follows_paths:
+        return model, result
+
+    def fitted(params: Any) -> tuple[FoldModel, FitResult]:
+        tried = model.with_effects([*model.effects[:-1], model.apply(last.effect, params)])
+        return tried, tried.fit(result)
+
+    found, _ = refine(*fitted(variation.params(variation.values)), descents=1,
+                      anywhere=not is_near)
+    exactly = fitted(last.effect.exact(found.effects[-1].params))
+    return exactly if exactly[1].objective < result.objective else (model, result)
+
+
 def _near(model: FoldModel, effect: Effect, result: FitResult,
           like: Any) -> tuple[FoldModel, FitResult]:
     """Return the best fit to a fold around the parameters that were found on all links.
@@ -248,6 +278,8 @@ def _near(model: FoldModel, effect: Effect, result: FitResult,
     variation, best = effect.variation(like), fitted(like)
     if variation is None:
         return best
+    if not variation.follows_paths:
+        return _over_known_paths(*best, is_near=True)
     start, numbers = best[1].objective, variation.values.copy()
     for number, step in enumerate(variation.steps):
         least = start

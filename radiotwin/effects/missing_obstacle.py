@@ -61,6 +61,7 @@ AROUND_M = 3.0  # outlines are off by metres: a box along a wall is a wall that 
 GRID, MIN_BUILT_M = 9, 2.0  # points along each side that are looked at, and what is built there
 REACH_M, MAX_LINKS = 30.0, 3000  # links so near to a centre, and how many, that shapes are tried on
 NEAR_M = 25.0  # links whose ground tracks stay farther away keep their level, also exactly
+TURNS_DEG = (-20.0, 20.0)  # from where quick levels end: of a nearly square box they tell little
 LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)  # of an obstructed link, equally likely
 MAX_LOSS_DB = 50.0  # that a box causes
 HEIGHT_SCALE_M = 20.0  # of Rayleigh distributed heights: dense urban, ITU-R P.1410-6, Table 1
@@ -84,12 +85,14 @@ class MissingObstacle(GainEffect):
         scattered_db: Decibels = Field(
             0.0, description="Power in the shadow, relative to the channel without line of sight.")
         exact: bool = Field(False, description="Whether paths are followed over a map with it.")
+        known_paths: bool = Field(False, description=(
+            "Whether of the paths over the map without it those count that it does not block."))
         by_class: bool = Field(False, description=(
             "Whether the shadow has the level of the class without line of sight, not what is "
             "left on the other paths."))
 
     def __init__(self) -> None:
-        self._shadows = LinkCache()
+        self._shadows, self._known = LinkCache(), LinkCache()
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
@@ -157,12 +160,13 @@ class MissingObstacle(GainEffect):
         offset_db = np.zeros(len(links))
         if params.exact:
             city = city_of(links, self.name)
-            rows = np.flatnonzero(near_box(params.box, links.device_m[links.device],
-                                           links.receiver_m, NEAR_M))
+            rows = np.flatnonzero(self._near(links, params.box))
             mine = links.select(rows)
             with_box = mine.with_city(_with_box(city, params.box))
             offset_db[rows] = level_at(with_box, True) - level_at(mine, True)
             return Term.of_offset(offset_db)
+        if params.known_paths:
+            return Term.of_offset(self._past_db(links, params.box, level_at))
         return Term.of_offset(self._offsets_db(links, params.box, (params.scattered_db,),
                                                params.by_class, level_at)[0])
 
@@ -182,6 +186,41 @@ class MissingObstacle(GainEffect):
                                           scattered, speed_of_light / links.frequency_hz)
         return offset_db
 
+    def _past_db(self, links: LinkData, box: Box, level_at: LevelAt) -> np.ndarray:
+        """Return what a box adds to links (n,) past which their known paths go [dB]."""
+        from radiotwin.channel.known_paths import KnownPaths, UprightBox  # late: numba is large
+
+        city, rows = city_of(links, self.name), np.flatnonzero(self._near(links, box))
+        known = self._known.get(links, "paths", lambda: KnownPaths(links.geometry, city))
+        level_db = self._known.get(links, (level_at, "levels"),
+                                   lambda: np.full(len(links), np.nan))
+        unknown = rows[np.isnan(level_db[rows])]
+        level_db[unknown] = level_at(links.select(unknown), True)
+        top_m = float(city.ground_height_m(*box[:2])) + box.height_m
+        power = known.past(UprightBox(box[:2], (box.length_m / 2, box.width_m / 2),
+                                      float(np.radians(box.turn_deg)), top_m), rows)
+        before = power.direct + power.others
+        # Diffuse power, and what a channel adds to that of paths, passes any box.
+        rest = np.maximum(10 ** (level_db[rows] / 10) - before, 0.0)
+        crossing = cross(box, *ends_above(links, box[:2], rows))
+        crosses = np.isfinite(crossing.left_m)
+        direct = power.direct.copy()
+        direct[crosses] *= 10 ** (_gain_db(Crossing(*(value[crosses] for value in crossing)), 0.0,
+                                           speed_of_light / links.frequency_hz) / 10)
+        offset_db = np.zeros(len(links))
+        share = (direct + power.others_past + rest) / np.maximum(before + rest, 1e-300)
+        offset_db[rows] = 10 * np.log10(np.clip(share, 10 ** (-MAX_LOSS_DB / 10), 1.0))
+        return offset_db
+
+    def _near(self, links: LinkData, box: Box) -> np.ndarray:
+        """Return whether (n,) links may have other levels along paths because of a box."""
+        return near_box(box, links.device_m[links.device], links.receiver_m, NEAR_M)
+
+    @override
+    def reach(self, links: LinkData, params: Params) -> np.ndarray | None:
+        along_paths = params.exact or params.known_paths
+        return self._near(links, params.box) if along_paths else None
+
     def _shadow_db(self, links: LinkData, level_at: LevelAt, by_class: bool) -> np.ndarray:
         """Return what links (n,) lose if something hides the other end [dB]; see `Params`."""
         def derive() -> np.ndarray:
@@ -191,24 +230,30 @@ class MissingObstacle(GainEffect):
 
     @override
     def exact(self, params: Params) -> Params:
-        return params.model_copy(update={"exact": True, "by_class": False})
+        return params.model_copy(update={"exact": True, "known_paths": False, "by_class": False})
 
     @override
     def variation(self, params: Params) -> Variation:
         x_m, y_m = params.box[:2]
-        # With exact levels, what reaches the shadow is on paths that are followed.
-        count = len(params.box) + (not params.exact)
+        # To follow paths for each value takes minutes, and known ones tell nearly the same; what
+        # reaches the shadow is on them.
+        along_paths = params.exact or params.known_paths
+        count = len(params.box) + (not along_paths)
 
         def changed(numbers: np.ndarray) -> MissingObstacle.Params:
             values = [*numbers.tolist(), params.scattered_db][:len(params.box) + 1]
-            return params.model_copy(update={"box": Box(*values[:-1]), "scattered_db": values[-1]})
+            return params.model_copy(update={
+                "box": Box(*values[:-1]), "scattered_db": values[-1], "exact": False,
+                "known_paths": along_paths})
 
+        values = np.array([*params.box, params.scattered_db])[:count]
+        turned = [np.array([*box, params.scattered_db])[:count]
+                  for box in (params.box.turned_by(turn_deg) for turn_deg in TURNS_DEG)]
         return Variation(
-            np.array([*params.box, params.scattered_db])[:count],
-            np.array([6.0, 6.0, 8.0, 8.0, 8.0, 20.0, 4.0])[:count],
+            values, np.array([6.0, 6.0, 8.0, 8.0, 8.0, 20.0, 4.0])[:count],
             np.array([x_m - 60, y_m - 60, 4.0, 4.0, 3.0, -90.0, -20.0])[:count],
             np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0, 10.0])[:count], changed,
-            follows_paths=params.exact)
+            starts=turned if along_paths else ())
 
     @override
     def neg_log_prior(self, params: Params) -> float:

@@ -174,6 +174,7 @@ class Variation:
         follows_paths: whether each value is judged on paths that are followed anew. That is slow
             and rough, so folds search on a grid (`NEAR_SHARE`), and what lies between its points
             is uncertain.
+        starts: further numbers (r,) that a search of all links begins at.
     """
 
     values: np.ndarray
@@ -183,6 +184,7 @@ class Variation:
     params: Callable[[np.ndarray], Any]
     members: list[np.ndarray] | None = None
     follows_paths: bool = False
+    starts: Sequence[np.ndarray] = ()
 
     @property
     def resolution_sd(self) -> np.ndarray:

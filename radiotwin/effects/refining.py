@@ -24,7 +24,8 @@ EXTREMES_DB = (-200.0, 100.0)  # levels at which whatever a receiver does to the
 
 
 def refine(model: FoldModel, result: FitResult, evaluations: int = EVALUATIONS,
-            descents: int = DESCENTS, max_links: int = MAX_LINKS) -> tuple[FoldModel, FitResult]:
+            descents: int = DESCENTS, max_links: int = MAX_LINKS,
+            anywhere: bool = False) -> tuple[FoldModel, FitResult]:
     """Vary the last effect's parameters for a better fit to the training links.
 
     Args:
@@ -33,6 +34,7 @@ def refine(model: FoldModel, result: FitResult, evaluations: int = EVALUATIONS,
         evaluations: of the objective for each number, in one descent.
         descents: one after the other.
         max_links: that the objective is of.
+        anywhere: whether the search also begins at `Variation.starts`.
     """
     last = model.effects[-1]
     variation = last.effect.variation(last.params)
@@ -40,8 +42,10 @@ def refine(model: FoldModel, result: FitResult, evaluations: int = EVALUATIONS,
         return model, result
     if variation.members is not None:
         return _refine_members(model, result, last, variation)
-    rows = subsample(np.flatnonzero(model.train), max_links)
-    design_effect = model.view(result).design_effect * len(rows) / max(model.train.sum(), 1)
+    train, near = model.train, last.effect.reach(model.links, last.params)
+    train = train if near is None else train & near
+    rows = subsample(np.flatnonzero(train), max_links)
+    design_effect = model.view(result).design_effect * len(rows) / max(train.sum(), 1)
     small = model.restrict(rows, model.effects[:-1])
     rest = small.regression()
     # What has no coefficients of its own moves those of the others little: they stay meanwhile.
@@ -64,6 +68,10 @@ def refine(model: FoldModel, result: FitResult, evaluations: int = EVALUATIONS,
                      + OUTSIDE_NATS * outside)
 
     numbers = variation.values
+    if anywhere:
+        found = [_descend(objective, start, variation.steps, evaluations)
+                 for start in (numbers, *variation.starts)]
+        numbers = min(found, key=objective)
     for _ in range(descents):
         numbers = _descend(objective, numbers, variation.steps, evaluations)
     return _better(model, result, last, variation, numbers)

@@ -1,14 +1,16 @@
 """Power of the paths between devices and receivers."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
-from radiotwin.paths.candidates import candidate_search
+from radiotwin.paths.candidates import CandidateSearch, candidate_search
 from radiotwin.paths.clearance import clear_paths
-from radiotwin.paths.coefficients import slabs_of
+from radiotwin.paths.coefficients import Slabs, slabs_of
 from radiotwin.paths.fields import AVERAGE, VERTICAL, path_gains
 from radiotwin.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, find_paths
 from radiotwin.paths.shooting import DEVICE_RAYS
@@ -21,7 +23,24 @@ POLARISATIONS = {"average": AVERAGE, "vertical": VERTICAL}
 WEDGES = {"luebbers": LUEBBERS, "sionna": SIONNA}
 PATH_CHUNK = 50_000  # paths at once: about 30 MB
 DARK_CHUNK = 100  # receivers at once that only two edges may reach
+DEPTH = 4  # interactions of a path at most
 SECTORS = 24  # of azimuth, 15 degrees each
+
+
+class PathsWithPoints(NamedTuple):
+    """Paths from one device.
+
+    Attributes:
+        receiver: (p,) row of the receiver.
+        power: (p,) linear gain between isotropic antennas.
+        points_m: (p, m, 3) device, points of interaction, receiver [m]; what follows means nothing.
+        points: (p,) number of these points.
+    """
+
+    receiver: np.ndarray
+    power: np.ndarray
+    points_m: np.ndarray
+    points: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +88,7 @@ COMPONENTS = tuple(field.name for field in fields(PathPowers))[:-2]
 
 def path_powers(
     city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, device: np.ndarray,
-    frequency_hz: float, polarisation: str = "average", depth: int = 4,
+    frequency_hz: float, polarisation: str = "average", depth: int = DEPTH,
     wedge: str = "sionna", rays: int = DEVICE_RAYS,
 ) -> PathPowers:
     """Follow the paths from devices to receivers and add up their powers.
@@ -118,15 +137,9 @@ def path_powers(
             links = np.flatnonzero(device == row)
             candidates = search.candidates(device_m[row], rays)
             kind = _kinds(candidates, search.is_ground)
-            cursor, ends_m = 0, receiver_m[links]
-            while cursor < len(candidates.edge) * len(links):
-                found, cursor = find_paths(search.surfaces, candidates, device_m[row], ends_m,
-                                           cursor, buffer)
-                clear = clear_paths(city, search.surfaces, candidates, buffer, found)
-                gain = np.empty(len(clear))
-                path_gains(search.surfaces, candidates, wave_number, slabs,
-                           POLARISATIONS[polarisation], WEDGES[wedge], buffer, clear,
-                           gain)
+            for clear, gain in _clear_paths(city, search, candidates, device_m[row],
+                                            receiver_m[links], buffer, wave_number, slabs,
+                                            POLARISATIONS[polarisation], WEDGES[wedge]):
                 link, points_m = links[buffer.receiver[clear]], buffer.points_m[clear]
                 last, path = buffer.count[clear] - 1, np.arange(len(clear))
                 np.add.at(powers, (kind[buffer.candidate[clear]], link), gain)
@@ -147,6 +160,51 @@ def path_powers(
                 _add_rays(arrivals, link, -legs_m[:, 2], gain)
             advance(1)
     return PathPowers(*powers, departures, arrivals)  # type: ignore[call-arg]  # a row a kind
+
+
+def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray,
+                      frequency_hz: float) -> PathsWithPoints:
+    """Follow the paths of vertical antennas as `path_powers` does, and return each by itself.
+
+    Without the direct ones, and those over two edges.
+
+    Args:
+        city: 3D map.
+        device_m: (3,) position [m].
+        receiver_m: (n, 3) positions [m].
+        frequency_hz: carrier frequency [Hz].
+    """
+    search = candidate_search(city, DEPTH)
+    buffer = PathBuffer.allocate(PATH_CHUNK)
+    slabs = slabs_of((*city.materials, city.ground_material), frequency_hz)
+    no_points = np.zeros((0, *buffer.points_m.shape[1:]), dtype=np.float32)
+    no_rows = np.zeros(0, dtype=int)
+    parts = [PathsWithPoints(no_rows, np.zeros(0), no_points, no_rows)]
+    for clear, gain in _clear_paths(
+            city, search, search.candidates(device_m), device_m,
+            np.ascontiguousarray(receiver_m, dtype=float), buffer,
+            2 * np.pi * frequency_hz / speed_of_light, slabs, VERTICAL, WEDGES["sionna"]):
+        parts.append(PathsWithPoints(buffer.receiver[clear], gain,
+                                     buffer.points_m[clear].astype(np.float32),
+                                     buffer.count[clear]))
+    return PathsWithPoints(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+def _clear_paths(
+    city: CityMap, search: CandidateSearch, candidates: Candidates, device_m: np.ndarray,
+    receiver_m: np.ndarray, buffer: PathBuffer, wave_number: float, slabs: Slabs,
+    polarisation: int, wedge: int,
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield rows (p,) of a buffer that hold paths which nothing blocks, and their gains (p,)."""
+    cursor = 0
+    while cursor < len(candidates.edge) * len(receiver_m):
+        found, cursor = find_paths(search.surfaces, candidates, device_m, receiver_m, cursor,
+                                   buffer)
+        clear = clear_paths(city, search.surfaces, candidates, buffer, found)
+        gain = np.empty(len(clear))
+        path_gains(search.surfaces, candidates, wave_number, slabs, polarisation, wedge, buffer,
+                   clear, gain)
+        yield clear, gain
 
 
 def _add_rays(sums: np.ndarray, link: np.ndarray, ray_m: np.ndarray, power: np.ndarray) -> None:

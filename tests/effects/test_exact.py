@@ -58,7 +58,9 @@ def test_a_missing_building_is_in_the_map_that_the_channel_predicts_over(links):
     np.testing.assert_allclose(effect.term(links, params, channel).offset_db, [-30.0, 0.0], atol=0.01)
     assert channel.links == 2
     variation = effect.variation(params)
-    assert variation.params(variation.values) == params  # refined on what the channel says of each box
+    known = params.model_copy(update={"exact": False, "known_paths": True})
+    assert variation.params(variation.values) == known  # refined with paths that are followed once
+    assert effect.exact(known) == params
     assert len(variation.values) == 6 and len(effect.variation(params.model_copy(update={"exact": False})).values) == 7
 
 
