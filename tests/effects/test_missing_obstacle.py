@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from radiotwin.channel.followed_paths import path_gains
+from radiotwin.channel.image_paths import ImagePaths
 from radiotwin.effects.boxes import Box
+from radiotwin.effects.fitting import along_paths
+from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.foliage import Foliage
 from radiotwin.effects.missing_obstacle import SHAPES, MissingObstacle
 from radiotwin.scene.citymap import CityMap
@@ -139,3 +143,46 @@ def test_a_search_may_stay_where_it_begins():
         box = Box(0.0, 0.0, length_m, width_m, 20.0, turn_deg)
         variation = effect.variation(effect.Params(box=box))
         assert ((variation.low <= variation.values) & (variation.values <= variation.high)).all()
+
+
+def test_past_known_paths_is_what_the_box_does_not_block(make_links):
+    """A high box hides two receivers; of one most power is diffuse, nine times that of its straight line."""
+    house = trimesh.creation.box(bounds=[[400, 400, 0], [410, 410, 10]])
+    receiver_m = np.array([[60.0, 0, 5], [60.0, 8, 5], [0.0, 60, 5]])
+    links = make_links([[0.0, 0, 5]], receiver_m, city=CityMap(house.vertices, house.faces))
+
+    def level_at(of, exact=False):
+        assert exact
+        wavelength_m = 299792458 / of.frequency_hz
+        line = (wavelength_m / (4 * np.pi * np.linalg.norm(of.receiver_m - [0.0, 0, 5], axis=1)))**2
+        return 10 * np.log10(np.where(of.receiver_m[:, 1] == 8, 10.0, 1.3) * line)
+
+    params = MissingObstacle.Params(box=Box(30.0, 0.0, 10.0, 60.0, 200.0, 0.0), known_paths=True)
+    lost_db = MissingObstacle().term(links, params, level_at).offset_db
+    assert lost_db[0] < -5  # a third of the power of the straight line, in part by way of the ground, is left at most
+    assert 10 * np.log10(8 / 10) - 0.1 < lost_db[1] < 10 * np.log10(9 / 10) + 0.1
+    assert lost_db[2] == pytest.approx(0, abs=1e-3)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_along_paths_a_box_is_found_that_quick_levels_turned(make_links, seed):
+    """From 17° and some metres off a search finds most of what the true box explains, and that in a few seconds."""
+    true, rng = Box(60.0, 10.0, 22.0, 14.0, 30.0, 35.0), np.random.default_rng(seed)
+    house = trimesh.creation.box(bounds=[[-60, 60, 0], [180, 70, 25]])
+    city = CityMap(house.vertices, house.faces)
+    receiver_m = np.column_stack([rng.uniform(70, 200, 500), rng.uniform(-90, 55, 500), rng.uniform(5, 35, 500)])
+    links = make_links([[0.0, 0, 2.0], [20.0, -60, 2.0], [110.0, -70, 2.0]], receiver_m, city=city)
+    effect = MissingObstacle()
+    there = links.with_city(effect.corrected_map(city, effect.Params(box=true)))
+    level_db = 10 * np.log10(path_gains(there.geometry) + 1e-13) + rng.normal(0, 1.0, len(links))
+    channel = ImagePaths().fit(links.geometry, level_db, None)
+    model = FoldModel.build(replace(links, level_db=level_db), channel, 5.0)
+    def fitted(box):
+        found = model.with_effects([model.apply(effect, effect.Params(box=box, exact=True))])
+        return found, found.fit()
+
+    without, start = model.fit(), fitted(Box(62.0, 7.0, 18.0, 18.0, 26.0, 52.0))
+    found, fit = along_paths(*start, without)
+    gain, most = without.objective - fit.objective, without.objective - fitted(true)[1].objective
+    assert found.effects[-1].params.exact
+    assert gain > 0.8 * most > 0.8 * 1000 and without.objective - start[1].objective < 0.65 * most
