@@ -14,6 +14,7 @@ from radiotwin.links import LinkGeometry
 from radiotwin.paths.powers import paths_with_points
 from radiotwin.scene.citymap import CityMap
 
+WEAKEST = 1e-3  # of a link's strongest path: most are weaker, and together they carry little
 MIN_STEP_M = 1e-9  # a shorter leg along an axis is none along it
 
 
@@ -42,7 +43,7 @@ class Power(NamedTuple):
 
 
 class KnownPaths:
-    """The paths of n links over a map, each link's followed when it is first asked for."""
+    """The stronger paths of n links over a map, each link's followed when it is first asked for."""
 
     def __init__(self, geometry: LinkGeometry, city: CityMap) -> None:
         self._geometry, self._city = geometry, city
@@ -52,7 +53,7 @@ class KnownPaths:
 
     def past(self, box: UprightBox, rows: np.ndarray) -> Power:
         """Return the power of some links (r,), without a box and past one."""
-        self._follow(rows[~self._is_followed[rows]])
+        self.follow(rows)
         if not self._paths:
             nothing = np.zeros(len(rows))
             return Power(self._direct[rows], nothing, nothing)
@@ -61,16 +62,23 @@ class KnownPaths:
         return Power(self._direct[rows], np.bincount(link, power, n)[rows],
                      np.bincount(link, power_past, n)[rows])
 
-    def _follow(self, rows: np.ndarray) -> None:
+    def follow(self, rows: np.ndarray) -> None:
+        """Follow the paths of links (r,), of which some may be known."""
         geometry, parts = self._geometry, [self._paths] if self._paths else []
+        rows = rows[~self._is_followed[rows]]
+        if not len(rows):
+            return
         for device in np.unique(geometry.device[rows]):
             mine = rows[geometry.device[rows] == device]
             found = paths_with_points(
                 self._city, np.array(followed_from_m(geometry, int(mine[0]))),
                 geometry.receiver_m[mine], geometry.frequency_hz)
-            parts.append((mine[found.receiver], found.power, found.points_m, found.points))
-        if parts:
-            self._paths = tuple(np.concatenate(each) for each in zip(*parts, strict=True))
+            strongest = np.zeros(len(mine))
+            np.maximum.at(strongest, found.receiver, found.power)
+            kept = found.power > WEAKEST * strongest[found.receiver]
+            parts.append((mine[found.receiver[kept]], found.power[kept], found.points_m[kept],
+                          found.points[kept]))
+        self._paths = tuple(np.concatenate(each) for each in zip(*parts, strict=True))
         followed = geometry.select(rows)
         self._direct[rows] = np.where(followed.los, free_space(followed), 0.0)
         self._is_followed[rows] = True
@@ -82,12 +90,16 @@ def _blocked(points_m: np.ndarray, count: np.ndarray, centre_m: tuple[float, flo
     """Return whether a leg of each path (p,) goes through a box."""
     out = np.zeros(len(count), dtype=np.bool_)
     cosine, sine = np.cos(turn_rad), np.sin(turn_rad)
+    reach_m = np.hypot(half_m[0], half_m[1])
     for path in range(len(count)):
         for leg in range(count[path] - 1):
             x, y = points_m[path, leg, 0] - centre_m[0], points_m[path, leg, 1] - centre_m[1]
-            dx = points_m[path, leg + 1, 0] - centre_m[0] - x
-            dy = points_m[path, leg + 1, 1] - centre_m[1] - y
-            z = points_m[path, leg, 2]
+            to_x = points_m[path, leg + 1, 0] - centre_m[0]
+            to_y = points_m[path, leg + 1, 1] - centre_m[1]
+            if min(x, to_x) > reach_m or max(x, to_x) < -reach_m or min(y, to_y) > reach_m \
+                    or max(y, to_y) < -reach_m:  # as nearly all
+                continue
+            z, dx, dy = points_m[path, leg, 2], to_x - x, to_y - y
             enter, leave = _within(cosine * x + sine * y, cosine * dx + sine * dy, -half_m[0],
                                    half_m[0], 0.0, 1.0)
             enter, leave = _within(cosine * y - sine * x, cosine * dy - sine * dx, -half_m[1],

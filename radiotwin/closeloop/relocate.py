@@ -20,7 +20,6 @@ from radiotwin.inference.censored_regression import FitResult
 from radiotwin.links import LinkData
 from radiotwin.localize import position_log_likelihood
 from radiotwin.localize.estimate import TwinDevice
-from radiotwin.scene.citymap import CityMap
 
 RADII_M = (2.0, 5.0, 10.0, 20.0, 40.0, 80.0)  # of circles around a position, that are tried
 DIRECTIONS = 12
@@ -56,7 +55,7 @@ def relocate_devices(model: CrossValidatedModel, links: LinkData, base: Base
         moved = [_relocated(each, fit, unknown)
                  for each, fit in zip(model.models, model.fits, strict=True)]
         twin = replace(twin, devices=_with_positions(twin.devices, moved[0].links.device_m))
-    elif _corrected_map(model.whole) is not links.city:
+    elif model.whole.corrected_map is not links.city:
         located = [_located_anew(model.whole, links, np.ones(len(links), bool), base)]
         if not _is_moved(model.whole, located[0][0]):
             return model  # which takes folds minutes, too
@@ -100,14 +99,6 @@ def _with_positions(devices: list[TwinDevice], device_m: np.ndarray) -> list[Twi
             for each, (x_m, y_m, _) in zip(devices, device_m, strict=True)]
 
 
-def _corrected_map(model: FoldModel) -> CityMap | None:
-    """Return the map with what effects add to it and take from it."""
-    city = model.links.city
-    for each in model.effects:
-        city = each.effect.corrected_map(city, each.params) if city is not None else None
-    return city
-
-
 def _located_anew(model: FoldModel, links: LinkData, mine: np.ndarray,
                   base: Base) -> tuple[FoldModel, list[TwinDevice]]:
     """Return one model with its devices where its base, over the corrected map, has them.
@@ -120,7 +111,7 @@ def _located_anew(model: FoldModel, links: LinkData, mine: np.ndarray,
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the base has warned already
-        twin = base.fit(links.with_city(_corrected_map(model)).select(mine))
+        twin = base.fit(links.with_city(model.corrected_map).select(mine))
     moved = FoldModel.build(model.links, model.channel, model.dof, device_m=base.device_m(twin),
                             train=mine)
     return moved.with_effects([moved.apply(each.effect, each.params) for each in model.effects]), \

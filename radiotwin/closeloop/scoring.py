@@ -116,6 +116,8 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
     if whole is None:
         return replace(refused, reason="nothing in the residual looks like it")
     links = model.whole.links.select(model.whole.usable)
+    if model.whole.corrected_map is not links.city:  # what was found is part of what is known
+        links = links.with_city(model.whole.corrected_map)
     why = effect.contradicted(whole[0].effects[-1].params, links)
     if why:
         return replace(refused, reason=why)

@@ -26,6 +26,7 @@ from radiotwin.inference.censored_regression import (
 )
 from radiotwin.inference.student import NO_LOSSES, Losses
 from radiotwin.links import LinkData
+from radiotwin.scene.citymap import CityMap
 
 VIEWS = 8  # that are remembered: of a model and its folds, which every candidate asks for
 
@@ -120,6 +121,14 @@ class FoldModel:
     def effect_names(self) -> frozenset[str]:
         """Names of the effects found so far, without those that were declared."""
         return frozenset(each.effect.name for each in self.effects if not each.effect.is_declared)
+
+    @property
+    def corrected_map(self) -> CityMap | None:
+        """The map with what effects add to it and take from it; None without a map."""
+        city = self.links.city
+        for each in self.effects:
+            city = None if city is None else each.effect.corrected_map(city, each.params)
+        return city
 
     def apply(self, effect: Effect, params: Any) -> AppliedEffect:
         """Return an effect on these links."""

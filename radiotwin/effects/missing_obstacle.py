@@ -61,6 +61,7 @@ AROUND_M = 3.0  # outlines are off by metres: a box along a wall is a wall that 
 GRID, MIN_BUILT_M = 9, 2.0  # points along each side that are looked at, and what is built there
 REACH_M, MAX_LINKS = 30.0, 3000  # links so near to a centre, and how many, that shapes are tried on
 NEAR_M = 25.0  # links whose ground tracks stay farther away keep their level, also exactly
+MARGIN_M = 10.0  # and those within so much more are followed at once: boxes are tried side by side
 TURNS_DEG = (-20.0, 20.0)  # from where quick levels end: of a nearly square box they tell little
 LOSSES_DB = (8.0, 12.0, 16.0, 20.0, 25.0, 30.0)  # of an obstructed link, equally likely
 MAX_LOSS_DB = 50.0  # that a box causes
@@ -194,8 +195,10 @@ class MissingObstacle(GainEffect):
         known = self._known.get(links, "paths", lambda: KnownPaths(links.geometry, city))
         level_db = self._known.get(links, (level_at, "levels"),
                                    lambda: np.full(len(links), np.nan))
-        unknown = rows[np.isnan(level_db[rows])]
-        level_db[unknown] = level_at(links.select(unknown), True)
+        if np.isnan(level_db[rows]).any():
+            around = self._near(links, box, NEAR_M + MARGIN_M) & np.isnan(level_db)
+            level_db[around] = level_at(links.select(around), True)
+            known.follow(np.flatnonzero(around))
         top_m = float(city.ground_height_m(*box[:2])) + box.height_m
         power = known.past(UprightBox(box[:2], (box.length_m / 2, box.width_m / 2),
                                       float(np.radians(box.turn_deg)), top_m), rows)
@@ -212,9 +215,9 @@ class MissingObstacle(GainEffect):
         offset_db[rows] = 10 * np.log10(np.clip(share, 10 ** (-MAX_LOSS_DB / 10), 1.0))
         return offset_db
 
-    def _near(self, links: LinkData, box: Box) -> np.ndarray:
+    def _near(self, links: LinkData, box: Box, within_m: float = NEAR_M) -> np.ndarray:
         """Return whether (n,) links may have other levels along paths because of a box."""
-        return near_box(box, links.device_m[links.device], links.receiver_m, NEAR_M)
+        return near_box(box, links.device_m[links.device], links.receiver_m, within_m)
 
     @override
     def reach(self, links: LinkData, params: Params) -> np.ndarray | None:
@@ -271,8 +274,8 @@ class MissingObstacle(GainEffect):
         share = built_share(links, params.box)
         if share <= MAX_BUILT:
             return None
-        return (f"{share:.0%} of it and of what is around it would be buildings of the map: their "
-                "walls or roofs are off, then, and none is missing")
+        return (f"{share:.0%} of it and of what is around it would be buildings of the map, or "
+                "found before: their walls or roofs are off, then, and no other is missing")
 
     @override
     def corrected_map(self, city: CityMap, params: Params) -> CityMap:

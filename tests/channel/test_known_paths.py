@@ -48,7 +48,8 @@ def test_without_a_box_all_power_is_there(geometry):
         power = known.past(far, rows)
         np.testing.assert_array_equal(power.others_past, power.others)
         np.testing.assert_allclose(power.direct, gains[rows, 0], rtol=1e-12)
-        np.testing.assert_allclose(power.others, gains[rows, 1:].sum(axis=1), rtol=1e-9)
+        share = power.others / gains[rows, 1:].sum(axis=1)
+        assert (share > 0.97).all() and (share < 1 + 1e-9).all()  # the weakest are not kept
     assert 0 < geometry.los.sum() < RECEIVERS
 
 
