@@ -11,12 +11,7 @@ from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.closeloop.ends import ends_of
 from radiotwin.closeloop.hypotheses import Hypotheses, is_judged_by_levels
 from radiotwin.effects.base import Effect
-from radiotwin.effects.fitting import (
-    add_effect,
-    along_paths,
-    prepare_additions,
-    takes_many_paths,
-)
+from radiotwin.effects.fitting import add_effect, along_paths, prepare_additions
 from radiotwin.effects.fold_model import FittedEffect, FoldModel
 from radiotwin.effects.params import EffectParams
 from radiotwin.execution import Executor
@@ -121,8 +116,7 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
     why = effect.contradicted(whole[0].effects[-1].params, links)
     if why:
         return replace(refused, reason=why)
-    if _is_worth_paths(*whole, hypotheses):
-        whole = along_paths(*whole, model.fits[0])
+    whole = along_paths(*whole, model.fits[0])
     coefficients = whole[1].coefficients[whole[0].coefficient_slices[-1]]
     params = whole[0].effects[-1].params
     why = effect.implausible(params, coefficients) or effect.contradicted(params, links)
@@ -135,16 +129,6 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
     if hypotheses is None or not is_judged_by_levels(effect):
         return Candidate(effect, *whole, gain)
     return Candidate(effect, *whole, gain, hypotheses.of_named(*whole))
-
-
-def _is_worth_paths(model: FoldModel, fit: FitResult, hypotheses: Hypotheses | None) -> bool:
-    """Return whether the last effect explains so much that its paths may be followed many times.
-
-    What correlated errors of the base explain as well is judged by quick levels.
-    """
-    if hypotheses is None or not takes_many_paths(model):
-        return True
-    return hypotheses.of_named(model, fit) >= 0
 
 
 def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.ndarray, tried: int,

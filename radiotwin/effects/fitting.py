@@ -73,15 +73,6 @@ def along_paths(model: FoldModel, result: FitResult,
     return found or (model, result)
 
 
-def takes_many_paths(model: FoldModel) -> bool:
-    """Return whether `along_paths` follows paths many times: the last effect has many numbers."""
-    last = model.effects[-1]
-    if not (last.effect.always_exact and model.channel.follows_paths):
-        return False
-    variation = last.effect.variation(last.params)
-    return variation is not None and len(variation.values) > MAX_EXACT_NUMBERS
-
-
 def prepare_additions(models: Sequence[FoldModel], results: Sequence[FitResult],
                       effects: Sequence[Effect], executor: Executor, like: Any = None) -> None:
     """Compute what `add_effect` will be asked, on the workers of an executor.

@@ -3,13 +3,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 from radiotwin.channel.log_distance import LogDistance, LogDistanceLine
 from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.scoring import Candidate, fit_candidate
-from radiotwin.effects import fitting
+from radiotwin.effects.boxes import Box
 from radiotwin.effects.fold_model import FoldModel
+from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.position_errors import DevicePositionError
+from radiotwin.scene.citymap import CityMap
 
 DEVICES_M, MOVED_M = np.array([[0.0, 0.0, 10.0], [300.0, 200.0, 10.0]]), np.array([[14.0, -18.0, 0.0], [0.0, 0.0, 0.0]])
 
@@ -54,14 +57,7 @@ def fitted(moved, evidence_nats, effect=DevicePositionError):
     return fit_candidate(model, effect(), 0, SelectionCriteria(), hypotheses), channel.followed
 
 
-def test_what_correlated_errors_explain_is_judged_without_its_paths(moved, monkeypatch):
-    monkeypatch.setattr(fitting, "MAX_EXACT_NUMBERS", 1)  # a position has two
-    for evidence_nats, is_followed in ((-1.0, False), (1.0, True)):
-        found, followed = fitted(moved, evidence_nats)
-        assert isinstance(found, Candidate) and bool(followed) == is_followed
-
-
-def test_of_few_numbers_paths_are_followed_whatever_quick_levels_say(moved):
+def test_paths_are_followed_whatever_quick_levels_say(moved):
     found, followed = fitted(moved, -1.0)
     assert isinstance(found, Candidate) and followed and found.whole.effects[-1].params.device == 0
 
@@ -84,3 +80,31 @@ def test_links_of_devices_that_are_nowhere_do_not_speak_against_anything(moved):
     effect = OfUsable()
     assert isinstance(fit_candidate(lost, effect, 0, SelectionCriteria(), None), Candidate)
     assert effect.asked == {0}
+
+
+class OverMap(MissingObstacle):
+    """A box that notes the maps that it is held against."""
+
+    def __init__(self):
+        super().__init__()
+        self.heights_m = []
+
+    def propose(self, view):
+        return [self.Params(box=Box(90.0, 60.0, 20.0, 20.0, 15.0, 0.0))]
+
+    def contradicted(self, params, links):
+        self.heights_m.append(float(links.city.height_at(40.0, 60.0)))
+        return "it is noted"
+
+
+def test_a_building_that_was_found_is_in_the_map_that_the_next_is_held_against(moved):
+    model, _ = moved
+    house = trimesh.creation.box(bounds=[[400, 400, 0], [410, 410, 10]])
+    whole = replace(model.whole, links=model.whole.links.with_city(CityMap(house.vertices, house.faces)))
+    for found, height_m in (([], 0.0), ([Box(40.0, 60.0, 20.0, 20.0, 25.0, 0.0)], 25.0)):
+        effect = OverMap()
+        applied = [whole.apply(MissingObstacle(), MissingObstacle.Params(box=box)) for box in found]
+        base = whole.with_effects(applied)
+        over = SimpleNamespace(whole=base, fits=[base.fit()], links=base.links)
+        refused = fit_candidate(over, effect, 0, SelectionCriteria(), None)
+        assert refused.reason == "it is noted" and effect.heights_m == [pytest.approx(height_m)]
