@@ -256,7 +256,7 @@ class MissingObstacle(GainEffect):
             values, np.array([6.0, 6.0, 8.0, 8.0, 8.0, 20.0, 4.0])[:count],
             np.array([x_m - 60, y_m - 60, 4.0, 4.0, 3.0, -90.0, -20.0])[:count],
             np.array([x_m + 60, y_m + 60, 120.0, 120.0, 250.0, 90.0, 10.0])[:count], changed,
-            starts=turned if along_paths else ())
+            is_rough=along_paths, starts=turned if along_paths else ())
 
     @override
     def neg_log_prior(self, params: Params) -> float:

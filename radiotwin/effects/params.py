@@ -174,6 +174,8 @@ class Variation:
         follows_paths: whether each value is judged on paths that are followed anew. That is slow
             and rough, so folds search on a grid (`NEAR_SHARE`), and what lies between its points
             is uncertain.
+        is_rough: whether each value is judged on levels that are nearly those it is to have: what
+            lies within such a grid is uncertain, too.
         starts: further numbers (r,) that a search of all links begins at.
     """
 
@@ -184,12 +186,14 @@ class Variation:
     params: Callable[[np.ndarray], Any]
     members: list[np.ndarray] | None = None
     follows_paths: bool = False
+    is_rough: bool = False
     starts: Sequence[np.ndarray] = ()
 
     @property
     def resolution_sd(self) -> np.ndarray:
         """Standard deviation (r,) of what the search leaves open: uniform within the grid."""
-        return self.steps * (NEAR_SHARE / np.sqrt(12) if self.follows_paths else 0.0)
+        rough = self.follows_paths or self.is_rough
+        return self.steps * (NEAR_SHARE / np.sqrt(12) if rough else 0.0)
 
 
 def quantities(params: type[EffectParams] | EffectParams) -> dict[str, dict[str, Any]]:
