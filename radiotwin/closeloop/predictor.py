@@ -47,7 +47,6 @@ from radiotwin.threads import in_threads
 
 HALF_M = 50.0  # distance to the nearest measurement at which near and far count the same
 PULL = 0.01  # towards the best single member, see `convex_weights`: 2 % of the RMSE
-INNER_FOLDS = 2  # that are held out within the links outside a fold
 MAX_INNER_LINKS = 12_000  # that they are a sample of
 INNER_TREES = 20
 MIN_LEARNT = 60  # detected links that anything is learnt from
@@ -168,7 +167,7 @@ def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: S
         share = shares_of(part.links, fold.train, test)
         members = np.column_stack([physics_db(fold, fit, rest, part, test, seed),
                                    *(baselines[name][test] for name in laws)])
-        others = [(number + step) % count for step in range(1, count)][:INNER_FOLDS]
+        others = [other for other in range(count) if other != number]
         weights = _weights(*learnt.held_out(model.index, others, seed)[:2], names)
         return learnt, test, members, share, combine(members, share, weights)
 
