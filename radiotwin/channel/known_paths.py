@@ -14,6 +14,7 @@ from radiotwin.links import LinkGeometry
 from radiotwin.paths.powers import paths_with_points
 from radiotwin.scene.citymap import CityMap
 
+LINK_CHUNK = 1000  # whose paths are held before the weakest go: tens of megabytes
 WEAKEST = 1e-3  # of a link's strongest path: most are weaker, and together they carry little
 MIN_STEP_M = 1e-9  # a shorter leg along an axis is none along it
 
@@ -69,15 +70,17 @@ class KnownPaths:
         if not len(rows):
             return
         for device in np.unique(geometry.device[rows]):
-            mine = rows[geometry.device[rows] == device]
-            found = paths_with_points(
-                self._city, np.array(followed_from_m(geometry, int(mine[0]))),
-                geometry.receiver_m[mine], geometry.frequency_hz)
-            strongest = np.zeros(len(mine))
-            np.maximum.at(strongest, found.receiver, found.power)
-            kept = found.power > WEAKEST * strongest[found.receiver]
-            parts.append((mine[found.receiver[kept]], found.power[kept], found.points_m[kept],
-                          found.points[kept]))
+            of_device = rows[geometry.device[rows] == device]
+            position_m = np.array(followed_from_m(geometry, int(of_device[0])))
+            for first in range(0, len(of_device), LINK_CHUNK):
+                mine = of_device[first:first + LINK_CHUNK]
+                found = paths_with_points(self._city, position_m, geometry.receiver_m[mine],
+                                          geometry.frequency_hz)
+                strongest = np.zeros(len(mine))
+                np.maximum.at(strongest, found.receiver, found.power)
+                kept = found.power > WEAKEST * strongest[found.receiver]
+                parts.append((mine[found.receiver[kept]], found.power[kept],
+                              found.points_m[kept], found.points[kept]))
         self._paths = tuple(np.concatenate(each) for each in zip(*parts, strict=True))
         followed = geometry.select(rows)
         self._direct[rows] = np.where(followed.los, free_space(followed), 0.0)
