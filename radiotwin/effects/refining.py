@@ -45,6 +45,8 @@ def refine(model: FoldModel, result: FitResult, evaluations: int = EVALUATIONS,
     train, near = model.train, last.effect.reach(model.links, last.params)
     train = train if near is None else train & near
     rows = subsample(np.flatnonzero(train), max_links)
+    if not len(rows):
+        return model, result
     design_effect = model.view(result).design_effect * len(rows) / max(train.sum(), 1)
     small = model.restrict(rows, model.effects[:-1])
     rest = small.regression()

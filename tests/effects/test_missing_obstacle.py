@@ -13,6 +13,7 @@ from radiotwin.effects.fitting import along_paths
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.foliage import Foliage
 from radiotwin.effects.missing_obstacle import SHAPES, MissingObstacle
+from radiotwin.effects.refining import refine
 from radiotwin.scene.citymap import CityMap
 from radiotwin.scene.vegetation import Vegetation, VegetationConfig
 
@@ -186,3 +187,14 @@ def test_along_paths_a_box_is_found_that_quick_levels_turned(make_links, seed):
     gain, most = without.objective - fit.objective, without.objective - fitted(true)[1].objective
     assert found.effects[-1].params.exact
     assert gain > 0.8 * most > 0.8 * 1000 and without.objective - start[1].objective < 0.65 * most
+
+
+def test_a_box_that_no_link_comes_near_stays_where_it_is(make_links):
+    house = trimesh.creation.box(bounds=[[-60, 60, 0], [180, 70, 25]])
+    receiver_m = np.array([(x_m, y_m, 20.0) for x_m in range(50, 150, 10) for y_m in range(-60, 60, 10)], float)
+    links = make_links([[0.0, 0, 2.0]], receiver_m, city=CityMap(house.vertices, house.faces),
+                       level_db=np.linspace(-80, -70, len(receiver_m)))
+    model = FoldModel.build(links, ImagePaths().fit(links.geometry, links.level_db, None), 5.0)
+    far = MissingObstacle.Params(box=Box(-300.0, 0.0, 20.0, 20.0, 30.0, 0.0), known_paths=True)
+    there = model.with_effects([model.apply(MissingObstacle(), far)])
+    assert refine(there, there.fit())[0] is there
