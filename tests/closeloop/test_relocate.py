@@ -79,7 +79,7 @@ def test_along_paths_folds_are_located_anew_only_where_a_device_moves(monkeypatc
         device_m[1, 0] += moved_m
         return FoldModel.build(each.links, each.channel, each.dof, device_m=device_m, train=mine), model.twin.devices
 
-    monkeypatch.setattr(relocate, "_corrected_map", lambda each: "another map")
+    monkeypatch.setattr(FoldModel, "corrected_map", property(lambda each: "another map"))
     monkeypatch.setattr(relocate, "_located_anew", anew)
     found = relocate_devices(model, model.links, make_bases(None, 0)["twin"])
     assert len(located) == asked and located[0] == len(model.links)
