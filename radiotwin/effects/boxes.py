@@ -39,6 +39,10 @@ class Box(NamedTuple):
     height_m: Length
     turn_deg: Annotated[float, Field(ge=-3600, le=3600)]
 
+    def straightened(self) -> "Box":
+        """Return the same box with a turn of at most 45° to each side."""
+        return self.like(self._replace(turn_deg=0.0))
+
     def turned_by(self, turn_deg: float) -> "Box":
         """Return a box turned counter-clockwise [deg], with a turn of at most 90° to each side."""
         return self._replace(turn_deg=(self.turn_deg + turn_deg + 90.0) % 180.0 - 90.0)

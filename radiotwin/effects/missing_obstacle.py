@@ -233,7 +233,9 @@ class MissingObstacle(GainEffect):
 
     @override
     def exact(self, params: Params) -> Params:
-        return params.model_copy(update={"exact": True, "known_paths": False, "by_class": False})
+        # The search goes on from here: a turn must not begin at its bounds.
+        return params.model_copy(update={"box": params.box.straightened(), "exact": True,
+                                         "known_paths": False, "by_class": False})
 
     @override
     def variation(self, params: Params) -> Variation:

@@ -121,3 +121,19 @@ def test_back_projection_finds_the_cell_and_how_high_it_must_be():
     place, height = np.unravel_index(total.argmax(), total.shape)
     assert np.abs(centres[place] - (tower.x_m, tower.y_m)).max() <= 1.5 * CELL_M
     assert 30 <= HEIGHTS_M[height] <= 70
+
+
+@pytest.mark.parametrize("turn_deg", [-90.0, -60.0, 0.0, 44.0, 50.0, 90.0, 134.0])
+def test_a_straightened_box_is_the_same_with_a_smaller_turn(turn_deg):
+    box = Box(3.0, -4.0, 20.0, 10.0, 5.0, turn_deg)
+    straight = box.straightened()
+
+    def corners(of):
+        turn = np.radians(of.turn_deg)
+        axes = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        signs = np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)])
+        return np.array(sorted((signs * [of.length_m / 2, of.width_m / 2] @ axes).round(6).tolist()))
+
+    assert abs(straight.turn_deg) <= 45 and straight.straightened() == straight
+    np.testing.assert_allclose(corners(straight), corners(box), atol=1e-5)
+    assert straight._replace(length_m=0, width_m=0, turn_deg=0) == box._replace(length_m=0, width_m=0, turn_deg=0)
