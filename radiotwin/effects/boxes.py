@@ -55,6 +55,23 @@ class Box(NamedTuple):
                              turn_deg=self.turn_deg + 90.0 * quarters)
 
 
+def grid_around(box: Box, margin_m: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return x and y (count, count) of points on the ground of a box, and so far around it [m]."""
+    turn, share = np.radians(box.turn_deg), (np.arange(count) + 0.5) / count - 0.5
+    along_m, across_m = np.meshgrid(share * (box.length_m + 2 * margin_m),
+                                     share * (box.width_m + 2 * margin_m))
+    return (box.x_m + along_m * np.cos(turn) - across_m * np.sin(turn),
+            box.y_m + along_m * np.sin(turn) + across_m * np.cos(turn))
+
+
+def stands_on(box: Box, x_m: np.ndarray, y_m: np.ndarray) -> np.ndarray:
+    """Return whether a box stands on points of the ground, of any shape."""
+    turn, east_m, north_m = np.radians(box.turn_deg), x_m - box.x_m, y_m - box.y_m
+    along_m = east_m * np.cos(turn) + north_m * np.sin(turn)
+    across_m = north_m * np.cos(turn) - east_m * np.sin(turn)
+    return (np.abs(along_m) <= box.length_m / 2) & (np.abs(across_m) <= box.width_m / 2)
+
+
 class Crossing(NamedTuple):
     """How n links cross a box; NaN where a link's ground track does not.
 

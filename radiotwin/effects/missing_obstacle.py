@@ -29,11 +29,13 @@ from radiotwin.effects.boxes import (
     best_cells,
     cross,
     devices_through,
+    grid_around,
     is_beside_unknown,
     is_seen_from_one_place,
     knife_edge_db,
     near_box,
     obstruction_nats,
+    stands_on,
     two_edges_db,
 )
 from radiotwin.effects.params import (
@@ -128,6 +130,7 @@ class MissingObstacle(GainEffect):
         all stand in buildings of the map.
         """
         links, (x_m, y_m) = view.links, centre_m.tolist()
+        found = view.found_params(self.name, "box")
         around = Box(x_m, y_m, 2 * REACH_M, 2 * REACH_M, max(HEIGHTS_M), 0.0)
         near = near_box(around, *ends_above_ground(links, los), 0.0)
         rows = subsample(los[near], MAX_LINKS)
@@ -154,7 +157,7 @@ class MissingObstacle(GainEffect):
         best(Box(box.x_m, box.y_m, *sides_m, box.height_m, turn_deg)
              for sides_m, turn_deg in SHAPES)
         return next((params(*tried) for tried in sorted(gains, key=gains.__getitem__, reverse=True)
-                     if built_share(links, tried[0]) <= MAX_BUILT), None)
+                     if built_share(links, tried[0], found) <= MAX_BUILT), None)
 
     @override
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:
@@ -321,20 +324,18 @@ def _gain_db(crossing: Crossing, scattered: np.ndarray | float,
     return np.maximum(10 * np.log10(np.minimum(power, 1.0)), -MAX_LOSS_DB)
 
 
-def built_share(links: LinkData, box: Box) -> float:
-    """Return the share of the ground of a box, and just around it, that is built in links' map.
+def built_share(links: LinkData, box: Box, found: Iterable[Box] = ()) -> float:
+    """Return the share of the ground of a box, and just around it, that is built.
 
-    0 without a map.
+    In the map of links, if they have one, or because boxes were found there.
     """
-    if links.city is None:
-        return 0.0
-    turn, share = np.radians(box.turn_deg), (np.arange(GRID) + 0.5) / GRID - 0.5
-    along_m, across_m = np.meshgrid(share * (box.length_m + 2 * AROUND_M),
-                                     share * (box.width_m + 2 * AROUND_M))
-    x_m = box.x_m + along_m * np.cos(turn) - across_m * np.sin(turn)
-    y_m = box.y_m + along_m * np.sin(turn) + across_m * np.cos(turn)
-    above_m = links.city.height_at(x_m, y_m) - links.city.ground_height_m(x_m, y_m)
-    return float((above_m > MIN_BUILT_M).mean())
+    x_m, y_m = grid_around(box, AROUND_M, GRID)
+    built = np.zeros(x_m.shape, dtype=bool)
+    if links.city is not None:
+        built = links.city.height_at(x_m, y_m) - links.city.ground_height_m(x_m, y_m) > MIN_BUILT_M
+    for other in found:
+        built |= stands_on(other, x_m, y_m)
+    return float(built.mean())
 
 
 @lru_cache(maxsize=32)

@@ -8,7 +8,7 @@ import trimesh
 
 from radiotwin.channel.followed_paths import path_gains
 from radiotwin.channel.image_paths import ImagePaths
-from radiotwin.effects.boxes import Box
+from radiotwin.effects.boxes import Box, stands_on
 from radiotwin.effects.fitting import along_paths
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.foliage import Foliage
@@ -198,3 +198,25 @@ def test_a_box_that_no_link_comes_near_stays_where_it_is(make_links):
     far = MissingObstacle.Params(box=Box(-300.0, 0.0, 20.0, 20.0, 30.0, 0.0), known_paths=True)
     there = model.with_effects([model.apply(MissingObstacle(), far)])
     assert refine(there, there.fit())[0] is there
+
+
+def test_where_a_building_was_found_no_other_is_proposed(make_links, view):
+    """The way to the east is still lossy though a box was found there: what is proposed stands elsewhere."""
+    receiver_m = np.array([(x_m, y_m, 5.0) for x_m in range(90, 200, 6) for y_m in range(-60, 60, 6)], float)
+    links = make_links([[0.0, 0, 2.0], [0.0, 40, 2.0]], receiver_m)
+    start_m = links.device_m[links.device]
+    share = (60.0 - start_m[:, 0]) / (links.receiver_m[:, 0] - start_m[:, 0])
+    passes_m = start_m[:, 1] + share * (links.receiver_m[:, 1] - start_m[:, 1])
+    lost_db = np.where(np.abs(passes_m) < 10, 16.0, 0.0)
+    residual = view(replace(links, level_db=-lost_db), np.zeros(len(links)), 1.5,
+                    level_at=lambda links, exact=False: np.zeros(len(links)))
+    before = MissingObstacle().propose(residual)
+    box = before[0].box
+    assert np.hypot(box.x_m - 60, box.y_m) < 25
+    found = replace(residual, found=(("missing_obstacle", before[0]),))
+    x_m, y_m = np.meshgrid(np.linspace(-100, 300, 801), np.linspace(-200, 200, 801))
+    again = MissingObstacle().propose(found)
+    for params in again:
+        shared = (stands_on(box, x_m, y_m) & stands_on(params.box, x_m, y_m)).sum()
+        assert shared <= 0.3 * stands_on(params.box, x_m, y_m).sum()
+    assert box not in [each.box for each in again]
