@@ -7,11 +7,10 @@ import numpy as np
 from scipy.constants import speed_of_light
 
 from radiotwin.paths.candidates import candidate_search
-from radiotwin.paths.clearance import clear_paths
 from radiotwin.paths.coefficients import slabs_of
-from radiotwin.paths.fields import VERTICAL, path_gains
-from radiotwin.paths.images import PathBuffer, find_paths
-from radiotwin.paths.powers import PATH_CHUNK, WEDGES
+from radiotwin.paths.fields import VERTICAL
+from radiotwin.paths.images import PathBuffer
+from radiotwin.paths.powers import PATH_CHUNK, WEDGES, clear_paths_gains
 from radiotwin.scene import Scene
 from radiotwin.trace.settings import SolverSettings
 from radiotwin.trace.solver import Antennas, PathGains
@@ -45,14 +44,9 @@ def engine_paths(
     candidates, slabs = search.candidates(device_m), slabs_of(
         (*city.materials, city.ground_material), frequency_hz)
     out: list[list[FoundPath]] = [[] for _ in receiver_m]
-    cursor = 0
-    while cursor < len(candidates.edge) * len(receiver_m):
-        found, cursor = find_paths(search.surfaces, candidates, device_m, receiver_m, cursor,
-                                   buffer)
-        clear = clear_paths(city, search.surfaces, candidates, buffer, found)
-        gain = np.empty(len(clear))
-        path_gains(search.surfaces, candidates, 2 * np.pi * frequency_hz / speed_of_light, slabs,
-                   VERTICAL, WEDGES[wedge], buffer, clear, gain)
+    for clear, gain in clear_paths_gains(
+            city, search, candidates, device_m, receiver_m, buffer,
+            2 * np.pi * frequency_hz / speed_of_light, slabs, VERTICAL, WEDGES[wedge]):
         for path, power in zip(clear, gain):
             row, count = buffer.candidate[path], buffer.count[path]
             before, after = ((facets[row] >= 0).sum() for facets in (candidates.before,

@@ -110,9 +110,9 @@ def fit_candidate(model: CrossValidatedModel, effect: Effect, step: int,
     whole = add_effect(model.whole, effect, model.fits[0])
     if whole is None:
         return replace(refused, reason="nothing in the residual looks like it")
-    links = model.whole.links.select(model.whole.usable)
-    if model.whole.corrected_map is not links.city:  # what was found is part of what is known
-        links = links.with_city(model.whole.corrected_map)
+    links, city = model.whole.links.select(model.whole.usable), model.whole.corrected_map
+    if city is not links.city:  # what was found is part of what is known
+        links = links.with_city(city)
     why = effect.contradicted(whole[0].effects[-1].params, links)
     if why:
         return replace(refused, reason=why)

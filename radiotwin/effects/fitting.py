@@ -211,6 +211,14 @@ def _is_exact(model: FoldModel) -> bool:
     return bool(last.params == last.effect.exact(last.params))
 
 
+def _with_params(model: FoldModel, result: FitResult,
+                 params: Any) -> tuple[FoldModel, FitResult]:
+    """Return the model with other parameters in its last effect, and its fit."""
+    last = model.apply(model.effects[-1].effect, params)
+    tried = model.with_effects([*model.effects[:-1], last])
+    return tried, tried.fit(result)
+
+
 def _exactly_beside(model: FoldModel, result: FitResult) -> tuple[FoldModel, FitResult]:
     """Look for better exact levels of the last effect, where those of its quick optimum are not.
 
@@ -221,10 +229,8 @@ def _exactly_beside(model: FoldModel, result: FitResult) -> tuple[FoldModel, Fit
     variation = last.effect.variation(last.params)
     if variation is None or len(variation.values) > MAX_EXACT_NUMBERS:
         return model, result
-    exact = model.apply(last.effect, last.effect.exact(last.params))
-    start = model.with_effects([*model.effects[:-1], exact])
-    beside = refine(start, start.fit(result), evaluations=EXACT_EVALUATIONS, descents=1,
-                     max_links=MAX_EXACT_LINKS)
+    start = _with_params(model, result, last.effect.exact(last.params))
+    beside = refine(*start, evaluations=EXACT_EVALUATIONS, descents=1, max_links=MAX_EXACT_LINKS)
     return beside if beside[1].objective < result.objective else (model, result)
 
 
@@ -244,14 +250,9 @@ def _over_known_paths(model: FoldModel, result: FitResult,
     variation = None if exact is None else last.effect.variation(exact)
     if variation is None or variation.follows_paths:
         return model, result
-
-    def fitted(params: Any) -> tuple[FoldModel, FitResult]:
-        tried = model.with_effects([*model.effects[:-1], model.apply(last.effect, params)])
-        return tried, tried.fit(result)
-
-    found, _ = refine(*fitted(variation.params(variation.values)), descents=1,
-                      anywhere=not is_near)
-    exactly = fitted(last.effect.exact(found.effects[-1].params))
+    start = _with_params(model, result, variation.params(variation.values))
+    found, _ = refine(*start, descents=1, anywhere=not is_near)
+    exactly = _with_params(model, result, last.effect.exact(found.effects[-1].params))
     return exactly if exactly[1].objective < result.objective else (model, result)
 
 

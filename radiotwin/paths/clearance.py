@@ -1,11 +1,36 @@
 """Test of paths for obstacles."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from numba import njit
 
-from radiotwin.paths.images import Candidates, PathBuffer, sequence_length
+from radiotwin.paths.images import Candidates, PathBuffer, find_paths, sequence_length
 from radiotwin.paths.surfaces import NORMAL, NORMAL_0, NORMAL_N, Surfaces
 from radiotwin.scene.citymap import SKIN_M, CityMap
+
+
+def found_clear(
+    city: CityMap, surfaces: Surfaces, candidates: Candidates, device_m: np.ndarray,
+    receiver_m: np.ndarray, buffer: PathBuffer,
+) -> Iterator[np.ndarray]:
+    """Find the paths from a device that nothing blocks, as many at a time as a buffer holds.
+
+    Args:
+        city: 3D map.
+        surfaces: of the map.
+        candidates: that are tried.
+        device_m: (3,) position [m].
+        receiver_m: (n, 3) positions [m].
+        buffer: takes the paths.
+
+    Yields:
+        (m,) rows of the buffer, ascending; the next paths take their places.
+    """
+    cursor = 0
+    while cursor < len(candidates.edge) * len(receiver_m):
+        found, cursor = find_paths(surfaces, candidates, device_m, receiver_m, cursor, buffer)
+        yield clear_paths(city, surfaces, candidates, buffer, found)
 
 
 def clear_paths(

@@ -9,10 +9,10 @@ from scipy.constants import speed_of_light
 
 from radiotwin.errors import BadInput
 from radiotwin.paths.candidates import CandidateSearch, candidate_search
-from radiotwin.paths.clearance import clear_paths
+from radiotwin.paths.clearance import found_clear
 from radiotwin.paths.coefficients import Slabs, slabs_of
 from radiotwin.paths.fields import AVERAGE, VERTICAL, path_gains
-from radiotwin.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, find_paths
+from radiotwin.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer
 from radiotwin.paths.shooting import DEVICE_RAYS
 from radiotwin.paths.two_edges import paths_over_two_edges, two_edge_gains
 from radiotwin.paths.wedges import LUEBBERS, SIONNA
@@ -137,9 +137,9 @@ def path_powers(
             links = np.flatnonzero(device == row)
             candidates = search.candidates(device_m[row], rays)
             kind = _kinds(candidates, search.is_ground)
-            for clear, gain in _clear_paths(city, search, candidates, device_m[row],
-                                            receiver_m[links], buffer, wave_number, slabs,
-                                            POLARISATIONS[polarisation], WEDGES[wedge]):
+            for clear, gain in clear_paths_gains(
+                    city, search, candidates, device_m[row], receiver_m[links], buffer,
+                    wave_number, slabs, POLARISATIONS[polarisation], WEDGES[wedge]):
                 link, points_m = links[buffer.receiver[clear]], buffer.points_m[clear]
                 last, path = buffer.count[clear] - 1, np.arange(len(clear))
                 np.add.at(powers, (kind[buffer.candidate[clear]], link), gain)
@@ -180,7 +180,7 @@ def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarra
     no_points = np.zeros((0, *buffer.points_m.shape[1:]), dtype=np.float32)
     no_rows = np.zeros(0, dtype=int)
     parts = [PathsWithPoints(no_rows, np.zeros(0), no_points, no_rows)]
-    for clear, gain in _clear_paths(
+    for clear, gain in clear_paths_gains(
             city, search, search.candidates(device_m), device_m,
             np.ascontiguousarray(receiver_m, dtype=float), buffer,
             2 * np.pi * frequency_hz / speed_of_light, slabs, VERTICAL, WEDGES["sionna"]):
@@ -190,17 +190,13 @@ def paths_with_points(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarra
     return PathsWithPoints(*(np.concatenate(each) for each in zip(*parts, strict=True)))
 
 
-def _clear_paths(
+def clear_paths_gains(
     city: CityMap, search: CandidateSearch, candidates: Candidates, device_m: np.ndarray,
     receiver_m: np.ndarray, buffer: PathBuffer, wave_number: float, slabs: Slabs,
     polarisation: int, wedge: int,
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield rows (p,) of a buffer that hold paths which nothing blocks, and their gains (p,)."""
-    cursor = 0
-    while cursor < len(candidates.edge) * len(receiver_m):
-        found, cursor = find_paths(search.surfaces, candidates, device_m, receiver_m, cursor,
-                                   buffer)
-        clear = clear_paths(city, search.surfaces, candidates, buffer, found)
+    for clear in found_clear(city, search.surfaces, candidates, device_m, receiver_m, buffer):
         gain = np.empty(len(clear))
         path_gains(search.surfaces, candidates, wave_number, slabs, polarisation, wedge, buffer,
                    clear, gain)

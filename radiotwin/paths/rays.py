@@ -8,9 +8,9 @@ from scipy.constants import speed_of_light
 
 from radiotwin.paths.amplitudes import path_amplitudes
 from radiotwin.paths.candidates import candidate_search
-from radiotwin.paths.clearance import clear_paths
+from radiotwin.paths.clearance import found_clear
 from radiotwin.paths.coefficients import slabs_of
-from radiotwin.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer, find_paths
+from radiotwin.paths.images import MAX_INTERACTIONS, Candidates, PathBuffer
 from radiotwin.paths.wedges import LUEBBERS
 from radiotwin.scene.citymap import CityMap
 
@@ -72,11 +72,7 @@ def follow_rays(city: CityMap, device_m: np.ndarray, receiver_m: np.ndarray, fre
     for first in range(0, len(receiver_m), RECEIVER_CHUNK):
         ends_m = np.ascontiguousarray(receiver_m[first:first + RECEIVER_CHUNK], dtype=float)
         parts = [_direct(city, device_m, ends_m, wave_number)]
-        cursor = 0
-        while cursor < len(candidates.edge) * len(ends_m):
-            found, cursor = find_paths(search.surfaces, candidates, device_m, ends_m, cursor,
-                                       buffer)
-            rows = clear_paths(city, search.surfaces, candidates, buffer, found)
+        for rows in found_clear(city, search.surfaces, candidates, device_m, ends_m, buffer):
             amplitude, length_m = np.empty(len(rows), dtype=complex), np.empty(len(rows))
             path_amplitudes(search.surfaces, candidates, wave_number, slabs, LUEBBERS, buffer,
                             rows, amplitude, length_m)
