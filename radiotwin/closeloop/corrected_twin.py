@@ -1,4 +1,4 @@
-"""The twin of a loop: fitted to all its links, with its base and all effects that are causes."""
+"""The twin of a loop: fitted to all its links, with its base, all causes and what maps have."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
         loop: what was found.
         scene: that it was found in, if there was one.
     """
-    model = loop.explained
+    model = loop.for_twin
     shadowing = model.shadowing[0] if model.shadowing else None
     if shadowing is None and needs_rest(loop.prediction):
         shadowing = CorrelatedShadowing.fit(model.whole, model.fits[0], 0)
-    fitted = replace(EffectModel.of(model.whole, model.fits[0], causes_only=True),
+    fitted = replace(EffectModel.of(model.whole, model.fits[0]),
                      **vars(_calibration(loop, scene)), shadowing=shadowing,
                      blend=make_blend(model, loop.prediction, 0))
     provenance: dict[str, Any] = {"links": len(model.links),
@@ -44,14 +44,11 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
 
 
 def _calibration(loop: Loop, scene: Scene | None) -> RadiusCalibration:
-    """Return how far positions are to be believed that the loop's models locate as its twin does.
-
-    That is without what only describes the rest: the twin does not have it, either.
-    """
-    model, links = loop.explained, loop.links
+    """Return how far positions are to be believed that folds locate as the twin does."""
+    model, links = loop.for_twin, loop.links
     if model.whole.channel.follows_paths:  # which locates nothing: `check_can_locate`
         return RadiusCalibration()
-    models = [EffectModel.of(fold, fit, causes_only=True).for_positions()
+    models = [EffectModel.of(fold, fit).for_positions()
               for fold, fit in zip(model.folds, model.fits[1:], strict=True)]
     # A device that the loop found elsewhere is not where it was declared.
     moved = {device for each in model.whole.effects if isinstance(each.effect, DevicePositionError)

@@ -2,9 +2,14 @@
 
 Near measured places interpolation and trees know most, and far from them physics does. So each
 member of the combination has a weight near measurements and one far from them, with a smooth
-transition. The weights are those with the least held-out error, and no reading has a part in the
-weights, the rest or the trees by which it is predicted: within the links outside a fold, other
-folds are held out in turn (nested cross-validation).
+transition. The weights are those with the least held-out error on other folds: no reading has a
+part in the members by which it is predicted, and no error of its fold has one in the weights. That
+the other folds' models have learnt from it is all that is not held out. Weights from within the
+other folds (nested cross-validation) are those of models that have learnt from less: with one of
+six sectors held out interpolation predicts best, and with two of them worst. For a few numbers that
+many readings choose nesting is not needed (Wainer and Cawley 2021, 'Nested cross-validation when
+selecting classifiers is overzealous for most practical applications', Expert Systems with
+Applications 182).
 """
 
 from __future__ import annotations
@@ -47,8 +52,8 @@ from radiotwin.threads import in_threads
 
 HALF_M = 50.0  # distance to the nearest measurement at which near and far count the same
 PULL = 0.01  # towards the best single member, see `convex_weights`: 2 % of the RMSE
-MAX_INNER_LINKS = 12_000  # that they are a sample of
-INNER_TREES = 20
+MAX_AWAY_LINKS = 12_000  # of which quadrants are held out
+AWAY_TREES = 20
 MIN_LEARNT = 60  # detected links that anything is learnt from
 
 
@@ -87,17 +92,14 @@ class _Learnt:
     part: Part
     names: list[str]
 
-    def held_out(self, group: np.ndarray, groups: list[int],
-                 seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Hold out groups of its training links, fit to the others, and predict.
+    def without_quadrants(self, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Hold out each quadrant of its training links, fit to the others, and predict.
 
         Of the physics the coefficients are fitted again, and of rest and kriging the values. What
         the links that are held out still decide is, of a few numbers for all: the place of a box,
         the length of a correlation.
 
         Args:
-            group: (n,) of each link.
-            groups: to be held out, one after the other.
             seed: of trees and samples.
 
         Returns:
@@ -105,15 +107,15 @@ class _Learnt:
             of named effects [dB], and (r,) rows of the links.
         """
         rows = np.flatnonzero(self.model.train)
-        if len(rows) > MAX_INNER_LINKS:
+        if len(rows) > MAX_AWAY_LINKS:
             rng = np.random.default_rng(seed)
-            rows = np.sort(rng.choice(rows, MAX_INNER_LINKS, replace=False))
-        part = self.part.select(rows)
+            rows = np.sort(rng.choice(rows, MAX_AWAY_LINKS, replace=False))
+        part, quadrant = self.part.select(rows), _quadrant(self.model.links)[rows]
         whole = self.model.restrict(rows, self.model.effects)
         errors, shares, scales = [np.zeros((0, len(self.names)))], [np.zeros(0)], [np.zeros(0)]
         tested = [np.zeros(0, dtype=int)]
-        for each in groups:
-            out = group[rows] == each
+        for each in range(4):
+            out = quadrant == each
             test = np.flatnonzero(out & np.isfinite(part.links.level_db))
             if not len(test) or np.isfinite(part.links.level_db[~out]).sum() < MIN_LEARNT:
                 continue
@@ -130,7 +132,7 @@ class _Learnt:
 
     def members_db(self, test: np.ndarray, seed: int) -> np.ndarray:
         """Return predictions (m, k) of rows (m,), by few trees and known correlations [dB]."""
-        physics = physics_db(self.model, self.fit, self.rest, self.part, test, seed, INNER_TREES)
+        physics = physics_db(self.model, self.fit, self.rest, self.part, test, seed, AWAY_TREES)
         laws = [law_db(kind, self.part.links, self.model.train, test, self.kriging)
                 for kind in LAWS if kind.name in self.names]
         return np.column_stack([physics, *laws])
@@ -156,31 +158,36 @@ def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: S
     rest_too = [REST] if with_rest or model.shadowing else []
     names = [NAMED, *FORESTS, *TREES_ALONE, *rest_too, *laws]
 
-    def of_fold(number: int) -> tuple[_Learnt, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Return what is learnt outside a fold; its rows (m,), members, shares and prediction."""
+    def of_fold(number: int) -> tuple[_Learnt, np.ndarray, np.ndarray, np.ndarray]:
+        """Return what is learnt outside a fold; its rows (m,), their members and far shares."""
         fold, fit, part, rest = model.folds[number], model.fits[number + 1], parts[number], None
         if REST in names:
             rest = model.shadowing[number + 1] if model.shadowing else CorrelatedShadowing.fit(
                 fold, fit, seed)
         learnt = _Learnt(fold, fit, rest, kriging[number] if kriging else None, part, names)
         test = np.flatnonzero((model.index == number) & fold.usable)
-        share = shares_of(part.links, fold.train, test)
         members = np.column_stack([physics_db(fold, fit, rest, part, test, seed),
                                    *(baselines[name][test] for name in laws)])
-        others = [other for other in range(count) if other != number]
-        weights = _weights(*learnt.held_out(model.index, others, seed)[:2], names)
-        return learnt, test, members, share, combine(members, share, weights)
+        return learnt, test, members, shares_of(part.links, fold.train, test)
 
     members, share = np.full((len(links), len(names)), np.nan), np.ones(len(links))
-    mean_db = np.full(len(links), np.nan)
     with warnings.catch_warnings():  # whose filters threads leave as another one had them
         folds = in_threads(of_fold, range(count))
-    for _, test, *found in folds:
-        members[test], share[test], mean_db[test] = found
-    far_db, far_share, far_scale_db, far_rows = folds[-1][0].held_out(
-        _quadrant(links), [0, 1, 2, 3], seed)
-    error_db = links.level_db[:, None] - members
-    weights = _weights(np.vstack([error_db, far_db]), np.concatenate([share, far_share]), names)
+    for _, test, own_members, own_share in folds:
+        members[test], share[test] = own_members, own_share
+    far_db, far_share, far_scale_db, far_rows = folds[-1][0].without_quadrants(seed)
+
+    def weights_without(number: int) -> np.ndarray:
+        """Return the weights (2, k) of all links but a fold's; -1: of all."""
+        here, away = model.index != number, model.index[far_rows] != number
+        error_db = links.level_db[here, None] - members[here]
+        return _weights(np.vstack([error_db, far_db[away]]),
+                        np.concatenate([share[here], far_share[away]]), names)
+
+    mean_db = np.full(len(links), np.nan)
+    for number, (_, test, own_members, own_share) in enumerate(folds):
+        mean_db[test] = combine(own_members, own_share, weights_without(number))
+    weights = weights_without(-1)
     away = np.column_stack([combine(far_db, far_share, weights) / far_scale_db, far_share,
                             model.index[far_rows]])
     return CombinedPrediction(mean_db, names, weights, members, share, baselines, away)

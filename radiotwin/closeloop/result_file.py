@@ -69,7 +69,7 @@ def make_report(loop: Loop) -> dict[str, Any]:
                                for label, rows in groups.items()}
     predicted = loop.prediction
     error["combined"] = errors(links.level_db, predicted.mean_db) | {
-        "in_90_percent_interval": held_out_coverage(loop.explained, predicted)}
+        "in_90_percent_interval": held_out_coverage(loop.for_twin, predicted)}
     baselines = {name: errors(links.level_db, mean_db)
                  for name, mean_db in predicted.baselines.items()}
     combination = [{"name": name, "weight_near": near, "weight_far": far} for name, near, far in

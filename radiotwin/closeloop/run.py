@@ -74,10 +74,18 @@ class Loop(Summarised):
         """Base and effects."""
         return self.selection.model
 
-    @property
-    def explained(self) -> CrossValidatedModel:
-        """Base and what has a name, with the rest if it was interpolated of that alone."""
-        return self.selection.named
+    @cached_property
+    def for_twin(self) -> CrossValidatedModel:
+        """The same without curves that no map has; with the rest, if it goes with just that."""
+        dropped = [each.effect for each in self.after.whole.effects
+                   if not (each.effect.is_cause or each.effect.is_declared
+                           or each.effect.is_on_maps(each.params))]
+        if not dropped:
+            return self.after
+        models = [model.with_effects([each for each in model.effects
+                                      if not any(each.effect is other for other in dropped)])
+                  for model in self.after.models]
+        return self.after.extended(models, [model.fit() for model in models])
 
     @property
     def criteria(self) -> SelectionCriteria:
@@ -122,8 +130,7 @@ class Loop(Summarised):
     @cached_property
     def prediction(self) -> CombinedPrediction:
         """Held-out, by all that was learnt, and by other models alone; takes a while."""
-        return combined_prediction(self.selection.named, bool(self.remaining), self.criteria,
-                                   self.seed)
+        return combined_prediction(self.for_twin, bool(self.remaining), self.criteria, self.seed)
 
     @cached_property
     def detectable(self) -> list[Detectable]:

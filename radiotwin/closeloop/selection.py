@@ -71,13 +71,6 @@ class SelectionResult:
         """Whether no more effects may be added."""
         return len(self.model.whole.effects) >= self.criteria.max_effects
 
-    @property
-    def named(self) -> CrossValidatedModel:
-        """Base and what has a name, with the rest if it was interpolated of that alone."""
-        named = self.explained or self.model
-        same = len(named.whole.effects) == len(self.model.whole.effects)
-        return self.model if same else named
-
     def hypotheses(self, seed: int) -> Hypotheses:
         """Return the hypotheses about what the model lacks, made once for each model."""
         if self.looked_at is None or self.looked_at[0] is not self.model:

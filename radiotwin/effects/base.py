@@ -98,7 +98,7 @@ class Effect(ABC):
         repeatable: whether there may be several, each found in a step of its own.
         sparse: whether each of its coefficients belongs to one end, and any few may be there.
         of_device: whether it is a device's own level or antenna, which another need not have.
-        of_receiver: whether it belongs to a receiver, so that it is no part of a map.
+        of_receiver: whether it belongs to a receiver.
         is_cause: whether it is a physical cause, not merely a description of what is left.
         within_flights: whether it acts at certain times only, so that other flights do not show it:
             it is scored on devices, or blocks of ground, that are held out in all flights.
@@ -174,6 +174,10 @@ class Effect(ABC):
             return params.model_copy(update=dict(zip(fields, inside, strict=True)))
 
         return Variation(values, steps, low, high, changed)
+
+    def is_on_maps(self, params: Any) -> bool:
+        """Return whether a map, which has neither receivers nor times, is drawn with it."""
+        return not self.of_receiver
 
     def reach(self, links: LinkData, params: Any) -> np.ndarray | None:
         """Return which (n,) links similar parameters may act on; None for any."""

@@ -103,19 +103,15 @@ class EffectModel:
     unheard: Unheard | None = None
 
     @classmethod
-    def of(cls, model: FoldModel, result: FitResult, causes_only: bool = False) -> EffectModel:
+    def of(cls, model: FoldModel, result: FitResult) -> EffectModel:
         """Return what was learnt from the training links of a model.
 
         Args:
             model: channel and effects on the training links.
             result: fit of the model.
-            causes_only: whether to leave out what only describes the residual: what is neither a
-                cause nor a part of the base (`Effect.is_cause`, `Effect.is_declared`).
         """
-        effects = tuple(each for each in model.fitted_effects(result)
-                        if each.effect.is_cause or each.effect.is_declared or not causes_only)
         sd_db = device_sd_db(model, result)
-        return cls(model.channel, effects,
+        return cls(model.channel, tuple(model.fitted_effects(result)),
                    result.coefficients[:model.level_columns.shape[1]], result.scale_db, model.dof,
                    model.links.device_m, tuple(model.links.receiver_names), model.links.first_s,
                    sd_db, unheard=Unheard.of(model, result, sd_db))
@@ -124,12 +120,12 @@ class EffectModel:
         """Return the same without what takes too long for each place where a device may be.
 
         That is what the base says of errors of a map, for which each link is followed over nine
-        maps, and effects that follow paths. How far their lack displaces devices is in
-        `radius_factor`.
+        maps, and effects that follow paths. Curves without a cause go, too: they describe what is
+        left on links of devices whose positions are known. How far their lack displaces devices is
+        in `radius_factor`.
         """
-        return replace(self, effects=tuple(
-            each for each in self.effects if not each.effect.in_paths
-            and (each.effect.is_cause or not each.effect.is_declared)))
+        return replace(self, effects=tuple(each for each in self.effects
+                                           if each.effect.is_cause and not each.effect.in_paths))
 
     def on_links(self, links: LinkData) -> tuple[FoldModel, FitResult]:
         """Return the model of any links (n,), and the fit that goes with it.
@@ -138,7 +134,7 @@ class EffectModel:
         receivers are left out.
         """
         effects = [each for each in self.effects
-                   if links.receiver_names or not each.effect.of_receiver]
+                   if links.receiver_names or each.effect.is_on_maps(each.params)]
         model = FoldModel.build(links, self.channel, self.dof)
         model = model.with_effects([model.apply(each.effect, each.params) for each in effects])
         # A twin of 0.1 that follows paths has levels without slopes.

@@ -30,6 +30,7 @@ from radiotwin.effects.roof_heights import RoofHeights
 from radiotwin.effects.sector_antenna import SectorAntenna
 from radiotwin.effects.tilted_dipole import TiltedDipole
 from radiotwin.effects.uncertain_sight import UncertainSight
+from radiotwin.effects.unexplained_trend import ON_MAPS, OVER, UnexplainedTrend
 from radiotwin.errors import BadInput
 from radiotwin.plugins import load_plugins
 
@@ -79,6 +80,9 @@ def effect_named(name: str, variant: str) -> Effect:
     Raises:
         BadInput: no such effect is installed, or one that describes the same otherwise.
     """
+    over = variant.removeprefix(OVER)
+    if name == UnexplainedTrend.name and over in ON_MAPS:
+        return UnexplainedTrend(over)
     named = [effect for effect in catalogue() if effect.name == name]
     for effect in named:
         if effect.variant == variant:

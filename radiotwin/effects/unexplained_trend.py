@@ -1,17 +1,20 @@
 """`unexplained_trend`, a last resort: the residual as a smooth curve over one variable.
 
 It describes on which variable the residual still depends, and how; it explains nothing. It is no
-candidate among the effects, because it would fit part of whatever they model; and a map, which has
-no heading and no time, is drawn without it.
+candidate among the effects, because it would fit part of whatever they model. A twin and its maps
+have a curve that is the same for all receivers and over a variable of places; a map has no heading
+and no time.
 """
 
+from typing import Annotated
+
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 from typing_extensions import override
 
 from radiotwin.effects.arrays import LinkCache
 from radiotwin.effects.base import GainEffect, Term
-from radiotwin.effects.params import EffectParams, Estimate, Parameter
+from radiotwin.effects.params import EffectParams, Estimate, Parameter, ReceiverIndex, Unique
 from radiotwin.effects.residual_view import LevelAt, ResidualView
 from radiotwin.links import LinkData, residual_variable
 
@@ -20,6 +23,16 @@ PRIOR_SD_DB = 5.0  # of the value at a knot
 MAX_CURVES = 10  # receivers that may have a curve each
 MIN_KNOWN = 0.5  # share of the links with a value
 CIRCULAR = ("azimuth_deg", "body_azimuth_deg", "heading_deg")
+ON_MAPS = ("distance_m", "elevation_deg", "azimuth_deg", "altitude_m", "predicted_level_db",
+           "metres_inside_m", "diffraction_parameter")
+OVER = "over "
+MAX_KNOT = 1e9
+
+
+def _ascending(values: list[float]) -> list[float]:
+    if any(after <= before for before, after in zip(values, values[1:], strict=False)):
+        raise ValueError("knots must ascend")
+    return values
 
 
 class UnexplainedTrend(GainEffect):
@@ -33,14 +46,16 @@ class UnexplainedTrend(GainEffect):
     class Params(EffectParams):
         """Knots and receivers of the curves."""
 
-        knots: list[float] = Field(description="Values of the variable, ascending.")
-        receivers: list[int | None] = Field(
+        knots: Annotated[list[Annotated[float, Field(ge=-MAX_KNOT, le=MAX_KNOT)]],
+                         AfterValidator(_ascending)] = Field(
+            min_length=1, max_length=KNOTS, description="Values of the variable, ascending.")
+        receivers: Unique[ReceiverIndex | None] = Field(
             description="Indices of the receivers with a curve each; [None] is one for all.")
 
     def __init__(self, variable: str) -> None:
         """Make the effect for a variable of `residual_variables`."""
         self.variable = variable
-        self.variant = f"over {variable}"  # type: ignore[misc]  # one class for every variable
+        self.variant = f"{OVER}{variable}"  # type: ignore[misc]  # one class for every variable
         self.uses = ("quality",) if variable == "quality" else ()  # type: ignore[misc]
         self._values = LinkCache()
 
@@ -60,6 +75,10 @@ class UnexplainedTrend(GainEffect):
 
         return [max((self.Params(knots=knots, receivers=members) for members in choices),
                     key=rating)]
+
+    @override
+    def is_on_maps(self, params: Params) -> bool:
+        return self.variable in ON_MAPS and params.receivers == [None]
 
     @override
     def term(self, links: LinkData, params: Params, level_at: LevelAt) -> Term:

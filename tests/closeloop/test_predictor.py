@@ -16,7 +16,7 @@ from radiotwin.links import prepare_links
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr(predictor, "INNER_TREES", 5)
+    monkeypatch.setattr(predictor, "AWAY_TREES", 5)
     monkeypatch.setattr(cross_validation, "best_dof", lambda *_: 5.0)  # which the base learns of all links
 
 
@@ -55,14 +55,40 @@ def test_of_levels_without_any_cause_the_mean_is_predicted(open_ground):
     assert (found.weights >= 0).all()
 
 
-def test_no_reading_of_a_fold_changes_its_prediction(open_ground):
+def test_no_reading_of_a_fold_changes_the_members_that_predict_it(open_ground):
     links = prepare_links(open_ground.measured(flown(open_ground, 4)), None)
     model, found = predicted(links)
     own = model.index == 2
     level_db = links.level_db + own * np.random.default_rng(0).normal(0, 9, len(links))
     _, other = predicted(replace(links, level_db=level_db))
-    np.testing.assert_allclose(found.mean_db[own], other.mean_db[own], atol=1e-6)
-    assert not np.allclose(found.mean_db[~own], other.mean_db[~own])
+    np.testing.assert_allclose(found.members[own], other.members[own], atol=1e-6)
+    assert not np.allclose(found.members[~own], other.members[~own])
+
+
+def test_no_error_of_a_fold_has_a_part_in_its_weights(open_ground, monkeypatch):
+    links = prepare_links(open_ground.measured(flown(open_ground, 4, part=12)), None)
+    given = []
+    weighed = predictor._weights
+    monkeypatch.setattr(predictor, "_weights", lambda error_db, *rest: given.append(error_db) or weighed(error_db, *rest))
+    model, found = predicted(links)
+    error_db = links.level_db[:, None] - found.members
+    assert len(given) == len(model.folds) + 1
+    for number, weighed_db in enumerate(given[:-1]):
+        own = error_db[(model.index == number) & np.isfinite(error_db).all(axis=1)]
+        assert len(own) and not np.isin(own[:, 0], weighed_db[:, 0]).any()
+
+
+def test_on_levels_that_hold_nothing_the_reported_error_is_not_below_theirs(open_ground):
+    ratios = []
+    for seed in range(8):
+        world = flown(open_ground, seed, part=24)
+        world.gain_db = np.random.default_rng(seed).normal(-80.0, 6.0, len(world.gain_db))
+        links = prepare_links(open_ground.measured(world), None)
+        model, found = predicted(links, with_rest=True)
+        seen = np.isfinite(links.level_db)
+        mean_db = np.array([links.level_db[seen & (model.index != fold)].mean() for fold in model.index])
+        ratios.append(rmse_db(links, found.mean_db) / rmse_db(links, mean_db))
+    assert np.mean(ratios) > 0.995  # each scatters by 0.01
 
 
 @pytest.mark.slow

@@ -60,6 +60,24 @@ def test_a_twin_with_effects_predicts_the_same_after_loading(open_ground, tmp_pa
     assert_equal(twin.predict(faultless[0]), again.predict(faultless[1]))
 
 
+def test_a_curve_that_only_describes_is_drawn_on_the_maps_of_a_stored_twin(open_ground, tmp_path):
+    world = open_ground.fly(8)
+    azimuth_deg = np.degrees(np.arctan2(world.offset_m[:, 0], world.offset_m[:, 1]))
+    world.gain_db += 5.0 * np.sin(np.radians(3 * azimuth_deg))  # no effect of the catalogue does so at all devices
+    measurements = open_ground.measured(world).select(world.slot % 2 == 0)
+    loop = close_loop(measurements, base="log-distance")
+    assert loop.verdict == "unexplained"
+    corrected_twin(loop, None).save(tmp_path / "twin")
+    twin = Twin.load(tmp_path / "twin")
+    assert [each.effect.variant for each in twin.effects] == ["over azimuth_deg"]
+    # Round each device, far from what was measured: a wave three times round, as far as eight knots follow one.
+    around_deg = np.arange(0, 360, 5.0)
+    offset_m = 150.0 * np.column_stack([np.sin(np.radians(around_deg)), np.cos(np.radians(around_deg)), 0.3 + 0 * around_deg])
+    links = twin.links(twin.device_m[0] + offset_m, np.zeros(len(around_deg), dtype=int), NO_MAP)
+    wave = np.sin(np.radians(3 * around_deg))
+    assert np.corrcoef(twin.predict(links).mean_db, wave)[0, 1] > 0.7
+
+
 def test_a_corrected_twin_of_version_0_1_predicts_the_same():
     """Offsets of devices, a step of one receiver, and interpolated shadowing, without a map."""
     twin, before = Twin.load(VERSION_1 / "corrected"), np.load(VERSION_1 / "corrected.npz")
