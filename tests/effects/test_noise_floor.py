@@ -60,6 +60,23 @@ def test_only_the_receiver_that_has_one_gets_a_floor(flown, kind):
     assert before.objective - after.objective > 50
 
 
+def test_weak_links_that_scatter_widely_read_no_floor(make_links):
+    """As where walls scatter: half of the shadow that the base expects is not there, and readings go on falling."""
+    rng = np.random.default_rng(2)
+    receiver = np.repeat(np.arange(2), LINKS)
+    receiver_m = np.column_stack([rng.uniform(0, 1500, (len(receiver), 2)), np.full(len(receiver), 40.0)])
+    links = make_links([[700.0, 800, 1.5]], receiver_m, receiver=receiver)
+    expected_db = -22 - 30 * np.log10(links.distance_m)
+    level_db = np.maximum(expected_db, -90 + rng.normal(0, 12, len(links))) + rng.normal(0, 2.0, len(links))
+    links.level_db[:] = np.where(receiver == 1, level_db, expected_db + rng.normal(0, 2.0, len(links)))
+    model = FoldModel.build(links, KnownLevels(LogDistanceLine(-20.0, -3.0, 3.0)), 5.0)
+    found = add_effect(model, NoiseFloor(), model.fit())[0].effects[-1]
+    for own, floor_db in found.params.receivers.items():
+        assert (links.level_db[receiver == own] < floor_db - 6.1).mean() <= 0.011
+    assert "it is no floor" in NoiseFloor().implausible(NoiseFloor.Params(receivers={1: -80.0}, highest={1: -80.0}), np.zeros(0))
+    assert NoiseFloor().implausible(NoiseFloor.Params(receivers={1: -80.0}), np.zeros(0)) is None
+
+
 @pytest.mark.parametrize("alone", [False, True])
 def test_the_usual_floor_is_not_that_of_receivers_that_have_none(make_links, alone):
     links = make_links([[0.0, 0, 1.5]], np.ones((5, 3)), receiver=np.arange(5))
