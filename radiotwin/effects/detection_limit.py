@@ -2,7 +2,9 @@
 
 A blank then means "below that limit" (Tobin 1958, 'Estimation of relationships for limited
 dependent variables', Econometrica 26) and not "below the usual one". Receivers whose limits hardly
-differ, and a declared limit that is wrong, are no effect: `radiotwin.links.limits` sees to them.
+differ, and a declared limit that is wrong, are no effect: `radiotwin.links.limits` sees to them. A
+receiver with readings below a limit has another one: what is blank was lost for another reason,
+such as that no way leads there.
 """
 
 import numpy as np
@@ -13,7 +15,7 @@ from radiotwin.effects.base import LimitEffect
 from radiotwin.effects.params import Decibels, EffectParams, Estimate, Parameter, ReceiverIndex
 from radiotwin.effects.residual_view import ResidualView
 from radiotwin.links import LinkData
-from radiotwin.links.limits import MIN_NATS, receiver_limit
+from radiotwin.links.limits import MIN_NATS, contradict_limit, receiver_limit
 
 MIN_RISE_DB = 2.0  # above the usual limit
 
@@ -41,13 +43,16 @@ class DetectionLimit(LimitEffect):
     @override
     def propose(self, view: ResidualView) -> list[Params]:
         links, found, sd_db = view.links, {}, {}
+        seen = np.isfinite(links.level_db)
         for receiver in np.unique(links.receiver):
             mine = links.receiver == receiver
             usual_db = float(np.median(links.limit_db[mine]))
             limit = receiver_limit(links.level_db[mine], view.mean_db[mine], view.scale_db[mine],
                                    view.design_effect, usual_db)
             if (limit is not None and limit.is_sure and limit.limit_db > usual_db + MIN_RISE_DB
-                    and (np.isinf(usual_db) or limit.over_declared_nats > MIN_NATS)):
+                    and (np.isinf(usual_db) or limit.over_declared_nats > MIN_NATS)
+                    and not contradict_limit(np.sort(links.level_db[mine & seen]),
+                                             limit.limit_db)):
                 found[int(receiver)], sd_db[int(receiver)] = limit.limit_db, limit.sd_db
         return [self.Params(receivers=found, sd_db=sd_db)] if found else []
 

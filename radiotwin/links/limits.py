@@ -149,14 +149,14 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
     for receiver, mine in enumerate(rows):
         each, level_db = found[receiver], links.level_db[mine]
         read_db = np.sort(level_db[np.isfinite(level_db)])
-        trusted = np.isfinite(declared) and not _below(read_db, declared)
+        trusted = np.isfinite(declared) and not contradict_limit(read_db, declared)
         if each is not None and each.is_sure:
             near = abs(each.limit_db - declared) < MIN_OFF_DB  # whatever is odd in it
             trusted = near or trusted and not _overrules(each, read_db, declared)
             own_db[receiver] = declared if trusted else each.limit_db
         elif len(read_db) == len(level_db):
             own_db[receiver] = declared if trusted and usual_db == declared else -np.inf
-        elif usual_db is not None and not _below(read_db, usual_db - RISE_DB):
+        elif usual_db is not None and not contradict_limit(read_db, usual_db - RISE_DB):
             own_db[receiver] = usual_db  # its own blanks do not show it
         else:
             lost.append(receiver)
@@ -212,7 +212,7 @@ def _usual_db(links: LinkData, rows: list[np.ndarray], found: list[LimitEstimate
     return together.limit_db if together.is_sure else None
 
 
-def _below(read_db: np.ndarray, limit_db: float) -> bool:
+def contradict_limit(read_db: np.ndarray, limit_db: float) -> bool:
     """Return whether readings in order (n,) [dB] contradict a limit: not one or two odd ones."""
     below = np.searchsorted(read_db, limit_db - FALL_DB)
     return bool(below >= max(MIN_BELOW, BELOW_SHARE * len(read_db)))
@@ -225,7 +225,7 @@ def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) ->
     """
     rise_db = found.limit_db - declared_db
     off_db = max(rise_db - RISE_DB, -rise_db - FALL_DB)
-    reaches = rise_db > 0 and _below(read_db, declared_db + RISE_DB + FALL_DB)
+    reaches = rise_db > 0 and contradict_limit(read_db, declared_db + RISE_DB + FALL_DB)
     sure = off_db > SURE_SDS * found.sd_db and found.over_declared_nats > MIN_NATS
     return found.is_sure and sure and not reaches
 
