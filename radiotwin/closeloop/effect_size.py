@@ -67,7 +67,7 @@ def why_not_borne_out(size_db: Parameter) -> str:
 
 def _held_out(model: CrossValidatedModel, number: int
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return of each link (n,), as its fold has it, what `effect_size_db` is a regression of.
+    """Return the terms of the regression in `effect_size_db` for each link (n,), by its fold.
 
     Returns:
         what the effect changes, what is lacking without it, the error scale [dB], and whether the

@@ -185,8 +185,9 @@ def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: S
                         np.concatenate([share[here], far_share[away]]), names)
 
     mean_db = np.full(len(links), np.nan)
-    for number, (_, test, own_members, own_share) in enumerate(folds):
-        mean_db[test] = combine(own_members, own_share, weights_without(number))
+    for number in range(count):
+        own = model.index == number
+        mean_db[own] = combine(members[own], share[own], weights_without(number))
     weights = weights_without(-1)
     away = np.column_stack([combine(far_db, far_share, weights) / far_scale_db, far_share,
                             model.index[far_rows]])
