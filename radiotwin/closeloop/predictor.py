@@ -177,9 +177,9 @@ def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: S
         members[test], share[test] = own_members, own_share
     far_db, far_share, far_scale_db, far_rows = folds[-1][0].without_quadrants(seed)
 
-    def weights_without(number: int) -> np.ndarray:
-        """Return the weights (2, k) of all links but a fold's; -1: of all."""
-        here, away = model.index != number, model.index[far_rows] != number
+    def weights_of(here: np.ndarray) -> np.ndarray:
+        """Return the weights (2, k) of some of the links, (n,) bool."""
+        away = here[far_rows]
         error_db = links.level_db[here, None] - members[here]
         return _weights(np.vstack([error_db, far_db[away]]),
                         np.concatenate([share[here], far_share[away]]), names)
@@ -187,8 +187,8 @@ def combined_prediction(model: CrossValidatedModel, with_rest: bool, criteria: S
     mean_db = np.full(len(links), np.nan)
     for number in range(count):
         own = model.index == number
-        mean_db[own] = combine(members[own], share[own], weights_without(number))
-    weights = weights_without(-1)
+        mean_db[own] = combine(members[own], share[own], weights_of(~own))
+    weights = weights_of(np.ones(len(links), dtype=bool))
     away = np.column_stack([combine(far_db, far_share, weights) / far_scale_db, far_share,
                             model.index[far_rows]])
     return CombinedPrediction(mean_db, names, weights, members, share, baselines, away)

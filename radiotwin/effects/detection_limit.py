@@ -51,8 +51,7 @@ class DetectionLimit(LimitEffect):
                                    view.design_effect, usual_db)
             if (limit is not None and limit.is_sure and limit.limit_db > usual_db + MIN_RISE_DB
                     and (np.isinf(usual_db) or limit.over_declared_nats > MIN_NATS)
-                    and not contradict_limit(np.sort(links.level_db[mine & seen]),
-                                             limit.limit_db)):
+                    and not contradict_limit(links.level_db[mine & seen], limit.limit_db)):
                 found[int(receiver)], sd_db[int(receiver)] = limit.limit_db, limit.sd_db
         return [self.Params(receivers=found, sd_db=sd_db)] if found else []
 

@@ -148,7 +148,7 @@ def estimate_limits(links: LinkData, declared_db: float | None) -> tuple[np.ndar
     own_db, lost = np.full(len(rows), -np.inf), []
     for receiver, mine in enumerate(rows):
         each, level_db = found[receiver], links.level_db[mine]
-        read_db = np.sort(level_db[np.isfinite(level_db)])
+        read_db = level_db[np.isfinite(level_db)]
         trusted = np.isfinite(declared) and not contradict_limit(read_db, declared)
         if each is not None and each.is_sure:
             near = abs(each.limit_db - declared) < MIN_OFF_DB  # whatever is odd in it
@@ -213,13 +213,13 @@ def _usual_db(links: LinkData, rows: list[np.ndarray], found: list[LimitEstimate
 
 
 def contradict_limit(read_db: np.ndarray, limit_db: float) -> bool:
-    """Return whether readings in order (n,) [dB] contradict a limit: not one or two odd ones."""
-    below = np.searchsorted(read_db, limit_db - FALL_DB)
+    """Return whether readings (n,) [dB] contradict a limit: not one or two odd ones."""
+    below = np.count_nonzero(read_db < limit_db - FALL_DB)
     return bool(below >= max(MIN_BELOW, BELOW_SHARE * len(read_db)))
 
 
 def _overrules(found: LimitEstimate, read_db: np.ndarray, declared_db: float) -> bool:
-    """Return whether an estimate, from readings in order (n,), surely differs from the declared.
+    """Return whether an estimate, from readings (n,), surely differs from the declared.
 
     A receiver that reads levels down to the declared limit has that, however few they are.
     """
