@@ -94,6 +94,7 @@ def validated(schema: type[BaseModel], record: object, source: object,
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
         place = ".".join(str(part) for part in first["loc"])[:200] or "its content"
-        given = "" if first["type"] == "missing" else f", not {repr(first['input'])[:60]}"
+        whole = first["type"] == "missing" or not first["loc"]
+        given = "" if whole else f", not {repr(first['input'])[:60]}"
         reason = first["msg"].removeprefix("Value error, ")
         raise BadInput(f"{source} is damaged ({place}: {reason}{given}); {remedy}") from None

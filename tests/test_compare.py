@@ -9,6 +9,7 @@ from radiotwin.compare import compare_models, predict, score_map, split_flights
 from radiotwin.comparison_output import judge_also
 from radiotwin.errors import BadInput
 from radiotwin.measurements import Measurements
+from radiotwin.report import write_comparison_folder
 from radiotwin.scene import Scene
 from radiotwin.survey import fly_survey, segmented_truth
 from radiotwin.twin import fit_twin
@@ -199,3 +200,8 @@ def test_a_twin_with_the_name_of_a_model_or_a_column_is_refused(small_scene, flo
     twin = fit_twin(train, small_scene, model="log_distance")
     with pytest.raises(BadInput, match="rename it"):
         compare_models(train, test, small_scene, models=("log_distance",), twins={name: twin})
+
+
+def test_models_without_the_networks_are_drawn_too(comparison, small_scene, truth, tmp_path):
+    write_comparison_folder(comparison, small_scene, tmp_path, truth)
+    assert {"compare.json", "scatter.png", "maps.png", "estimates.png"} <= {path.name for path in tmp_path.iterdir()}

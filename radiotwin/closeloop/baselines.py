@@ -180,7 +180,9 @@ def held_out_baselines(model: CrossValidatedModel, parts: list[Part], criteria: 
         (n,) prediction by each [dB], by name; and the kriging of each fold, empty without it.
     """
     kriging: list[RegressionKriging] = []
-    names = [*(kind.name for kind in laws_for(model.links, criteria)), EXTRA_TREES, BOOSTING]
+    published = published_laws(model.links.select(model.whole.usable))
+    names = [*(kind.name for kind in laws_for(model.links, criteria)), EXTRA_TREES, BOOSTING,
+             *(law.name for law in published)]
     result = {name: np.full(len(model.links), np.nan) for name in names}
     for number, (fold, part) in enumerate(zip(model.folds, parts, strict=True)):
         test = np.flatnonzero((model.index == number) & fold.usable)
@@ -191,11 +193,13 @@ def held_out_baselines(model: CrossValidatedModel, parts: list[Part], criteria: 
             result[kind.name][test] = _if_detected(law, part.links, test)
         for learner in (EXTRA_TREES, BOOSTING):
             result[learner][test] = trees_db(learner, part, fold.train, test, seed)
-    return result | published_laws(model.links), kriging
+        for law in published:  # a device of unknown position is where the fold has it
+            result[law.name][test] = _if_detected(law, part.links, test)
+    return result, kriging
 
 
-def published_laws(links: LinkData) -> dict[str, np.ndarray]:
-    """Return what recommendations say of links [dB], by name; fitted to nothing.
+def published_laws(links: LinkData) -> list[PublishedLaw]:
+    """Return laws of recommendations, fitted to nothing.
 
     Of those that hold at the frequency and for most of the heights and distances. Levels must be
     gains, for no recommendation knows the transmit power.
@@ -204,8 +208,8 @@ def published_laws(links: LinkData) -> dict[str, np.ndarray]:
         links: n links.
     """
     if not links.is_gain or np.isnan(links.frequency_hz):
-        return {}
-    result, geometry = {}, links.geometry
+        return []
+    laws, geometry = [], links.geometry
     for kind in BUILT_IN:
         if not issubclass(kind, PublishedLaw):
             continue
@@ -214,5 +218,5 @@ def published_laws(links: LinkData) -> dict[str, np.ndarray]:
         except BadInput:  # another frequency, or no map
             continue
         if law.inside(geometry).mean() >= MIN_INSIDE:
-            result[law.name] = _if_detected(law, links, np.arange(len(links)))
-    return result
+            laws.append(law)
+    return laws

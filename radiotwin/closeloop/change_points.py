@@ -32,6 +32,7 @@ from radiotwin.closeloop.scoring import (
     CandidateScore,
     fit_candidate,
     score_candidate,
+    with_candidate,
 )
 from radiotwin.closeloop.selection import SelectionResult
 from radiotwin.effects.base import Effect
@@ -86,7 +87,10 @@ def _select_one_kind(result: SelectionResult, effect: ReceiverDrift | DeviceDrif
             return
         model = extended
         params = candidate.whole.effects[-1].params
-        result.keep(score, with_effect(result.model, effect, params))
+        whole = with_effect(result.model, effect, params)
+        there = replace(candidate, whole=whole.whole, fit=whole.fits[0])
+        # When it was, a flight that is held out does not tell.
+        result.keep(score, with_candidate(result.model, there, result.executor))
 
 
 def located_links(model: CrossValidatedModel, links: LinkData, base: Base) -> LinkData:

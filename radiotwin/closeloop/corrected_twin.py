@@ -29,10 +29,10 @@ def corrected_twin(loop: Loop, scene: Scene | None) -> Twin:
     model = loop.for_twin
     shadowing = model.shadowing[0] if model.shadowing else None
     if shadowing is None and needs_rest(loop.prediction):
-        shadowing = CorrelatedShadowing.fit(model.whole, model.fits[0], 0)
+        shadowing = CorrelatedShadowing.fit(model.whole, model.fits[0], loop.seed)
     fitted = replace(EffectModel.of(model.whole, model.fits[0]),
                      **vars(_calibration(loop, scene)), shadowing=shadowing,
-                     blend=make_blend(model, loop.prediction, 0))
+                     blend=make_blend(model, loop.prediction, loop.seed))
     provenance: dict[str, Any] = {"links": len(model.links),
                                   "radiotwin_version": radiotwin.__version__}
     if loop.origin is not None:
@@ -56,4 +56,4 @@ def _calibration(loop: Loop, scene: Scene | None) -> RadiusCalibration:
     known = replace(links, anchors=links.anchors - moved)
     held_out = [known.select(model.index == number) for number in range(len(models))]
     area_m = scene.config.extent.bounds if scene is not None else whole_area(models[0], links)
-    return calibrate_radii(models, held_out, area_m, 0)
+    return calibrate_radii(models, held_out, area_m, loop.seed)

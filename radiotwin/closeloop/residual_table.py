@@ -15,12 +15,13 @@ def residual_table(loop: Loop) -> pd.DataFrame:
 
     Returns:
         columns `time_s, flight, receiver, receiver_x_m, receiver_y_m, receiver_z_m, device,
-        device_x_m, device_y_m, device_z_m` (device positions of the model), `los` (1, 0),
+        device_x_m, device_y_m, device_z_m` (device positions of the model; NaN where it has none),
+        `los` (1, 0),
         `measured_db` (dBm for power), `before_db` and `after_db`, NaN where the link was not
         detected or never held out
     """
     links = loop.after.links
-    device_m = links.device_m[links.device]
+    device_m = np.where(loop.after.whole.usable[:, None], links.device_m[links.device], np.nan)
     before_db, after_db = (links.level_db - model.held_out_mean_db
                            for model in (loop.before, loop.after))
     return pd.DataFrame({

@@ -27,6 +27,9 @@ from radiotwin.records import read_record, validated
 SCHEMA, SCHEMA_1 = "radiotwin.closeloop/2", "radiotwin.closeloop/1"
 REMEDY = "run `radiotwin close-loop` again"
 MAX_GROUPS = 100  # thousands of transmitter positions say nothing one by one
+# Parts that a report need not have, as version 0.1 had not.
+ABSENT: dict[str, Any] = {"posterior": [], "detectable": [], "combination": [], "prediction": None,
+                          "receivers_compared": []}
 # Of the interpolated rest, and of effects that version 0.1 wrote.
 NOT_KNOWN: dict[str, Any] = {"size_db": None, "uses": [], "is_declared": False, "probability": None}
 
@@ -182,7 +185,7 @@ def check_report(report: dict[str, Any], source: object = "closeloop.json") -> d
     Raises:
         BadInput: a field is missing or has another type.
     """
-    return validated(ReportRecord, report, source, REMEDY)
+    return validated(ReportRecord, ABSENT | report, source, REMEDY)
 
 
 def _from_version_1(report: dict[str, Any]) -> dict[str, Any]:
@@ -194,8 +197,7 @@ def _from_version_1(report: dict[str, Any]) -> dict[str, Any]:
                       for effect in report["effects"]]
     new["error"] = _with_new_bias(report["error"]) | {"combined": None}
     new["baselines"] = _with_new_bias(report["baselines"])
-    return new | {"schema": SCHEMA, "criteria": {}, "posterior": [], "detectable": [],
-                  "combination": [], "prediction": None, "receivers_compared": []}
+    return new | {"schema": SCHEMA, "criteria": {}} | ABSENT
 
 
 def _with_new_bias(value: Any) -> Any:

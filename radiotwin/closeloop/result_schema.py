@@ -1,8 +1,8 @@
 """Schema of `closeloop.json`, by which it is read: it may come from somebody else."""
 
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from radiotwin.records import Number, Record, Whole
 
@@ -50,6 +50,14 @@ class ParameterRecord(Record):
     high: Number | None
     unit: str
     determined: bool = True
+
+
+class KnownParameterRecord(ParameterRecord):
+    """Estimate that has all three numbers."""
+
+    value: Number
+    low: Number
+    high: Number
 
 
 class EvidenceRecord(Record):
@@ -159,7 +167,7 @@ class ReceiverDifferenceRecord(Record):
 
     first: str
     second: str
-    difference_db: ParameterRecord
+    difference_db: KnownParameterRecord
     pairs: Whole
     places: Whole
 
@@ -201,3 +209,10 @@ class ReportRecord(Record):
     criteria: dict[str, Number] = Field(default_factory=dict)
     notes: list[str]
     inputs: InputsRecord = Field(default_factory=InputsRecord)
+
+    @model_validator(mode="after")
+    def _effects_change_errors(self) -> Self:
+        rmse_db = self.error.before.rmse_db, self.error.after.rmse_db
+        if self.verdict == "effect" and None in rmse_db:
+            raise ValueError("the verdict is effect, and error has no rmse_db before or after it")
+        return self

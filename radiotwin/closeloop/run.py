@@ -203,7 +203,7 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
     for name in names:
         on_progress(f"fitting the base {name}")
         models[name] = cross_validate(links, bases[name], folds, parts)
-    best = min(models, key=lambda name: models[name].rmse_db())
+    best = best_base(models)
     selection = SelectionResult(models[best], criteria, executor=executor)
     candidates = [effect() for effect in catalogue()
                   if not (effect.in_paths and models[best].whole.channel.follows_paths)]
@@ -234,6 +234,20 @@ def close_loop(measurements: Measurements, scene: Scene | None = None, base: str
         add_shadowing(selection, seed)
     return Loop(best, links, folds, before, selection, dependences_before, dependences_after,
                 seed, _noise_floor_db(all_links, criteria), measurements.origin)
+
+
+def best_base(models: dict[str, CrossValidatedModel]) -> str:
+    """Return the base with the least held-out error of the links that all can predict.
+
+    One that cannot locate the devices that are hard to predict does not win by that. Of several
+    without a link in common, the one that predicts most.
+    """
+    known = {name: np.isfinite(model.links.level_db - model.held_out_mean_db)
+             for name, model in models.items()}
+    in_common = np.all(list(known.values()), axis=0)
+    if not in_common.any():
+        return max(known, key=lambda name: known[name].sum())
+    return min(models, key=lambda name: models[name].rmse_db(in_common))
 
 
 def _dependences(model: CrossValidatedModel, seed: int) -> list[ResidualDependence]:

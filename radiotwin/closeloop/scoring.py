@@ -149,23 +149,29 @@ def score_candidate(model: CrossValidatedModel, candidate: Candidate, block: np.
     Returns:
         the score, and the model with it; None where it does not pass.
     """
-    models, fits = [candidate.whole], [candidate.fit]
     fitted = FittedEffect(candidate.effect, candidate.whole.effects[-1].params,
                           candidate.fit.coefficients[candidate.whole.coefficient_slices[-1]])
     devices, receivers = ends_of(fitted, model.links)
-    like = candidate.whole.effects[-1].params
-    prepare_additions(model.folds, model.fits[1:], [candidate.effect], executor, like)
-    for each, fit in zip(model.folds, model.fits[1:], strict=True):
-        extended_fold, extended_fit = add_effect(each, candidate.effect, fit, like) or (each, fit)
-        models.append(extended_fold)
-        fits.append(extended_fit)
-    extended = model.extended(models, fits)
+    extended = with_candidate(model, candidate, executor)
     score = CandidateScore(candidate.effect.name, step=step, evidence_nats=candidate.evidence,
-                           params=like, variant=candidate.effect.variant, devices=devices,
+                           params=fitted.params, variant=candidate.effect.variant, devices=devices,
                            receivers=receivers)
     score = score_model(model, extended, score, block, tried, seed, criteria,
                         nlos_only=candidate.effect.nlos_only)
     return score, None if score.reason else extended
+
+
+def with_candidate(model: CrossValidatedModel, candidate: Candidate,
+                   executor: Executor) -> CrossValidatedModel:
+    """Return a model with a candidate; a fold has it as its own training links show it."""
+    effect, like = candidate.effect, candidate.whole.effects[-1].params
+    models, fits = [candidate.whole], [candidate.fit]
+    prepare_additions(model.folds, model.fits[1:], [effect], executor, like)
+    for each, fit in zip(model.folds, model.fits[1:], strict=True):
+        extended_fold, extended_fit = add_effect(each, effect, fit, like) or (each, fit)
+        models.append(extended_fold)
+        fits.append(extended_fit)
+    return model.extended(models, fits)
 
 
 def fit_and_score(model: CrossValidatedModel, effect: Effect, block: np.ndarray, tried: int,

@@ -108,6 +108,7 @@ class Effect(ABC):
         in_paths: whether a base that follows paths has it, so that it is no candidate there.
         always_exact: whether `exact` may be asked of every candidate, not only of what is kept.
         uses: columns of the measurements that it reads and that no map has, such as `quality`.
+        needs_map: whether its term needs the 3D map.
     """
 
     name: ClassVar[str]
@@ -127,10 +128,14 @@ class Effect(ABC):
     in_paths: ClassVar[bool] = False
     always_exact: ClassVar[bool] = False
     uses: ClassVar[tuple[str, ...]] = ()
+    needs_map: ClassVar[bool] = False
 
     def unavailable(self, links: LinkData) -> str | None:
-        """Return why the data do not allow this effect to be looked for; None where they do."""
-        return None
+        """Return why the data do not allow this effect to be looked for; None where they do.
+
+        By default, because it needs a map and there is none.
+        """
+        return "there is no 3D map" if self.needs_map and links.city is None else None
 
     def kind(self, params: Any) -> Any:
         """Return of which kind parameters are: a search begins at the best of each kind."""

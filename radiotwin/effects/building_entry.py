@@ -74,6 +74,7 @@ class BuildingEntry(GainEffect):
     """Links with one end inside a building lose on the way in."""
 
     name = "building_entry"
+    needs_map = True
     figure = "histogram"
     nlos_only = True
     confused_with = ("missing_obstacle", "receiver_gain_offset")
@@ -92,8 +93,8 @@ class BuildingEntry(GainEffect):
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
-        if links.city is None:
-            return "there is no 3D map"
+        if missing := super().unavailable(links):
+            return missing
         if not MIN_HZ <= links.frequency_hz <= MAX_HZ:
             return ("the frequency is not known, or outside the 80 MHz to 100 GHz of ITU-R P.2109; "
                     "give frequency_hz")

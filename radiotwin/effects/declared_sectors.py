@@ -95,6 +95,8 @@ class DeclaredSectors(SectorAntenna):
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
+        if missing := super().unavailable(links):
+            return missing
         if len(_declared(links)) < MIN_DEVICES:
             return f"azimuth_deg of {MIN_DEVICES} devices of known position is not declared"
         return None
@@ -190,10 +192,7 @@ class DeclaredSectorsOnPaths(DeclaredSectors):
 
     variant = "sector antennas of declared azimuth, along paths"
     straight = False
-
-    @override
-    def unavailable(self, links: LinkData) -> str | None:
-        return "there is no 3D map" if links.city is None else super().unavailable(links)
+    needs_map = True
 
 
 def _shared(params: Any) -> np.ndarray:

@@ -30,6 +30,7 @@ class MappedVegetation(GainEffect):
 
     name = "mapped_vegetation"
     repeatable = True
+    needs_map = True
     confused_with = ("foliage", "excess_attenuation")
 
     class Params(EffectParams):
@@ -47,7 +48,9 @@ class MappedVegetation(GainEffect):
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
-        if links.city is None or not len(links.city.vegetation):
+        if missing := super().unavailable(links):
+            return missing
+        if not len(city_of(links, self.name).vegetation):
             return "the map shows no vegetation"
         if not self._kinds(links):
             return (f"fewer than {MIN_LINKS} links pass {MIN_THROUGH_M:g} m or more of vegetation "

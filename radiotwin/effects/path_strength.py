@@ -31,6 +31,7 @@ class _Paths(PathEffect):
 
     nlos_only = True  # with line of sight they add tenths of a decibel
     in_paths = True
+    needs_map = True
     kinds: ClassVar[tuple[str, ...]]
 
     class Params(EffectParams):
@@ -41,8 +42,8 @@ class _Paths(PathEffect):
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
-        if links.city is None:
-            return "there is no 3D map"
+        if missing := super().unavailable(links):
+            return missing
         if len(links) > MAX_LINKS:
             return f"{len(links):,} links are too many to follow their paths; at most {MAX_LINKS:,}"
         return None

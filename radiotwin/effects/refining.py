@@ -104,8 +104,8 @@ def _refine_members(model: FoldModel, result: FitResult, last: AppliedEffect,
     every = np.flatnonzero(model.train)
     trained = model.links.select(every)
     for member in variation.members or ():
-        moved = numbers.copy()
-        moved[member] += variation.steps[member]
+        moved, step = numbers.copy(), variation.steps[member]
+        moved[member] += np.where(numbers[member] + step > variation.high[member], -step, step)
         acts = acted_db(trained, moved) != acted_db(trained, numbers)
         rows = subsample(every[acts], MAX_LINKS_OF_MEMBER)
         if not len(rows):

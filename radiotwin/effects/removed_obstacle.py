@@ -32,6 +32,7 @@ LOWER = (5 / 6, 5 / 3)  # standard deviations of its mapped height, by which a b
 FLAT_M = 0.5  # least height of a building that is lower
 # Very strong evidence (Kass and Raftery 1995, 'Bayes factors', J. Am. Stat. Assoc. 90, Sec. 3.2).
 MIN_LEAD_NATS = 5.0
+SAME_M = 1.0  # a building whose centre is as near is the same one
 NEAR_M = 25.0  # links whose ground tracks stay farther away keep their level, also exactly
 
 
@@ -42,6 +43,7 @@ class RemovedObstacle(GainEffect):
     figure = "links"
     nlos_only = True
     repeatable = True
+    needs_map = True
     always_exact = True
     confused_with = ("device_position_error",)
 
@@ -51,10 +53,6 @@ class RemovedObstacle(GainEffect):
         building: int = Field(ge=0, description="Index, as `buildings` numbers them.")
         centre_m: tuple[Metres, Metres, Metres] = Field(description="Centre x, y, and height [m].")
         exact: bool = Field(False, description="Whether paths are followed over a map without it.")
-
-    @override
-    def unavailable(self, links: LinkData) -> str | None:
-        return "there is no 3D map" if links.city is None else None
 
     @override
     def propose(self, view: ResidualView) -> list[Params]:
@@ -103,7 +101,10 @@ class RemovedObstacle(GainEffect):
 
     @override
     def corrected_map(self, city: CityMap, params: Params) -> CityMap:
-        return _without(city, params.building)[0]
+        # By its place: other effects' buildings that are gone, or there, have changed the numbers.
+        apart_m = np.linalg.norm(buildings(city)[1] - np.array(params.centre_m), axis=1)
+        nearest = int(apart_m.argmin())
+        return _without(city, nearest)[0] if apart_m[nearest] < SAME_M else city
 
     @override
     def parameters(self, links: LinkData, params: Params,

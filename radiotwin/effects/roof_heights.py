@@ -69,6 +69,7 @@ class RoofHeights(GainEffect):
     variant = "roofs that are off by metres"
     figure = "histogram"
     is_declared = True
+    needs_map = True
     is_cause = False
 
     class Params(EffectParams):
@@ -78,8 +79,8 @@ class RoofHeights(GainEffect):
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
-        if links.city is None:
-            return "there is no 3D map"
+        if missing := super().unavailable(links):
+            return missing
         return None if np.isfinite(links.frequency_hz) else "the frequency is not known"
 
     @override

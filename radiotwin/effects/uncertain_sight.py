@@ -34,6 +34,7 @@ class UncertainSight(GainEffect):
     variant = "walls and roofs that are off by metres"
     figure = "histogram"
     is_declared = True
+    needs_map = True
     is_cause = False
 
     class Params(EffectParams):
@@ -48,8 +49,8 @@ class UncertainSight(GainEffect):
 
     @override
     def unavailable(self, links: LinkData) -> str | None:
-        if links.city is None:
-            return "there is no 3D map"
+        if missing := super().unavailable(links):
+            return missing
         chance = self._chance(links)
         count = int(((chance > 0) & (chance < 1)).sum())
         if count < MIN_LINKS:

@@ -99,8 +99,8 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     device_m = np.where(measurements.is_anchor[:, None], measurements.device_m, np.nan)
     device_m[:, 2] = np.where(np.isnan(declared_z_m), ASSUMED_HEIGHT_M, declared_z_m)
     if scene is not None and scene.city.terrain is not None:
-        low = np.isnan(declared_z_m) & measurements.is_anchor
-        device_m[low, 2] += scene.city.ground_height_m(*device_m[low, :2].T)
+        low = np.flatnonzero(np.isnan(declared_z_m))
+        device_m[low, 2] += _ground_m(scene, device_m[low], receiver_m)
     notes += check_names(measurements) + check_tilts(measurements)
     notes += check_positions(receiver_m, device_m, scene)
     from_middle_m = np.abs(receiver_m[:, :2] - np.median(receiver_m[:, :2], axis=0)).max(axis=1)
@@ -125,7 +125,7 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
     flat = np.isnan(declared_z_m).sum()
     if flat:
         notes.append(f"heights of devices are empty in {flat:,} rows, and taken for "
-                     f"{ASSUMED_HEIGHT_M} m")
+                     f"{ASSUMED_HEIGHT_M} m above the ground")
     placed = np.asarray(np.isfinite(device_m).all(axis=1) | (scene is not None) | to_locate)
     leave_out(~placed[device_index],
               "without a scene, devices of unknown position cannot be located")
@@ -149,6 +149,19 @@ def prepare_links(measurements: Measurements, scene: Scene | None,
                        device_m[placed], device, np.flatnonzero(placed), notes)
     notes += [RESTART_NOTE] * links.time_restarts
     return links
+
+
+def _ground_m(scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray) -> np.ndarray:
+    """Return the height of the ground (k,) below devices [m].
+
+    Of one of unknown position, that of most of the ground that was measured over.
+    """
+    city, unknown = scene.city, np.isnan(device_m[:, 0])
+    over_m = receiver_m[np.isfinite(receiver_m[:, :2]).all(axis=1), :2]
+    usual_m = float(np.median(city.ground_height_m(*over_m.T))) if len(over_m) else 0.0
+    below_m = np.full(len(device_m), usual_m)
+    below_m[~unknown] = city.ground_height_m(*device_m[~unknown, :2].T)
+    return below_m
 
 
 def _link_data(measurements: Measurements, table: pd.DataFrame, scene: Scene | None,

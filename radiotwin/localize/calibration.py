@@ -55,14 +55,14 @@ def calibrate_radii(models: list[EffectModel], held_out: list[LinkData], area_m:
 
     Args:
         models: one a fold, each learnt without it.
-        held_out: links of each fold, devices at their true positions; only anchors are tried.
+        held_out: links of each fold, devices at their true positions; only anchors are tried that
+            were heard there.
         area_m: as of `locate`.
         seed: of which devices are taken.
     """
     with_map = held_out[0].city is not None
     trials = [(model, links, device) for model, links in zip(models, held_out, strict=True)
-              for device in np.flatnonzero(np.bincount(links.device) >= MIN_LINKS)
-              if device in links.anchors]
+              for device in _enough_links(links) if device in links.anchors]
     most = MAX_TRIALS_WITH_MAP if with_map else MAX_TRIALS
     found, truth_m, misfits = [], [], []
     for number in np.random.default_rng(seed).permutation(len(trials))[:most]:
@@ -85,6 +85,13 @@ def calibrate_radii(models: list[EffectModel], held_out: list[LinkData], area_m:
         enough = [each for each in POWERS if (ratios(each) <= 1).mean() >= CREDIBLE]
         power = enough[0] if enough else POWERS[-1]
     return RadiusCalibration(power, radius_factor(ratios(power)), float(np.median(misfits)))
+
+
+def _enough_links(links: LinkData) -> np.ndarray:
+    """Return devices with links enough to be located, of which at least one was heard."""
+    count, heard = (np.bincount(links.device[rows], minlength=len(links.device_names))
+                    for rows in (slice(None), np.isfinite(links.level_db)))
+    return np.flatnonzero((count >= MIN_LINKS) & (heard > 0))
 
 
 def radius_factor(ratios: np.ndarray) -> float:

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from radiotwin.closeloop.run import Loop, significant
+from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.params import Parameter
-from radiotwin.links import LinkData, evidence_blocks, residual_variables
+from radiotwin.links import evidence_blocks, residual_variables
 from radiotwin.report.labels import variable_label
 from radiotwin.scene.citymap import CityMap
 
@@ -29,7 +30,7 @@ class LinkArrays:
         level_db: (n,) measured gain [dB] or power [dBm]; NaN: not detected.
         is_gain: whether the level is a gain.
         receiver_m: (n, 3) receiver positions [m].
-        device_m: (k, 3) device positions of the model [m].
+        device_m: (k, 3) device positions of the model [m]; NaN where it has none.
         anchor: (k,) whether a device's position is declared.
         los: (n,) whether a link has line of sight.
         block: (n,) index of the block of links with a common error.
@@ -186,7 +187,7 @@ def collect(loop: Loop) -> LoopData:
         loop: result of `radiotwin.closeloop`.
     """
     model = loop.after
-    links = _links(model.links, loop.before.held_out_mean_db)
+    links = _links(model.whole, loop.before.held_out_mean_db)
     before = loop.dependences_before
     dependences = [*significant(before, loop.criteria), *loop.remaining]
     in_base = sum(each.effect.is_declared for each in model.whole.effects)  # they come first
@@ -201,9 +202,11 @@ def collect(loop: Loop) -> LoopData:
         interpolated_db)
 
 
-def _links(links: LinkData, predicted_db: np.ndarray) -> LinkArrays:
+def _links(model: FoldModel, predicted_db: np.ndarray) -> LinkArrays:
+    links, device_m = model.links, model.links.device_m.copy()
+    device_m[links.device[~model.usable]] = np.nan
     return LinkArrays(
-        links.level_db, links.is_gain, links.receiver_m, links.device_m,
+        links.level_db, links.is_gain, links.receiver_m, device_m,
         np.isin(np.arange(len(links.device_m)), list(links.anchors)), links.los,
         evidence_blocks(links), links.first_s,
         {"device": links.device_names, "receiver": links.receiver_names,

@@ -40,7 +40,6 @@ COLUMNS = {"n": "links", "bias_db": "bias [dB]", "std_db": "standard deviation [
            "nll": "−log-likelihood [nats]"}
 CARDS = (("rmse_db", "RMSE, before and after", " dB"), ("bias_db", "bias", " dB"),
          ("std_db", "standard deviation", " dB"), ("correlation", "correlation", ""))
-MAX_NAMED = 4  # variables in a sentence
 MAX_ROWS = 40  # groups with more members are left out of the tables
 MAX_COLUMNS = 30  # of the scores
 MAX_MODELS = 100

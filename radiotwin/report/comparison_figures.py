@@ -32,10 +32,11 @@ def write_comparison_figures(comparison: Comparison, scene: Scene, truth: RadioM
     """
     folder = Path(folder)
     save(scatter_figure(comparison, list(comparison.twins)), folder / "scatter.png")
+    shown = [name for name in SHOWN if name in comparison.twins] or list(comparison.twins)[:2]
     if len(comparison.locations) and comparison.locations["error_m"].notna().all():
-        save(estimates_figure(comparison, list(SHOWN), scene), folder / "estimates.png")
+        save(estimates_figure(comparison, shown, scene), folder / "estimates.png")
     if truth is not None:
-        maps = {name: comparison.twins[name].radio_map(scene) for name in reversed(SHOWN)}
+        maps = {name: comparison.twins[name].radio_map(scene) for name in reversed(shown)}
         figure = model_maps_figure(truth, maps, scene, typical_device(truth, maps))
         save(figure, folder / "maps.png")
 

@@ -36,7 +36,7 @@ def effect_figure(effect: EffectData, background: MapBackground) -> Figure:
         effect: the effect and its contribution.
         background: map of the same links.
     """
-    kind = effect.figure or FIGURE_OF_NAME.get(effect.name) or FIGURE_OF_STAGE.get(effect.stage, "")
+    kind = effect.figure or FIGURE_OF_STAGE.get(effect.stage, "")
     return FIGURES.get(kind, dependence_figure)(effect, background)
 
 
@@ -151,11 +151,6 @@ def interval_figure(effect: EffectData, background: MapBackground) -> Figure:
 FIGURES: dict[str, Callable[[EffectData, MapBackground], Figure]] = {
     "dependence": dependence_figure, "histogram": histogram_figure, "intervals": interval_figure,
     "links": affected_links_figure, "pattern": pattern_figure, "response": response_figure}
-FIGURE_OF_NAME = {
-    "antenna_pattern": "pattern", "body_shadowing": "pattern",
-    "device_gain_offset": "intervals", "receiver_gain_offset": "intervals",
-    "device_position_error": "links", "receiver_position_error": "links", "foliage": "links",
-    "interference": "links", "missing_obstacle": "links", "removed_obstacle": "links"}
 FIGURE_OF_STAGE = {"paths": "histogram", "detection": "intervals", "limit": "intervals",
                    "receiver": "response"}
 

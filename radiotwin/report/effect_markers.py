@@ -28,7 +28,7 @@ def mark(ax: Axes, effect: EffectData) -> None:
 
 
 def _mark_box(ax: Axes, effect: EffectData) -> Label:
-    """Outline a box: centre x, y, length, width, height [m] and clockwise rotation [deg]."""
+    """Outline a box: centre x, y, length, width, height [m] and counter-clockwise turn [deg]."""
     x_m, y_m, length_m, width_m, height_m, turn_deg = effect.params["box"]
     turn = np.radians(turn_deg)
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1)]) * 0.5 * (length_m, width_m)

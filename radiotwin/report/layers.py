@@ -5,6 +5,7 @@ import pandas as pd
 
 from radiotwin.compare import comparable_db
 from radiotwin.display.style import level_range_db, residual_range_db
+from radiotwin.link_view import moving_end
 from radiotwin.measurement_columns import MAX_COORDINATE_M
 from radiotwin.radiomap import RadioMap
 from radiotwin.report.packing import pack, pack_db, pack_m
@@ -65,9 +66,8 @@ def link_layer(run: Run) -> dict | None:
     if step > 1:
         run.notes.append(f"Of {len(links):,} held-out links every {step}th is shown.")
         links = links.iloc[::step]
-    ends_m = [links[[f"{end}_{axis}_m" for axis in "xyz"]].to_numpy(dtype=float)
-              for end in ("receiver", "device")]
-    moving_m = max(ends_m, key=lambda end_m: len(np.unique(end_m[:, :2].round(), axis=0)))
+    end = moving_end(links)
+    moving_m = links[[f"{end}_{axis}_m" for axis in "xyz"]].to_numpy(dtype=float)
     names = sorted(links["device"].unique())
     before_db, after_db = (links[f"{when}_db"].to_numpy(dtype=float)
                            for when in ("before", "after"))

@@ -54,7 +54,7 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
             None: in this process.
 
     Returns:
-        the twin; positions of devices that could not be located are NaN.
+        the twin; `located` says of which devices the position is known.
 
     Warns:
         Of more than `MAX_LINKS` links, `THINNED_LINKS` are drawn, evenly among the devices.

@@ -14,6 +14,7 @@ from radiotwin.channel.base import MIN_DETECTED
 from radiotwin.channel.published import PublishedLaw
 from radiotwin.errors import BadInput
 from radiotwin.links import LinkData, LinkGeometry, link_geometry
+from radiotwin.links.prepare import ASSUMED_HEIGHT_M
 from radiotwin.localize import (
     DeviceEstimate,
     LocalizeSettings,
@@ -150,7 +151,8 @@ def _locate(links: LinkData, scene: Scene, channel: ChannelModel, unknown: np.nd
     measured = links.receiver_m[rows], links.device[rows], links.level_db[rows], channel
     options: dict[str, Any] = {
         "devices": unknown, "bounds": scene.config.extent.bounds, "city": links.city,
-        "z_m": links.device_m[unknown, 2], "limit_db": limit_db, "seed": seed,
+        "z_m": np.nan_to_num(links.device_m[unknown, 2], nan=ASSUMED_HEIGHT_M),
+        "limit_db": limit_db, "seed": seed,
         "start_m": start_m, "settings": settings}
     names = [links.device_names[index] for index in unknown]
     return kept("positions", (*measured, options, names),

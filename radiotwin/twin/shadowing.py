@@ -57,8 +57,8 @@ def with_shadowing(radio_map: RadioMap, twin: Twin, measurements: Measurements, 
 
 
 def _nearest(axis_m: np.ndarray, there_m: np.ndarray) -> np.ndarray:
-    """Return the (n,) rows of an axis that are nearest to coordinates (n,) [m]."""
-    return np.abs(axis_m[:, None] - there_m).argmin(axis=0)
+    """Return the (n,) rows of a rising axis that are nearest to coordinates (n,) [m]."""
+    return np.searchsorted((axis_m[1:] + axis_m[:-1]) / 2, there_m)
 
 
 def fit_shadowing(radio_map: RadioMap, measurements: Measurements, limit_db: float,

@@ -217,8 +217,7 @@ def _check_terms(effects: list[FittedEffect], devices: list[str], receivers: lis
         row % 2, row.astype(float), nothing, devices, receivers or ["any"], ["f0", "f1"], 2.4e9,
         None, True, frozenset(range(len(devices))))
     for each in effects:
-        needs_map = "no 3D map" in (each.effect.unavailable(links) or "")
-        if needs_map or getattr(each.params, "exact", False):
+        if each.effect.needs_map or getattr(each.params, "exact", False):
             continue  # checked when it predicts
         term = each.effect.term(links, each.params, lambda links, exact=False: np.zeros(len(links)))
         if term.columns.shape[1] != len(each.coefficients):

@@ -65,7 +65,7 @@ class Twin(Summarised):
 
     @property
     def device_m(self) -> np.ndarray:
-        """(k, 3) positions [m]; NaN where a device could not be located."""
+        """(k, 3) positions [m]; NaN where nothing is known of a device's."""
         positions_m = [(each.x_m, each.y_m, each.z_m) for each in self.devices]
         return np.array(positions_m, dtype=float).reshape(-1, 3)
 

@@ -19,6 +19,7 @@ from radiotwin.closeloop.result_file import (
 from radiotwin.closeloop.run import close_loop
 from radiotwin.effects.gain_offsets import ReceiverGainOffset
 from radiotwin.errors import BadInput
+from radiotwin.report import closeloop_summary, write_closeloop_page
 
 VERSION_1 = Path(__file__).parent / "version_1" / "closeloop.json"  # of radiotwin 0.1, see tests/twin/version_1
 
@@ -135,3 +136,31 @@ def test_fields_that_are_not_checked_are_not_kept(old):
     new = upgrade_report(old)
     effect = new["effects"][0] | {"figure": "<img>", "__html__": "<img>"}
     assert upgrade_report(new | {"extra": "<img>", "effects": [effect, *new["effects"][1:]]}) == new
+
+
+@pytest.fixture
+def least():
+    """The least that a report of this version has."""
+    scores = {"n": 3, "rmse_db": 4.0}
+    effect = {"name": "foliage", "rank": 1, "parameters": {}, "evidence": {"heldout_nll_gain": 1.0, "p_value": 0.1}}
+    return {"schema": "radiotwin.closeloop/2", "base": "twin", "verdict": "effect", "effects": [effect], "candidates": [],
+            "heldout": {"by": "flight", "folds": 2, "n": 3}, "baselines": {}, "notes": [],
+            "error": {"before": dict(scores), "after": dict(scores), "noise_floor_db": None},
+            "remaining": {"structured": False, "drivers": []}}
+
+
+def test_the_least_that_the_schema_asks_for_makes_a_page(least, tmp_path):
+    report = upgrade_report(least)
+    write_closeloop_page(report, tmp_path, "least")
+    assert "4.00" in closeloop_summary(report)
+
+
+def test_what_a_sentence_computes_with_is_refused_where_it_is_not_known(least):
+    least["error"]["after"]["rmse_db"] = None
+    with pytest.raises(BadInput, match="verdict is effect, and error has no rmse_db"):
+        upgrade_report(least)
+    upgrade_report(least | {"verdict": "none", "effects": []})  # nothing was held out, so there is nothing to compare
+    difference = {"value": None, "low": None, "high": None, "unit": "dB"}
+    compared = [{"first": "a", "second": "b", "difference_db": difference, "pairs": 3, "places": 3}]
+    with pytest.raises(BadInput, match=r"receivers_compared\.0\.difference_db\.value"):
+        upgrade_report(least | {"verdict": "none", "receivers_compared": compared})

@@ -1,10 +1,13 @@
 """The loop on worlds without a map, made by other formulas: the hidden effect is named and the error falls."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from radiotwin.closeloop.cross_validation import CrossValidatedModel
 from radiotwin.closeloop.result_file import make_report
-from radiotwin.closeloop.run import close_loop
+from radiotwin.closeloop.run import best_base, close_loop
 from radiotwin.errors import BadInput
 
 pytestmark = pytest.mark.usefixtures("short_report")
@@ -178,3 +181,34 @@ def test_devices_can_be_held_out(open_ground):
     assert named(report)[0] == "receiver_gain_offset" and report["heldout"]["by"] == "device"
     with pytest.raises(BadInput, match="allowed are auto, flight, block, quadrant, device"):
         close_loop(open_ground.measured(world), base="log-distance", hold_out="colour")
+
+
+def test_when_a_receiver_changed_a_flight_that_is_held_out_does_not_tell(open_ground):
+    world = open_ground.fly(4)
+    world.gain_db[(world.receiver == 1) & (world.flight >= 3)] -= 6.0
+    loop = close_loop(open_ground.measured(world), base="log-distance", hold_out="flight")
+    whole, *folds = ([each.params.receivers[1].number for each in model.effects if each.effect.name == "receiver_drift"]
+                     for model in loop.for_twin.models)
+    (when_s,) = whole
+    assert 459 <= when_s <= 600  # between the ends of the third flight and the beginning of the fourth
+    without_fourth_s = folds[int(loop.folds.index[world.flight == 3][0])]
+    assert without_fourth_s and without_fourth_s[0] > when_s + 50  # half-way to the fifth
+    assert all(each == whole for number, each in enumerate(folds)
+               if number not in loop.folds.index[(world.flight == 2) | (world.flight == 3)])
+
+
+class Predicts(SimpleNamespace):
+    """A base of which only held-out predictions are known."""
+
+    rmse_db = CrossValidatedModel.rmse_db
+
+
+def test_a_base_does_not_win_by_links_that_it_cannot_predict():
+    error_db = np.where(np.arange(1000) < 300, 3.0, 8.0)
+    level_db = SimpleNamespace(level_db=np.zeros(1000))
+    some = Predicts(links=level_db, held_out_mean_db=np.where(np.arange(1000) < 300, error_db, np.nan))
+    all_ = Predicts(links=level_db, held_out_mean_db=0.8 * error_db)
+    none = Predicts(links=level_db, held_out_mean_db=np.full(1000, np.nan))
+    assert some.rmse_db() < all_.rmse_db()
+    assert best_base({"twin": some, "raytrace": all_}) == "raytrace"
+    assert best_base({"twin": none, "raytrace": all_}) == "raytrace"

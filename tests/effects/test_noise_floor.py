@@ -12,6 +12,7 @@ from radiotwin.closeloop.selection import fit_candidate, score_candidate
 from radiotwin.effects.fitting import add_effect
 from radiotwin.effects.fold_model import FoldModel
 from radiotwin.effects.noise_floor import NoiseFloor
+from radiotwin.effects.refining import refine
 from radiotwin.execution import Executor
 from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.links import evidence_blocks
@@ -116,3 +117,13 @@ def test_links_with_line_of_sight_which_are_strong_need_not_show_it(flown):
     candidate = fit_candidate(model, NoiseFloor(), 0, criteria)
     score, extended = score_candidate(model, candidate, evidence_blocks(links), 20, 0, 0, criteria, Executor())
     assert score.reason == "" and extended is not None
+
+
+def test_a_floor_that_begins_as_high_as_it_may_be_is_still_searched_below(flown):
+    """Where the highest of the floors that are tried is the highest allowed, only lower ones are left."""
+    model = FoldModel.build(flown, KnownLevels(LogDistanceLine(-40.0, -2.5, 4.0)), 5.0)
+    highest_db = FLOOR_DB + 4.0
+    params = NoiseFloor.Params(receivers={RAISED: highest_db}, highest={RAISED: highest_db}, alone=True)
+    with_floor = model.with_effects([model.apply(NoiseFloor(), params)])
+    refined, _ = refine(with_floor, with_floor.fit())
+    assert refined.effects[-1].params.receivers[RAISED] == pytest.approx(FLOOR_DB, abs=0.7)

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
+from radiotwin.effects.boxes import Box
 from radiotwin.effects.mapped_buildings import buildings
+from radiotwin.effects.missing_obstacle import MissingObstacle
 from radiotwin.effects.removed_obstacle import RemovedObstacle
 from radiotwin.scene.citymap import CityMap
 from tests.scene.test_citymap import clip_interval
@@ -61,3 +63,17 @@ def test_a_building_that_is_lower_than_what_heights_are_off_is_never(make_links,
     low = ((-10.0, -10.0, 10.0, 10.0, 4.5), BOXES[1])
     monkeypatch.setattr("tests.effects.test_removed_obstacle.BOXES", low)
     assert suspected(make_links, view, [low[1]]) is None
+
+
+def test_each_of_several_buildings_that_are_gone_is_gone_whatever_else_has_changed():
+    """By the numbers of the map as it was given, while buildings go and come before them."""
+    row = city_of([(x, 0.0, x + 20.0, 20.0, 20.0) for x in (0.0, 100.0, 200.0, 300.0)])
+    centres_m, effect = buildings(row)[1], RemovedObstacle()
+    params = [effect.Params(building=number, centre_m=tuple(centres_m[number].tolist()), exact=True) for number in range(4)]
+    there, added = MissingObstacle(), Box(-100.0, 10.0, 10.0, 10.0, 15.0, 0.0)
+    left = {(0, 1): [210, 310], (0, 3): [110, 210], (3, 0): [110, 210], (2, 2): [10, 110, 310]}
+    for gone, left_x_m in left.items():
+        city = there.corrected_map(row, there.Params(box=added))
+        for number in gone:
+            city = effect.corrected_map(city, params[number])
+        np.testing.assert_allclose(np.sort(buildings(city)[1][:, 0]), [-100.0, *left_x_m])

@@ -3,10 +3,14 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from radiotwin.links import prepare_links
 from radiotwin.links.heights import height_notes
+from radiotwin.measurements import Measurements
 from radiotwin.tables import Origin
+from tests.terrains import terrain_map
 
 FLIGHT_M = np.column_stack([np.linspace(-100, 100, 50), np.zeros(50), np.linspace(30, 80, 50)])
 
@@ -35,3 +39,20 @@ def test_another_zero_is_named(world, points_m, parts):
 @pytest.mark.parametrize("points_m", [FLIGHT_M, FLIGHT_M * [1, 1, np.nan], raised(100), np.vstack([FLIGHT_M, raised(-60)[:10]])])
 def test_plausible_or_unknown_heights_are_not_mentioned(points_m):
     assert height_notes(points_m, scene(520)) == []
+
+
+def test_a_device_whose_height_is_not_given_is_held_above_the_ground():
+    """One of unknown position above most of the ground that was flown over, and not below it."""
+    city = terrain_map(lambda x_m, y_m: np.where(x_m > 300.0, 160.0, 100.0) + 0 * y_m)
+    world = SimpleNamespace(city=city, config=SimpleNamespace(origin=None, gain_limit_db=-150.0,
+                                                              radio=SimpleNamespace(frequency_hz=2e9, sensitivity_dbm=-120.0)))
+    rng, count = np.random.default_rng(0), 200
+    receiver_m = np.column_stack([rng.uniform(-400, 400, (count, 2)), np.full(count, 190.0)])
+    names = np.array(["anchor", "phone"])[rng.integers(0, 2, count)]
+    table = pd.DataFrame({"flight": "f0", "receiver": "r", "device": names, "gain_db": rng.uniform(-120, -80, count)}
+                         | {f"receiver_{axis}_m": receiver_m[:, i] for i, axis in enumerate("xyz")})
+    devices = pd.DataFrame({"device": ["anchor", "phone"], "x_m": [350.0, np.nan], "y_m": [0.0, np.nan], "z_m": np.nan,
+                            "role": ["anchor", "unknown"]})
+    links = prepare_links(Measurements(table, devices), world)
+    assert dict(zip(links.device_names, links.device_m[:, 2])) == pytest.approx({"anchor": 161.5, "phone": 101.5})
+    assert any("taken for 1.5 m above the ground" in note for note in links.notes)

@@ -64,3 +64,12 @@ def test_a_receiver_that_has_changed_shows_in_the_misfit(open_ground):
     misfits = [misfit(model, changed.select(changed.device == each.device), each)
                for each in locate(model, changed, AREA_M)]
     assert np.sqrt(np.median(misfits) / found.typical_misfit) > 1.2
+
+
+def test_a_device_that_a_fold_never_heard_is_no_trial(open_ground):
+    """Blanks alone locate nobody; one such device must not hide how well the others fit."""
+    folds = folds_of(open_ground, 3)
+    deaf = [replace(fold, level_db=np.where(fold.device == 2, np.nan, fold.level_db)) for fold in folds]
+    without = [fold.select(fold.device != 2) for fold in folds]
+    found, expected = (calibrate_radii([overconfident(6.0)] * 4, each, AREA_M, 0) for each in (deaf, without))
+    assert np.isfinite(found.typical_misfit) and found == expected

@@ -109,3 +109,11 @@ def test_of_too_many_links_some_of_each_device_are_drawn(monkeypatch):
     assert thin.table["row"].is_monotonic_increasing and thin.table["row"].between(200, 400).sum() > 10
     with pytest.warns(UserWarning):
         assert fit._thinned(data, 0).table.equals(thin.table)
+
+
+def test_a_spare_device_without_a_height_is_no_reason_to_fit_nothing(small_scene, flown):
+    spare = pd.DataFrame([{"device": "spare", "x_m": np.nan, "y_m": np.nan, "z_m": np.nan, "role": "unknown"}])
+    devices = pd.concat([flown.devices, spare], ignore_index=True)
+    twin = fit_twin(Measurements(flown.table, devices), small_scene, model="log_distance")
+    last = twin.devices[-1]
+    assert last.device == "spare" and not last.located and np.isnan([last.x_m, last.y_m]).all()

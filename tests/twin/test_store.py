@@ -13,6 +13,10 @@ import pytest
 from radiotwin.channel import followed_paths
 from radiotwin.closeloop.corrected_twin import corrected_twin
 from radiotwin.closeloop.run import close_loop
+from radiotwin.effects import catalogue
+from radiotwin.effects.effect_model import EffectModel
+from radiotwin.effects.fold_model import FittedEffect
+from radiotwin.effects.roof_heights import Roof
 from radiotwin.errors import BadInput
 from radiotwin.links import prepare_links
 from radiotwin.measurements import read_measurements
@@ -206,3 +210,25 @@ def test_a_twin_reads_nothing_outside_its_folder(tmp_path, name):
     (tmp_path / "twin" / name).symlink_to(tmp_path / name)
     with pytest.raises(BadInput, match="leads out of"):
         Twin.load(tmp_path / "twin")
+
+
+OF_MAPS = {
+    "building_entry": {"building": "traditional", "frequency_hz": 2.4e9}, "diffraction": {"strength_db": 3.0, "level_db": -40.0},
+    "mapped_vegetation": {"kind": "wood"}, "removed_obstacle": {"building": 0, "centre_m": (0.0, 0.0, 9.0)},
+    "roof_heights": {"roofs": (Roof(0, 1.0, 1.0, 9.0, 1.0, 2.0),)}, "uncertain_sight": {"contrast_db": 20.0},
+    "wall_reflection": {"strength_db": 3.0, "level_db": -40.0}}
+
+
+def test_every_effect_that_needs_a_map_is_tried():
+    assert {each.name for each in catalogue() if each.needs_map} == {*OF_MAPS, "antenna_pattern"}  # whose params other tests have
+
+
+@pytest.mark.parametrize("name", OF_MAPS)
+def test_a_twin_with_an_effect_that_needs_a_map_comes_back_without_one(twin, tmp_path, name):
+    effect = next(each() for each in catalogue() if each.name == name)
+    params = effect.Params(**OF_MAPS[name])
+    fitted = EffectModel(twin.channel, (FittedEffect(effect, params, np.zeros(0)),), np.zeros(2), np.array([3.0]), 5.0,
+                         twin.device_m, ("r0",), np.nan, 0.0)
+    replace(twin, fitted=fitted).save(tmp_path / "twin")
+    (again,) = Twin.load(tmp_path / "twin").effects
+    assert type(again.effect) is type(effect) and again.params == params
