@@ -92,9 +92,8 @@ def fit_twin(measurements: Measurements, scene: Scene, *, model: str = "segmente
 
 
 def _usable(measurements: Measurements) -> Measurements:
-    """Return the links without copies; raise BadInput where all levels are equal."""
-    if np.isfinite(measurements.level_db).any():  # where none is, the model says what it lacks
-        refuse_empty_levels(measurements.level_db, measurements.level_column)
+    """Return the links without copies; raise BadInput where levels are empty or all equal."""
+    refuse_empty_levels(measurements.level_db, measurements.level_column)
     copied = copied_rows(measurements.table)
     if not copied.any():
         return measurements

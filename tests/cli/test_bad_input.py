@@ -78,7 +78,7 @@ def test_one_flight_only(run, here):
 
 def test_nothing_detected(run, here):
     change(here, lambda table: table.assign(gain_db=""))
-    refuse(run, FIT, here, "nothing detected")
+    refuse(run, FIT, here, "nothing was detected")
 
 
 def test_all_links_nlos(run, here):
