@@ -11,6 +11,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
+from matplotlib.ticker import LogFormatter
 
 from marl.flights import Flights
 from marl.mission import Known, Mission
@@ -104,6 +105,8 @@ def curve_figure(curves: dict[str, list[dict]], levels: dict[str, float]) -> Fig
              ylabel="share of all data collected in the truth")
     if any(row["real_episodes"] > 0 for rows in curves.values() for row in rows):
         axes.set_xscale("log")  # which fails where there is nothing to show
+        axes.xaxis.set_major_formatter(LogFormatter())  # 1, 2, 10, and no powers
+        axes.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1, 0.4)))
     axes.grid(alpha=0.3, which="both")
     figure.legend(loc="outside lower center", ncols=3, frameon=False)
     return figure

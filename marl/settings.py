@@ -96,7 +96,7 @@ class RunSettings(BaseModel):
     twin: Literal["nn", "log-distance", "kriging", "raytrace", "path-kriging", "truth"] = Field(
         "nn", description="model of the twin that is trained in; raytrace: paths over the 3D map, "
         "minutes a round; path-kriging: the same over a map that may be wrong; truth: a perfect "
-        "twin, no flight is needed")
+        "twin, in which training flights count as real ones")
     twin_shadowing: Literal["fitted", "slot"] = Field(
         "fitted", description="how long the twin's error lasts in a simulated flight: fitted to "
         "its residuals, or one slot; preset paper: slot")
@@ -104,8 +104,8 @@ class RunSettings(BaseModel):
         "fedqmix", description="learner, planner or heuristic that flies")
     preset: Literal["fast", "paper"] = Field("fast", description="settings of learning")
     real_episodes: int = Field(
-        10, ge=1, le=10_000, description="rounds, each with one real flight to learn the twin "
-        "from; preset paper: 30")
+        10, ge=1, le=10_000, description="rounds, each with one real flight of all UAVs to learn "
+        "the twin from; preset paper: 30")
     episodes: int = Field(
         800, ge=1, le=10_000_000, description="training episodes of each replica in a round; "
         "preset paper: 1000")

@@ -65,7 +65,7 @@ def _gains(folder: Path, scene: Scene, count: int, rng: np.random.Generator, qua
     points_m = np.column_stack([rng.uniform(low_m, high_m, (count, 2)),
                                 rng.uniform(*HEIGHTS_M, count)])
     write_csv(pd.DataFrame(points_m, columns=["x_m", "y_m", "z_m"]), folder / "points.csv")
-    return run_measured(["radiotwin.cli", "gains", "scene", "--points", "points.csv", "--quality",
+    return run_measured(["radiotwin", "gains", "scene", "--points", "points.csv", "--quality",
                          quality, "--workers", "1", "--device", "cpu", *options], folder)
 
 

@@ -70,7 +70,7 @@ def run_measured(command: list[str], folder: Path) -> dict[str, float]:
 
 def make_import(links: int, folder: Path) -> dict[str, list[str]]:
     """Write a table of links in a small city, and how to read it; see `Make`."""
-    run_measured(["radiotwin.cli", "build-scene", "preset:small", "-o", "scene"], folder)
+    run_measured(["radiotwin", "build-scene", "preset:small", "-o", "scene"], folder)
     scene, rng = Scene.load(folder / "scene"), np.random.default_rng(0)
     names = np.array([device.device for device in scene.config.devices])
     low_x, high_x, low_y, high_y = scene.config.extent.bounds
@@ -96,8 +96,8 @@ def make_import(links: int, folder: Path) -> dict[str, list[str]]:
     write_csv(pd.DataFrame({"device": names, **dict(zip("xyz", scene.device_m.T))}),
               folder / "cells.csv")
     columns = "level=rsrp,device=cell,x=x,y=y,z=z,time=time,flight=flight"
-    fit = ["radiotwin.cli", "fit", "out/measurements.csv", "--scene", "scene", "-o"]
-    return {"import": ["radiotwin.cli", "import", "links.csv", "--columns", columns,
+    fit = ["radiotwin", "fit", "out/measurements.csv", "--scene", "scene", "-o"]
+    return {"import": ["radiotwin", "import", "links.csv", "--columns", columns,
                        "--level-unit", "dBm", "--length-unit", "m", "--time-format", "epoch s",
                        "--not-detected=-140", "--devices", "cells.csv", "-o", "out"],
             "fit segmented_log_distance": [*fit, "law", "--model", "segmented_log_distance"],
@@ -118,7 +118,7 @@ def make_map_inputs(size: int, folder: Path) -> dict[str, list[str]]:
     write_config(coarse.config.model_copy(update={"lattice": fine, "uavs": []}),
                  folder / "scene" / "scene.toml")
     device = coarse.config.devices[0].device
-    command = ["radiotwin.cli", "map", "twin", "--scene", "scene", "--devices", device, "-o"]
+    command = ["radiotwin", "map", "twin", "--scene", "scene", "--devices", device, "-o"]
     return {f"map to {suffix}": [*command, f"map{suffix}"] for suffix in (".nc", ".tif", ".csv")}
 
 
@@ -140,7 +140,7 @@ def make_town(size: int, folder: Path) -> dict[str, list[str]]:
                          "geometry": {"type": "Polygon", "coordinates": rings}})
     (folder / "town.geojson").write_text(
         json.dumps({"type": "FeatureCollection", "features": features}), encoding="utf-8")
-    return {"build-scene": ["radiotwin.cli", "build-scene", "town.geojson", "-o", "scene",
+    return {"build-scene": ["radiotwin", "build-scene", "town.geojson", "-o", "scene",
                             "--devices", "20", "--quiet"]}
 
 
@@ -169,7 +169,7 @@ def make_close_loop(links: int, folder: Path) -> dict[str, list[str]]:
     Five flights of two UAVs; half of the devices are anchors. Levels follow a law of distance and
     line of sight, with shadowing that changes over 40 m along the way.
     """
-    run_measured(["radiotwin.cli", "build-scene", "preset:small", "-o", "scene"], folder)
+    run_measured(["radiotwin", "build-scene", "preset:small", "-o", "scene"], folder)
     scene, rng = Scene.load(folder / "scene"), np.random.default_rng(0)
     device_m, flights, uavs = scene.device_m, 5, 2
     slots = -(-links // (len(device_m) * flights * uavs))
@@ -206,7 +206,7 @@ def make_close_loop(links: int, folder: Path) -> dict[str, list[str]]:
         "device": names, "x_m": np.where(known, device_m[:, 0], np.nan),
         "y_m": np.where(known, device_m[:, 1], np.nan), "z_m": device_m[:, 2],
         "role": np.where(known, "anchor", "unknown")}), folder / "devices.csv")
-    loop = ["radiotwin.cli", "close-loop", "measurements.csv", "--scene", "scene"]
+    loop = ["radiotwin", "close-loop", "measurements.csv", "--scene", "scene"]
     return {"close-loop": [*loop, "--out", "loop"]}
 
 

@@ -65,7 +65,7 @@ def _built(buildings: int, seed: int) -> dict[str, float]:
     if not (folder / "build.json").is_file():
         folder.mkdir(parents=True, exist_ok=True)
         write_map(city_footprints(buildings, seed), folder / "city.geojson")
-        taken = run_measured(["radiotwin.cli", "build-scene", "city.geojson", "-o", "scene",
+        taken = run_measured(["radiotwin", "build-scene", "city.geojson", "-o", "scene",
                               "--devices", "10", "--step", "50", "--altitudes", "60", "--quiet"],
                              folder)
         with atomic_path(folder / "build.json") as temporary:

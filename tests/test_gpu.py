@@ -21,7 +21,7 @@ RBM = ROOT / "scenes" / "rbm"
 def gains(device, points, folder, *options):
     """Traced by a command of its own: a process has one device."""
     out = folder / f"{device}{len(options)}.csv"
-    done = subprocess.run([sys.executable, "-m", "radiotwin.cli", "gains", str(RBM), "--points", str(points), "-o", str(out),
+    done = subprocess.run([sys.executable, "-m", "radiotwin", "gains", str(RBM), "--points", str(points), "-o", str(out),
                            "--device", device, "--devices", "d0,d4", *options], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return pd.read_csv(out)["gain_db"].to_numpy()

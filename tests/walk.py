@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
-PROGRAMS = {"radiotwin": "radiotwin.cli", "python -m marl.fedqmix": "marl.fedqmix"}
+PROGRAMS = {"radiotwin": "radiotwin", "python -m marl.fedqmix": "marl.fedqmix"}
 """How a command line begins -> the module that is run."""
 
 

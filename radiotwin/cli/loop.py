@@ -6,6 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from radiotwin.cli.options import (
+    MAX_SEED,
     Cluster,
     DeviceTable,
     MeasurementFile,
@@ -43,7 +44,7 @@ def close_loop(
                             "roofs as high and anchors where they were found.")] = None,
     shift: Shift = None,
     seed: Annotated[int, typer.Option(
-        min=0, help="Seed of folds, fits and permutations.")] = 0,
+        min=0, max=MAX_SEED, help="Seed of folds, fits and permutations.")] = 0,
     workers: Workers = "auto",
     cluster: Cluster = None,
 ) -> None:

@@ -45,8 +45,9 @@ Combining = Annotated[str, typer.Option(
 Radius = Annotated[float | None, typer.Option(
     help="Leave out what lies farther from the lines of a batch's links [m; 400 in cities of more "
          "than 5,000 shapes, inf (the whole city) in others].")]
-RaySeed = Annotated[int, typer.Option(min=0, help="Seed of the rays.")]
-FitSeed = Annotated[int, typer.Option(min=0, help="Seed of the fits and the search.")]
+MAX_SEED = 2**32 - 1  # of scikit-learn
+RaySeed = Annotated[int, typer.Option(min=0, max=MAX_SEED, help="Seed of the rays.")]
+FitSeed = Annotated[int, typer.Option(min=0, max=MAX_SEED, help="Seed of the fits and the search.")]
 
 Workers = Annotated[str, typer.Option(
     metavar="auto|N", help="Processes that share the work; 1 is this one. auto: as many as there "

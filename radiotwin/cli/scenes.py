@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from radiotwin.cli.options import (
+    MAX_SEED,
     OnlyDevices,
     PointsFile,
     SceneFolder,
@@ -76,7 +77,8 @@ def build_scene(
         min=0, help="Devices to place on free ground [0].")] = None,
     uavs: Annotated[int | None, typer.Option(
         min=0, help="UAVs to place near the middle [3].")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the placement [0].")] = None,
+    seed: Annotated[int | None, typer.Option(
+        min=0, max=MAX_SEED, help="Seed of the placement [0].")] = None,
     altitudes: Annotated[str | None, typer.Option(
         metavar="Z,…", help="Altitudes of the lattice [m], such as 1.5 for streets [three above "
                             "the roofs].")] = None,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from radiotwin.cli.options import ComputeDevice
+from radiotwin.cli.options import MAX_SEED, ComputeDevice
 from radiotwin.console import console, notice, print_rows, result, say
 
 
@@ -23,7 +23,7 @@ def demo(
              "taken.")] = "preset:small",
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder of all results.")] = Path("demo"),
     seed: Annotated[int, typer.Option(
-        min=0, help="Seed of placement, flights and fits.")] = 0,
+        min=0, max=MAX_SEED, help="Seed of placement, flights and fits.")] = 0,
     device: ComputeDevice = "auto",
 ) -> None:
     """Run the whole chain on a small scene, in minutes.

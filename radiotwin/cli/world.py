@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from radiotwin.cli.options import (
+    MAX_SEED,
     Cluster,
     Combining,
     ComputeDevice,
@@ -233,7 +234,8 @@ def survey(
     noise_db: Annotated[float | None, typer.Option(
         help="Standard deviation of the receivers' error [1; 0 where the truth has "
              "shadowing of its own, as segmented has].")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of paths and noise.")] = 0,
+    seed: Annotated[int, typer.Option(
+        min=0, max=MAX_SEED, help="Seed of paths and noise.")] = 0,
 ) -> None:
     """Fly the scene's UAVs through a truth map.
 

@@ -12,6 +12,7 @@ from radiotwin.coverage.run import Coverage
 
 BELOW_COLOUR = "#c9c9c9"
 SERVER_COLOURS = "tab20"
+GREYS = 14, 15  # of these: a building is grey
 # Title, unit in labels, factor from the raster's unit to it, colours from bad to good.
 _RASTERS: dict[str, tuple[str, str, float, str]] = {
     "received_power_dbm": ("Received power", "dBm", 1.0, "RdYlGn"),
@@ -59,9 +60,10 @@ def legend_of(name: str, coverage: Coverage) -> Legend:
     """
     if name == "best_server":
         palette = colormaps[SERVER_COLOURS].colors  # type: ignore[attr-defined]
-        order = [*range(0, len(palette), 2), *range(1, len(palette), 2)]  # strong before pale
+        both = [*range(0, len(palette), 2), *range(1, len(palette), 2)]  # strong before pale
+        order = [each for each in both if each not in GREYS]
         names = [each.name for each in coverage.transmitters]
-        colours = [to_hex(palette[order[row % len(palette)]]) for row in range(len(names))]
+        colours = [to_hex(palette[order[row % len(order)]]) for row in range(len(names))]
         return Legend("Best server", (), tuple(names), tuple(colours))
     title, unit, factor, colours_name = _RASTERS[name]
     lower = class_lists(coverage.settings, coverage.dataset.attrs["bandwidth_hz"])[name]

@@ -17,7 +17,7 @@ from radiotwin.coverage.radio import (
     rate_bps,
     thermal_noise_dbm,
 )
-from radiotwin.coverage.settings import CoverageSettings
+from radiotwin.coverage.settings import Bounds, CoverageSettings
 from radiotwin.coverage.sources import (
     GainSource,
     MapSource,
@@ -183,6 +183,7 @@ def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Tra
         altitude_m = altitude_of(source, settings.height_m)
         return (CoverageGrid.of_map(map_grid(source, altitude_m)),
                 MapSource(source, altitude_m, transmitters))
+    _refuse_elsewhere(settings.extent_m, scene)
     grid = CoverageGrid.over(
         settings.extent_m or scene.config.extent.bounds, settings.step_m or DEFAULT_STEP_M,
         settings.height_m or DEFAULT_HEIGHT_M)
@@ -193,6 +194,18 @@ def _prepare(source: Twin | RadioMap | str, scene: Scene, transmitters: list[Tra
                        "indoor loss could be taken off; leave --indoor-loss-db out, or take a law "
                        "or a twin")
     return grid, over_scene(source, scene, transmitters)
+
+
+def _refuse_elsewhere(extent_m: Bounds | None, scene: Scene) -> None:
+    """Raise BadInput where the map shows nothing of an extent."""
+    west, east, south, north = scene.config.extent.bounds
+    if extent_m is None:
+        return
+    x_min, x_max, y_min, y_max = extent_m
+    if x_min >= east or x_max <= west or y_min >= north or y_max <= south:
+        raise BadInput(f"an extent of x {x_min:g} to {x_max:g} m, y {y_min:g} to {y_max:g} m is "
+                       f"outside the map, which reaches from x {west:g} to {east:g} m and from y "
+                       f"{south:g} to {north:g} m; give one on it")
 
 
 def _noise_figure_db(scene: Scene, settings: CoverageSettings) -> float:

@@ -89,9 +89,9 @@ def locate_devices(measurements: Measurements, twin: Twin, scene: Scene | None =
     widening = _widening(model, links, found)
     if widening > 1.0:
         notes.append("all positions are uncertain: where devices are located, residuals are "
-                     f"{widening:.1f} times as large as in the measurements that the twin was "
-                     "learnt from, so receivers or surroundings have changed since; radii are "
-                     "that much wider")
+                     f"{widening:.1f} times as large as those of the known devices that the twin "
+                     "was learnt from: receivers or surroundings have changed since, or what was "
+                     "learnt holds less where these devices are; radii are that much wider")
         found = [replace(each, radius_m=widening * each.radius_m) for each in found]
     table = pd.DataFrame({"device": [links.device_names[each.device] for each in found],
                           "x_m": [each.x_m for each in found], "y_m": [each.y_m for each in found],

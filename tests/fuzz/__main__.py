@@ -42,7 +42,7 @@ def fuzz(
         os.environ["RADIOTWIN_CACHE"] = str(Path(scratch) / "cache")
         make_honest(honest)
         # Numba compiles the path engine once, in a process that nothing kills.
-        subprocess.run([sys.executable, "-m", "radiotwin.cli", "map", "twin_raytrace", "--scene", "scene", "-o",
+        subprocess.run([sys.executable, "-m", "radiotwin", "map", "twin_raytrace", "--scene", "scene", "-o",
                         "../warm.nc"], cwd=honest, check=True, capture_output=True)
         print(f"honest files made in {time.monotonic() - started:.0f} s", flush=True)
         started = written = time.monotonic()

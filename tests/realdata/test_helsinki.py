@@ -55,7 +55,7 @@ def test_three_sites_at_street_level_within_five_minutes(helsinki, tmp_path, wit
         source = f"twin --scene {scene.folder}"
     start_s = time.monotonic()
     options = "--transmitters sites.csv -o out --bandwidth-hz 20e6 --noise-figure-db 9"
-    result = subprocess.run([sys.executable, "-m", "radiotwin.cli", "coverage", *source.split(), *options.split()],
+    result = subprocess.run([sys.executable, "-m", "radiotwin", "coverage", *source.split(), *options.split()],
                             cwd=tmp_path, capture_output=True, text=True, timeout=600)
     assert result.returncode == 0, result.stderr
     assert time.monotonic() - start_s < MAX_S

@@ -19,7 +19,7 @@ pytestmark = pytest.mark.llvm
 
 ROOT = Path(__file__).parents[2]
 SETTINGS = SolverSettings(samples_per_src=3_000, batch_receivers=40, max_num_paths_per_src=20_000)
-TRACE = ["-m", "radiotwin.cli", "trace", "--quality", "fast", "--devices", "d0,d1", "-o"]
+TRACE = ["-m", "radiotwin", "trace", "--quality", "fast", "--devices", "d0,d1", "-o"]
 
 
 def points_of(scene):
