@@ -14,7 +14,8 @@ MIN_SD_M = 0.1
 
 def stretch(roof: Roof, base_m: float) -> float:
     """Return how much taller a building that stands on `base_m` is than on the map, a ratio."""
-    return 1.0 + roof.offset_m / max(roof.height_m - base_m, abs(roof.offset_m))
+    off_m = roof.true_offset_m
+    return 1.0 + off_m / max(roof.height_m - base_m, abs(off_m))
 
 
 def corrected_buildings(scene: Scene, shapes_of: dict[int, set[str]], left: set[str],

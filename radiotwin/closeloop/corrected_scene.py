@@ -99,7 +99,7 @@ def write_corrected_scene(loop: Loop, scene: Scene, folder: Path) -> list[str]:
     roofs = [roof for each in effects if isinstance(each.effect, RoofHeights)
              for roof in surely_off(each.params.roofs) if roof.building not in gone]
     changes += [f"the roof at ({roof.x_m:.0f}, {roof.y_m:.0f}) m is "
-                f"{above_m[roof.building] + roof.offset_m:.1f} m high, and "
+                f"{above_m[roof.building] + roof.true_offset_m:.1f} m high, and "
                 f"{above_m[roof.building]:.1f} m on the map"
                 for roof in roofs]
     config, antennas, found = with_antennas(config, loop, scene)

@@ -4,6 +4,12 @@ Many heights are counted from storeys or guessed. A link that passes a roof's ed
 two knife edges (ITU-R P.526), but no more than what is left on other paths: the law without line of
 sight. The height of each roof with such links is estimated beside all others, with a prior around
 the map's; a roof whose uncertainty its links do not halve stays where it is.
+
+What predicts best is not yet a roof's height: where more gets around buildings than over them, all
+roofs seem low, and each by something else. In 14 campaigns that another hand made, with exact maps,
+knife edges and ways around corners, roofs came out 1.2 m too low in the mean and scattered by 1.1
+m. So of what is said of a roof, what the others have in common is taken away, and how much they
+differ is part of its uncertainty.
 """
 
 from __future__ import annotations
@@ -42,6 +48,9 @@ SWEEPS = 3  # over all roofs, each beside the others as they are
 MAX_LINKS = 6000  # that are looked at
 LEAST_CONTRAST_DB = 3.0  # between links with line of sight and without; less: roofs hide nothing
 HIDDEN_DB = 200.0  # loss of a way that something other than a roof blocks
+# Standard deviations of what laws of edges are off by, in metres of height: of one roof (worth so
+# many roofs whose scatter is seen), and of all roofs together.
+MODEL_SD_M, MODEL_ROOFS, COMMON_SD_M = 1.5, 8, 1.5
 
 
 class Roof(NamedTuple):
@@ -50,8 +59,9 @@ class Roof(NamedTuple):
     Attributes:
         building: index, as `buildings` numbers them.
         x_m, y_m, height_m: centre and height on the map [m].
-        offset_m: true minus mapped height [m].
-        offset_sd_m: standard deviation of it [m].
+        offset_m: how much higher the one is that predicts links best [m].
+        offset_sd_m: standard deviation of `true_offset_m` [m].
+        common_m: what the other roofs have in common of it, which is the model's [m].
     """
 
     building: int
@@ -60,6 +70,12 @@ class Roof(NamedTuple):
     height_m: Metres
     offset_m: Metres
     offset_sd_m: Length
+    common_m: Metres = 0.0
+
+    @property
+    def true_offset_m(self) -> float:
+        """Estimate of true minus mapped height [m]."""
+        return self.offset_m - self.common_m
 
 
 class RoofHeights(GainEffect):
@@ -122,15 +138,38 @@ class RoofHeights(GainEffect):
     @override
     def parameters(self, links: LinkData, params: Params,
                    estimate: Estimate) -> dict[str, Parameter]:
-        return {f"true_minus_mapped_height_{roof.building}_m":
-                Parameter.normal(roof.offset_m, roof.offset_sd_m, "m")
+        return {f"true_minus_mapped_height_m[{roof.x_m:.0f}, {roof.y_m:.0f}]":
+                Parameter.normal(roof.true_offset_m, roof.offset_sd_m, "m")
                 for roof in surely_off(params.roofs)}
 
 
 def surely_off(roofs: Sequence[Roof]) -> list[Roof]:
     """Return the roofs whose 90 % interval leaves out the map's height, the most wrong first."""
-    return sorted((roof for roof in roofs if abs(roof.offset_m) > QUANTILE_90 * roof.offset_sd_m),
-                  key=lambda roof: -abs(roof.offset_m))
+    return sorted((roof for roof in roofs
+                   if abs(roof.true_offset_m) > QUANTILE_90 * roof.offset_sd_m),
+                  key=lambda roof: -abs(roof.true_offset_m))
+
+
+def beside_the_others(roofs: Sequence[Roof]) -> tuple[Roof, ...]:
+    """Return roofs with what the others have in common, and with as much doubt as they differ.
+
+    Args:
+        roofs: n roofs; the standard deviation of each is of what its own links leave open.
+    """
+    off_m, own_sd_m = (np.array([getattr(roof, name) for roof in roofs])
+                       for name in ("offset_m", "offset_sd_m"))
+    found = []
+    for number, roof in enumerate(roofs):
+        others_m, sd_m = (np.delete(values, number) for values in (off_m, own_sd_m))
+        seen = max(len(others_m) - 1, 0)
+        scatter = ((others_m - others_m.mean()) ** 2).sum() if seen else 0.0
+        variance = (MODEL_ROOFS * MODEL_SD_M**2 + scatter) / (MODEL_ROOFS + seen)
+        weight = 1 / (sd_m**2 + variance)
+        common_variance = 1 / (weight.sum() + 1 / COMMON_SD_M**2)
+        found.append(roof._replace(
+            common_m=float(common_variance * (weight @ others_m)),
+            offset_sd_m=float(np.sqrt(roof.offset_sd_m**2 + variance + common_variance))))
+    return tuple(found)
 
 
 class _Search:
@@ -182,7 +221,9 @@ class _Search:
                 self._loss_db[mine] = self._ways.loss_db(offset_m, self._wavelength_m, mine)
                 x_m, y_m, height_m = centres_m[building].tolist()
                 found[building] = Roof(building, x_m, y_m, height_m, offset_m, sd_m)
-        return tuple(roof for roof in found.values() if abs(roof.offset_m) >= MIN_OFFSET_M)
+        told = [roof for roof in found.values() if roof.offset_m]
+        return tuple(roof for roof in beside_the_others(told)
+                     if abs(roof.offset_m) >= MIN_OFFSET_M)
 
     def _estimate(self, mine: np.ndarray, tall_m: float, prior_m: float) -> tuple[float, float]:
         """Return mean and sd of a roof's offset from its pairs (q,) [m]; 0 if undetermined."""
@@ -211,6 +252,8 @@ class _Search:
         if spread_m > MAX_SD_SHARE * prior_m:
             return 0.0, prior_m
         slope = float(np.median(self._slope[link[telling]]))
+        if log.argmax() == len(log) - 1:  # higher than any that was tried
+            spread_m = prior_m
         return mean_m, float(np.hypot(spread_m, WALL_SD_M * slope))
 
 
