@@ -75,8 +75,8 @@ def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collectio
     """
     with file.open() as content:
         head, tail, whole, encoding = _scan(content, file, settings.encoding)
-    lines = _split(head.decode(encoding, "replace").removeprefix("\ufeff"))
-    lines = (lines if whole else lines[:-1])[:_LINES]
+    every = _split(head.decode(encoding, "replace").removeprefix("\ufeff"))
+    lines = (every if whole else every[:-1])[:_LINES]
     if names:
         before = settings.lines_before_header or 0
         delimiter = settings.delimiter or _delimiter(lines[before:], len(names))
@@ -90,7 +90,7 @@ def find_dialect(file: LogFile, settings: Settings, expected: Sequence[Collectio
     after = settings.lines_after_table
     if after is None:
         last = _split(tail.decode(encoding, "replace"))
-        after = _trailer(lines[first:] if whole else last[1:], delimiter, header)
+        after = _trailer(every[first:] if whole else last[1:], delimiter, header)
     stripped = [name.strip() for name in header]
     repeated = next((name for i, name in enumerate(stripped) if name and name in stripped[:i]), "")
     return Dialect(encoding, delimiter, decimal, before, after, repeated, tuple(names))

@@ -10,6 +10,7 @@ MAX_NAMED = 4  # variables or effects in a sentence
 MIN_DIFFERENCE_DB = 0.5  # of two receivers, to be worth a word: instruments' tolerance
 SURE = 0.9  # a cause that is less probable is said to be probable only
 HALF = 0.5  # more probable than not
+NOT_LOOKED_FOR, LACKING = "not looked for: ", "there is no "  # a reason, and how it goes on
 LIKELY = 0.05  # a cause that is less probable is not worth a word
 BADGES = {"effect": "found: ", "none": "no cause found", "unexplained": "unexplained",
           "undecided": "undecided"}
@@ -237,8 +238,24 @@ def _unexplained(report: dict) -> str:
     step = next(iter(report["posterior"]), None)
     if step and step["probabilities"] and step["probabilities"][0]["name"] != OTHER:
         return _too_much_of_places(report, step)
-    return (f"Something is missing that no effect of the catalogue explains{_of(report, OTHER)}: "
-            f"the {_residual(report)} {_sizes(report)}").strip()
+    text = f"Something is missing that no effect of the catalogue explains{_of(report, OTHER)}"
+    if step and step["probabilities"] and (step["probabilities"][0]["probability"] or 0.0) < SURE:
+        text = f"Unexplained. Likeliest: {_likely(step['probabilities'])}"
+    return f"{text}. The {_residual(report)} {_not_looked_for(report)}{_sizes(report)}".strip()
+
+
+def _not_looked_for(report: dict) -> str:
+    """Say which effects the data lack something for: one of them may be what is missing."""
+    why: dict[str, list[str]] = {}
+    for each in report["candidates"]:
+        reason = each["reason"].removeprefix(NOT_LOOKED_FOR)
+        if reason != each["reason"] and reason.startswith(LACKING):
+            lacks = reason.removeprefix(LACKING).split(",")[0]
+            form = each.get("variant") and f" ({each['variant']})"
+            why[lacks] = [*why.get(lacks, []), name_label(each["name"]) + (form or "")]
+    parts = [f"as {LACKING}{lacks}: {join_names(list(dict.fromkeys(names)))}"
+             for lacks, names in why.items()]
+    return f"Not looked for, {'; '.join(parts)}. " if parts else ""
 
 
 def _too_much_of_places(report: dict, step: dict) -> str:
@@ -311,8 +328,11 @@ def _sizes(report: dict) -> str:
         return ""
     alike = ("errors of the map and of its materials do" if _has_map(report) else
              "shadowing does")
-    return (f"Of what the base misses about {number(step['rest_db'])} dB belong to places, as "
-            f"{alike}, and about {number(step['noise_db'])} dB to single readings.")
+    # The first is of a whole field, of which more is off than what its readings show.
+    seen_db = report["error"]["before"]["rmse_db"]
+    rest_db = step["rest_db"] if seen_db is None else min(step["rest_db"], seen_db)
+    return (f"Roughly {number(rest_db)} dB of what the base misses belong to places, as {alike}, "
+            f"and {number(step['noise_db'])} dB to single readings.")
 
 
 def _has_map(report: dict) -> bool:

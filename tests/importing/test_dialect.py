@@ -84,6 +84,14 @@ def test_a_damaged_row_within_the_table_is_refused(read):
         read(text_of(";").replace("2;48.2;11.6;B;-90.25", "2;48.2"))
 
 
+@pytest.mark.parametrize("rows", [300, 500, 30_000])
+def test_a_summary_is_found_however_long_the_table_is(read, rows):
+    """Of which the beginning alone is looked at for all else; the last does not fit into one block."""
+    text = "Zeit;Pegel\n" + "".join(f"{i};-80\n" for i in range(rows)) + "Mittel;-80;dBm\nEnde\n"
+    source, table = read(text)
+    assert len(table) == rows + 1 and table[-1] == [str(rows - 1), "-80"] and "2 lines after the table" in source.notes[0]
+
+
 def test_many_lines_after_the_table_are_a_damaged_table(read):
     with pytest.raises(BadInput, match="line 5 has 1 fields"):
         read(text_of(";") + "".join(f"Ende {i}\n" for i in range(30)))

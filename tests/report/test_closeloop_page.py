@@ -238,7 +238,21 @@ def test_a_step_between_flights_has_no_probability_and_is_called_probable(tmp_pa
 def test_something_without_a_likely_name_is_missing():
     unnamed = report("unexplained")
     unnamed["posterior"][0]["probabilities"] = [{"name": "not in the catalogue", "probability": 0.9}]
-    assert "missing that no effect of the catalogue explains (probability 0.90): the residual" in closeloop_summary(unnamed)
+    assert "missing that no effect of the catalogue explains (probability 0.90). The residual" in closeloop_summary(unnamed)
+
+
+def test_what_merely_leads_is_not_stated_and_what_was_not_looked_for_is():
+    unnamed = report("unexplained")
+    unnamed["posterior"][0] |= {"rest_db": 9.0, "probabilities": [
+        {"name": "not in the catalogue", "probability": 0.43}, {"name": "antenna_pattern", "probability": 0.34}]}
+    unnamed["candidates"] = [unnamed["candidates"][0] | {
+        "name": "body_shadowing", "variant": "loss around the body",
+        "reason": "not looked for: there is no heading_deg, so directions are unknown", "kept": False}]
+    text = closeloop_summary(unnamed)
+    assert text.startswith("Unexplained. Likeliest: something that is not in the catalogue (0.43) and antenna pattern (0.34). The")
+    assert "Not looked for, as there is no heading_deg: body shadowing (loss around the body)." in text
+    assert "Roughly 3.00 dB" in text  # no more than the whole error
+    assert "Not looked for" not in closeloop_summary(report("unexplained"))
 
 
 @pytest.mark.parametrize("likelihood, is_said", [(0.87, True), (0.49, False)])
