@@ -1,6 +1,7 @@
 """Texts of a run as pages and figures show them: nothing hidden, nothing endless."""
 
 import re
+from datetime import UTC, datetime
 from typing import Any
 
 MAX_TEXT = 2000  # characters
@@ -19,6 +20,11 @@ def shown(text: str, max_length: int = MAX_TEXT) -> str:
     """
     cut = text if len(text) <= max_length else text[:max_length - 1] + "…"
     return _HIDDEN.sub(lambda found: ascii(found[0])[1:-1], cut)
+
+
+def moment(time_s: float) -> str:
+    """Return the date and time (UTC) of seconds since 1970."""
+    return datetime.fromtimestamp(time_s, UTC).isoformat(sep=" ", timespec="seconds")
 
 
 def percent(share: float) -> str:

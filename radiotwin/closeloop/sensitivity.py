@@ -74,7 +74,8 @@ def detectable(view: ResidualView, hypotheses: Hypotheses, criteria: SelectionCr
     searches: dict[type[GainEffect], GainEffect] = {}
     for each in typical_patterns(view):
         search = searches.setdefault(each.effect, each.effect())
-        if search.unavailable(view.links) is not None:
+        named = search.name in there and not search.repeatable  # as all there can be of it
+        if named or search.unavailable(view.links) is not None:
             continue
         information = hypotheses.information(each.change_db)
         nats = needed_nats(search.name, criteria.min_probability, rest_db / noise_db,

@@ -25,6 +25,7 @@ from radiotwin.effects.comparison import (
     share_alike,
 )
 from radiotwin.effects.params import (
+    Allowed,
     EffectParams,
     Estimate,
     Parameter,
@@ -171,12 +172,16 @@ class Episode(GainEffect):
                    estimate: Estimate) -> dict[str, Parameter]:
         who = "all" if params.receiver is None else links.receiver_names[params.receiver]
         member = f"[{who}]" if params.flight is None else f"[{who}, flight {params.flight}]"
+        time_s = links.time_s[_timed_rows(links, params.receiver, params.flight)]
+        flown = Allowed(float(time_s.min()), float(time_s.max())) if len(time_s) else Allowed()
         name, unit = ("loss_db", "dB") if params.form == "loss" else \
             ("specific_attenuation_db_km", "dB/km")
         return {name + member: Parameter.normal(estimate.coefficients[0],
                                                 estimate.coefficients_sd[0], unit),
-                "start_s" + member: Parameter(params.start_s, *params.start_within_s, "s"),
-                "end_s" + member: Parameter(params.end_s, *params.end_within_s, "s")}
+                "start_s" + member: Parameter(params.start_s, *params.start_within_s, "s",
+                                              allowed=flown),
+                "end_s" + member: Parameter(params.end_s, *params.end_within_s, "s",
+                                            allowed=flown)}
 
 
 def _is_same(window: _Window, params: Any) -> bool:

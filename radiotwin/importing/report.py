@@ -13,6 +13,7 @@ from radiotwin.importing.reading import Logs
 from radiotwin.importing.settings import Settings
 from radiotwin.importing.tally import Tally
 from radiotwin.measurements import Measurements
+from radiotwin.texts import moment
 
 SCHEMA = "radiotwin.import/2"
 UNITS = {"_m": "m", "_deg": "°", "_s": "s", "_dbm": "dBm", "_db": "dB"}
@@ -54,7 +55,7 @@ def make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Tal
         "written": len(table), "not_detected": int(np.isnan(measurements.level_db).sum()),
         "devices": len(devices), "anchors": int(measurements.is_anchor.sum()),
         "receivers": int(table["receiver"].nunique()), "flights": len(measurements.flights),
-        "time": {"first": _stamp(time_s.min()), "last": _stamp(time_s.max())}
+        "time": {"first": moment(time_s.min()), "last": moment(time_s.max())}
         if len(time_s) else None,
         "origin": None if origin is None else origin.model_dump(),
         "ranges": _ranges(table, positioned.links),
@@ -64,10 +65,6 @@ def make_report(logs: Logs, notes: list[str], others: int, kept: int, tally: Tal
                      *_time_and_angle_warnings(table),
                      *_averaging_warnings(measurements, settings)],
     }
-
-
-def _stamp(time_s: float) -> str:
-    return datetime.fromtimestamp(time_s, UTC).isoformat(sep=" ", timespec="seconds")
 
 
 def _ranges(table: pd.DataFrame, links: pd.DataFrame) -> dict[str, dict[str, Any]]:

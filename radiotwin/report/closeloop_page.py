@@ -217,13 +217,14 @@ def _value(parameter: dict) -> str:
     if words.is_reference(parameter):
         return "0 (reference)"
     known = parameter.get("determined", True)
-    return words.small(parameter["value"]) if known else "not determined"
+    return words.quantity(parameter["value"], parameter["unit"]) if known else "not determined"
 
 
 def _interval(parameter: dict) -> str:
     low, high = parameter["low"], parameter["high"]
     unknown = None in (low, high) or low == high
-    return "–" if unknown else f"{words.small(low)} to {words.small(high)}"
+    unit = parameter["unit"]
+    return "–" if unknown else f"{words.quantity(low, unit)} to {words.quantity(high, unit)}"
 
 
 def _p_value(value: float | None) -> str:

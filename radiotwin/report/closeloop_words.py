@@ -5,6 +5,7 @@ from collections import Counter
 from radiotwin.closeloop.criteria import SelectionCriteria
 from radiotwin.closeloop.posterior import NONE, OTHER
 from radiotwin.report.labels import INTERPOLATIONS, join_names, name_label, variable_label
+from radiotwin.texts import moment
 
 MAX_NAMED = 4  # variables or effects in a sentence
 MIN_DIFFERENCE_DB = 0.5  # of two receivers, to be worth a word: instruments' tolerance
@@ -12,6 +13,7 @@ SURE = 0.9  # a cause that is less probable is said to be probable only
 HALF = 0.5  # more probable than not
 NOT_LOOKED_FOR, LACKING = "not looked for: ", "there is no "  # a reason, and how it goes on
 LIKELY = 0.05  # a cause that is less probable is not worth a word
+DATES_S = 1e9, 4e9  # times from 2001 to 2096; no other number of seconds is as large
 BADGES = {"effect": "found: ", "none": "no cause found", "unexplained": "unexplained",
           "undecided": "undecided"}
 SETTLES = {
@@ -138,6 +140,13 @@ def small(value: float | None) -> str:
     if value is None or not 0 < abs(value) < 0.005:
         return number(value)
     return f"{value:.2g}".replace("-", "−")
+
+
+def quantity(value: float | None, unit: str) -> str:
+    """Return the number of a parameter, or a date where it is one in seconds since 1970."""
+    if value is not None and unit == "s" and DATES_S[0] < value < DATES_S[1]:
+        return moment(value)
+    return small(value)
 
 
 def about(value: float) -> str:

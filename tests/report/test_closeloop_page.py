@@ -348,3 +348,13 @@ def test_the_page_tells_how_far_intervals_can_be_trusted(tmp_path):
 
 def test_a_size_that_searches_found_by_doubling_has_two_digits():
     assert [about(size) for size in (106.2, 9.24, 0.0123, 1060.0)] == ["110", "9.2", "0.012", "1,100"]
+
+
+def test_times_since_1970_are_dates_and_no_other_quantity_is(tmp_path):
+    start = {"value": 1778554730.4, "low": 1778550000.0, "high": 1778560000.0, "unit": "s"}
+    length = {"value": 70.0, "low": 60.0, "high": 80.0, "unit": "s"}
+    found = report(effects=[DRIFT | {"parameters": {"start_s[r0]": start, "time_constant_s[r0]": length}}])
+    write_closeloop_page(found, tmp_path, "times")
+    page = (tmp_path / "closeloop.html").read_text(encoding="utf-8")
+    assert "2026-05-12 02:58:50" in page and "2026-05-12 01:40:00" in page and "1778554730" not in page
+    assert "60.00 to 80.00" in page
