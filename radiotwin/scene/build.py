@@ -23,7 +23,7 @@ from radiotwin.scene.config import (
     parse_config,
     write_config,
 )
-from radiotwin.scene.folder import check_target
+from radiotwin.scene.folder import check_target, keep_declarations
 from radiotwin.scene.importer import ImportedCity, import_city
 from radiotwin.scene.material_mapping import settle
 from radiotwin.scene.materials import constants
@@ -226,6 +226,7 @@ def finish_scene(city: ImportedCity, declared: Declared, out_folder: Path, optio
         with atomic_folder(out_folder) as folder:
             write_city(folder, shapes)
             write_config(plan.config, folder / "scene.toml")
+            keep_declarations(out_folder, folder)
             if buildings is not None:
                 write_csv(buildings, folder / "buildings.csv")
             draw_preview(Scene.load(folder), folder / "preview.png")

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
+import shutil
+import warnings
 from collections.abc import Set
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +20,9 @@ from radiotwin.scene.writer import write_city
 if TYPE_CHECKING:
     from radiotwin.scene.scene import Scene
 
-SCENE_FILES = frozenset({"scene.toml", "city.xml", "meshes", "preview.png", "buildings.csv"})
+EARLIER = "scene.toml.old"  # the declarations that a new scene replaced
+SCENE_FILES = frozenset({"scene.toml", EARLIER, "city.xml", "meshes", "preview.png",
+                         "buildings.csv"})
 COPIED = ("buildings.csv",)  # beside what is written anew
 
 
@@ -50,6 +55,25 @@ def check_target(folder: Path, allowed: Set[str] = SCENE_FILES, source: Path | N
     if source is not None and is_within(source, folder):
         raise BadInput(f"{source} lies in {folder}, which the new scene would replace; choose "
                        "another output folder")
+
+
+def keep_declarations(folder: Path, new: Path) -> None:
+    """Keep the `scene.toml` that a scene replaces, where it is another: it may have been edited.
+
+    Args:
+        folder: that is replaced.
+        new: folder with the new `scene.toml`; gets the one before as `scene.toml.old`.
+
+    Warns:
+        There was another.
+    """
+    before = folder / "scene.toml"
+    if before.is_file() and not filecmp.cmp(before, new / "scene.toml", shallow=False):
+        shutil.copyfile(before, new / EARLIER)
+        warnings.warn(f"{folder} held a scene with other declarations; its scene.toml is kept as "
+                      f"{EARLIER}", stacklevel=3)
+    elif (folder / EARLIER).is_file():
+        shutil.copyfile(folder / EARLIER, new / EARLIER)
 
 
 def copy_scene(scene: Scene, folder: Path) -> None:

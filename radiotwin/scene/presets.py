@@ -19,6 +19,7 @@ from radiotwin.scene.config import (
     UavConfig,
     write_config,
 )
+from radiotwin.scene.folder import keep_declarations
 from radiotwin.scene.generator import CityParameters, building_meshes, draw_buildings
 from radiotwin.scene.materials import itu_material
 from radiotwin.scene.preview import draw_preview
@@ -154,6 +155,7 @@ def build_preset(name: str, folder: Path | str) -> None:
     with atomic_folder(folder) as temporary:
         write_city(temporary, shapes)
         write_config(preset_config(name), temporary / "scene.toml")
+        keep_declarations(folder, temporary)
         draw_preview(Scene.load(temporary), temporary / "preview.png")
 
 

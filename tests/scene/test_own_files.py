@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import warnings
 
 import pytest
 
@@ -10,6 +11,7 @@ from radiotwin.scene import Scene
 from radiotwin.scene.build import build_scene
 from radiotwin.scene.mitsuba_xml import read_mitsuba_xml
 from radiotwin.scene.ply import read_ply
+from radiotwin.scene.presets import build_preset
 from radiotwin.trace import SolverSettings, trace_map
 
 
@@ -131,3 +133,18 @@ def test_a_trace_writes_nothing_outside(small_scene, tmp_path):
     with pytest.raises(BadInput, match="cache.trace-.* leads out of"):
         trace_map(Scene.load(folder), SolverSettings(), tmp_path / "truth.nc")
     assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def test_declarations_that_a_user_has_edited_are_kept_beside_a_new_scene(tmp_path):
+    build_preset("small", tmp_path / "scene")
+    declared = tmp_path / "scene" / "scene.toml"
+    edited = declared.read_text(encoding="utf-8").replace("battery = ", "battery = 1")
+    declared.write_text(edited, encoding="utf-8")
+    with pytest.warns(UserWarning, match="scene.toml is kept as scene.toml.old"):
+        build_preset("small", tmp_path / "scene")
+    assert (tmp_path / "scene" / "scene.toml.old").read_text(encoding="utf-8") == edited
+    assert declared.read_text(encoding="utf-8") != edited
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        build_preset("small", tmp_path / "scene")  # nothing has been edited since
+    assert (tmp_path / "scene" / "scene.toml.old").read_text(encoding="utf-8") == edited
