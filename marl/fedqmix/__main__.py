@@ -63,5 +63,6 @@ app.command()(with_output_options(fedqmix, prints_tables=True))
 
 
 if __name__ == "__main__":
-    signals.leave(exit_status(app, "the finished rounds are kept: the same command with --resume "
-                                   "goes on; but a federation starts anew, with another --out"))
+    signals.leave(exit_status(app, "rounds that had finished are kept: the same command with "
+                                   "--resume goes on (a federation starts anew, with another "
+                                   "--out)"))
