@@ -143,7 +143,8 @@ def locate(
     scene: OptionalScene = None,
     devices: DeviceTable = None,
     truth: Annotated[Path | None, typer.Option(
-        help="Table of devices with their true positions, to report the errors.")] = None,
+        help="Table with columns device and x_m, y_m or latitude, longitude: true positions, "
+             "to report the errors.")] = None,
     shift: Shift = None,
     out: Annotated[Path, typer.Option(
         "--out", "-o", help="Table of the positions.")] = Path("located.csv"),
@@ -156,11 +157,16 @@ def locate(
     from radiotwin.files import atomic_path, require_suffix, require_writable
     from radiotwin.inputs import keep_inputs
     from radiotwin.localize.without_map import MIN_LINKS
-    from radiotwin.measurements import read_devices, read_measurements
+    from radiotwin.measurements import read_measurements
     from radiotwin.scene import Scene
     from radiotwin.scene.folder import files_of
     from radiotwin.twin import Twin
-    from radiotwin.twin.locate import check_can_locate, locate_devices, position_errors
+    from radiotwin.twin.locate import (
+        check_can_locate,
+        locate_devices,
+        position_errors,
+        read_truth,
+    )
 
     require_suffix(out, ".csv", ".csv.gz")
     keep_inputs(out, measurements, devices or measurements.parent / "devices.csv", truth)
@@ -168,7 +174,7 @@ def locate(
     keep_inputs(out, *(files_of(world) if world else []))
     check_can_locate(known, world)  # before a file is read that may be large
     data = in_frame_of(world, read_measurements(measurements, devices), shift)
-    true = read_devices(truth) if truth else None
+    true = read_truth(truth, known.origin or data.origin) if truth else None
     require_writable(out)
     unknown = int((data.devices["role"] == "unknown").sum())
     positions, notes = locate_devices(data, known, world)

@@ -1,25 +1,29 @@
 """Devices of unknown position in a file of measurements, located by a corrected twin."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 
 from radiotwin.alignment import in_known_frame
+from radiotwin.cells import as_numbers, read_cells, refuse
 from radiotwin.effects.effect_model import EffectModel
 from radiotwin.errors import BadInput
-from radiotwin.geodesy import to_geographic
+from radiotwin.geodesy import to_geographic, to_local
 from radiotwin.links import LinkData, prepare_links
 from radiotwin.localize import PositionEstimate, locate, misfit, whole_area
 from radiotwin.measurements import Measurements
 from radiotwin.progress import progress
 from radiotwin.scene import Scene
+from radiotwin.tables import Origin
 from radiotwin.twin.twin import Twin
 
 NOT_BY_PATHS = ("and following paths from every position where a device may be takes too long: "
                 "locate cannot use such a twin. close-loop --base twin makes one for it, and "
                 "fit --model raytrace locates devices along with the twin")
 MAX_NAMED = 5  # receivers in a note
+TRUTH_COLUMNS = ("x_m", "y_m"), ("latitude", "longitude")
 MIN_WIDENING = 1.2  # of residuals, from which a file's links are unlike those learnt from
 
 
@@ -111,6 +115,48 @@ def _widening(model: EffectModel, links: LinkData, found: list[PositionEstimate]
     misfits = [misfit(model, links.select(links.device == each.device), each) for each in found]
     ratio = float(np.sqrt(np.nanmedian(misfits) / model.typical_misfit))
     return ratio if ratio > MIN_WIDENING else 1.0
+
+
+def read_truth(path: Path, origin: Origin | None) -> pd.DataFrame:
+    """Read true positions of devices.
+
+    Args:
+        path: table with the column `device`, and `x_m` and `y_m`, or `latitude` and `longitude`;
+            other columns do not matter.
+        origin: of the frame that devices are located in; None: not known.
+
+    Returns:
+        `device, x_m, y_m`; NaN where a position is not known.
+
+    Raises:
+        BadInput: none of these columns, no device twice, a value that is no number, or degrees
+            without an origin.
+    """
+    table = read_cells(path, ["device"])
+    names = next((each for each in TRUTH_COLUMNS if set(each) <= set(table)), None)
+    if names is None:
+        raise BadInput(f"{path}: true positions are not there; allowed are the columns x_m and "
+                       "y_m, or latitude and longitude")
+    if table["device"].duplicated().any():
+        raise BadInput(f"{path}: a device occurs twice; every device needs one row")
+    first, second = (_known_numbers(path, table, name) for name in names)
+    if names == TRUTH_COLUMNS[0]:
+        return pd.DataFrame({"device": table["device"], "x_m": first, "y_m": second})
+    if origin is None:
+        raise BadInput(f"{path}: positions are latitude and longitude, and where the frame of the "
+                       "twin lies is not known; give x_m and y_m in its frame")
+    x_m, y_m = to_local(origin, second, first)
+    known = np.isfinite(x_m) & np.isfinite(y_m)
+    return pd.DataFrame({"device": table["device"], "x_m": np.where(known, x_m, np.nan),
+                         "y_m": np.where(known, y_m, np.nan)})
+
+
+def _known_numbers(path: Path, table: pd.DataFrame, name: str) -> np.ndarray:
+    """Return the numbers (n,) of a column, NaN where it is empty."""
+    numbers = as_numbers(table[name])
+    empty = table[name].isna() | (table[name].astype(str).str.strip() == "")
+    refuse(path, name, table[name], ~np.isfinite(numbers) & ~empty.to_numpy(), "is no number")
+    return numbers
 
 
 def position_errors(positions: pd.DataFrame, truth: pd.DataFrame) -> dict[str, float]:

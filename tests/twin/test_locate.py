@@ -14,6 +14,7 @@ from radiotwin.effects.effect_model import EffectModel
 from radiotwin.errors import BadInput
 from radiotwin.inference.censored_line import LogDistanceLine
 from radiotwin.measurements import Measurements
+from radiotwin.tables import Origin
 from radiotwin.twin import Twin, TwinDevice
 from radiotwin.twin import locate as module
 
@@ -91,3 +92,30 @@ def test_only_twins_of_close_loop_whose_channel_is_a_law_locate():
         module.check_can_locate(law, None)
     with pytest.raises(BadInput, match="close-loop --base twin makes one"):
         module.check_can_locate(paths, None)
+
+
+ORIGIN = Origin(latitude_deg=48.0, longitude_deg=11.0, altitude_m=0.0)
+
+
+def test_true_positions_are_metres_or_degrees(tmp_path):
+    table = pd.DataFrame({"device": ["a", "b", "c"], "x_m": [0.0, 100.0, np.nan], "y_m": [0.0, -50.0, np.nan], "note": "kept"})
+    table.to_csv(tmp_path / "metres.csv", index=False)
+    found = module.read_truth(tmp_path / "metres.csv", None)
+    pd.testing.assert_frame_equal(found, table[["device", "x_m", "y_m"]])
+    # A degree of latitude is 111.2 km here, one of longitude 74.6 km (WGS84, by its radii of curvature).
+    degrees = pd.DataFrame({"device": ["a", "b", "c"], "latitude": [48.0, 48.0 - 50 / 111_199, np.nan],
+                            "longitude": [11.0, 11.0 + 100 / 74_625, np.nan]})
+    degrees.to_csv(tmp_path / "degrees.csv", index=False)
+    there = module.read_truth(tmp_path / "degrees.csv", ORIGIN)
+    np.testing.assert_allclose(there[["x_m", "y_m"]], table[["x_m", "y_m"]], atol=0.2)
+
+
+@pytest.mark.parametrize("text, message", [
+    ("device,x\na,1\n", "allowed are the columns x_m and y_m, or latitude and longitude"),
+    ("device,x_m,y_m\na,1,2\na,3,4\n", "a device occurs twice"),
+    ("device,x_m,y_m\na,1,two\n", "row 2, column y_m: 'two' is no number"),
+    ("device,latitude,longitude\na,48,11\n", "where the frame of the twin lies is not known")])
+def test_a_table_of_true_positions_that_is_none_is_one_message(tmp_path, text, message):
+    (tmp_path / "truth.csv").write_text(text)
+    with pytest.raises(BadInput, match=message):
+        module.read_truth(tmp_path / "truth.csv", None)
