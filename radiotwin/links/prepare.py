@@ -157,10 +157,11 @@ def _ground_m(scene: Scene, device_m: np.ndarray, receiver_m: np.ndarray) -> np.
     Of one of unknown position, that of most of the ground that was measured over.
     """
     city, unknown = scene.city, np.isnan(device_m[:, 0])
-    over_m = receiver_m[np.isfinite(receiver_m[:, :2]).all(axis=1), :2]
-    usual_m = float(np.median(city.ground_height_m(*over_m.T))) if len(over_m) else 0.0
-    below_m = np.full(len(device_m), usual_m)
+    below_m = np.zeros(len(device_m))
     below_m[~unknown] = city.ground_height_m(*device_m[~unknown, :2].T)
+    over_m = receiver_m[np.isfinite(receiver_m[:, :2]).all(axis=1), :2]
+    if unknown.any() and len(over_m):
+        below_m[unknown] = np.median(city.ground_height_m(*over_m.T))
     return below_m
 
 
