@@ -1,6 +1,7 @@
 """Draw radio maps over the outlines of the buildings."""
 
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -21,6 +22,7 @@ MAX_COLUMNS = 5
 MAX_PANELS = 100
 MAX_CELLS = 1_000  # along the longer side of a panel; of larger maps every n-th is drawn
 MAX_RATIO = 5  # of the sides of a panel
+TITLE_LETTERS_IN = 10  # that fit into an inch of a title
 ERROR_RANGE_DB = 25.0
 HeightGrid = tuple[np.ndarray, tuple[float, float, float, float]]
 """(ny, nx) heights [m], and x_min, x_max, y_min, y_max [m]."""
@@ -76,8 +78,9 @@ def radio_map_figure(radio_map: RadioMap, scene: Scene) -> Figure:
     source = plain(str(radio_map.dataset.attrs.get("source", "")))
     left_out = len(radio_map.devices) - len(names)
     more = f"; {left_out} more not shown" if left_out else ""
-    figure.suptitle(f"{source} at {_lowest(radio_map)} (triangle: device; white: not "
-                    f"detected{more})")
+    title = f"{source} at {_lowest(radio_map)} (triangle: device; white: not detected{more})"
+    letters = int(TITLE_LETTERS_IN * figure.get_figwidth())
+    figure.suptitle(fill(title, letters, break_on_hyphens=False))
     return figure
 
 
