@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 MAX_LINES, MAX_MEDIAN_LINES = 400, 150
 # Packages and modules of radiotwin from the top: each imports only what is in lower rows.
 LAYERS = (
+    {"__main__"},
     {"cli"},
     {"demo"},
     {"report"},
