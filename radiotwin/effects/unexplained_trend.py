@@ -26,7 +26,7 @@ CIRCULAR = ("azimuth_deg", "body_azimuth_deg", "heading_deg")
 ON_MAPS = ("distance_m", "elevation_deg", "azimuth_deg", "altitude_m", "predicted_level_db",
            "metres_inside_m", "diffraction_parameter")
 OVER = "over "
-MAX_KNOT = 1e9
+MAX_KNOT = 1e15  # of times since 1970, too
 
 
 def _ascending(values: list[float]) -> list[float]:
