@@ -5,11 +5,11 @@ two knife edges (ITU-R P.526), but no more than what is left on other paths: the
 sight. The height of each roof with such links is estimated beside all others, with a prior around
 the map's; a roof whose uncertainty its links do not halve stays where it is.
 
-What predicts best is not yet a roof's height: where more gets around buildings than over them, all
-roofs seem low, and each by something else. In 14 campaigns that another hand made, with exact maps,
-knife edges and ways around corners, roofs came out 1.2 m too low in the mean and scattered by 1.1
-m. So of what is said of a roof, what the others have in common is taken away, and how much they
-differ is part of its uncertainty.
+The height that predicts best is not yet the roof's: where more gets around buildings than over
+them, all roofs seem low, and each by another amount. In 14 campaigns that another hand made, with
+exact maps, knife edges and ways around corners, roofs came out 1.2 m too low in the mean and
+scattered by 1.1 m. So the offset that all have in common counts as the model's, and the scatter of
+the others is part of each roof's uncertainty.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ def surely_off(roofs: Sequence[Roof]) -> list[Roof]:
 
 
 def beside_the_others(roofs: Sequence[Roof]) -> tuple[Roof, ...]:
-    """Return roofs with what the others have in common, and with as much doubt as they differ.
+    """Return roofs with the offset of the others taken for the model's, and their scatter added.
 
     Args:
         roofs: n roofs; the standard deviation of each is of what its own links leave open.
