@@ -26,7 +26,7 @@ from radiotwin.files import atomic_path
 from radiotwin.map_file import is_zarr
 from radiotwin.measurements import Measurements
 from radiotwin.radiomap import RadioMap
-from radiotwin.records import Number, Record, Whole, read_record, validated
+from radiotwin.records import Real, Record, Whole, read_record, validated
 from radiotwin.scene import Scene
 from radiotwin.twin import Twin
 
@@ -41,9 +41,9 @@ class ScoreRecord(Record):
     positions: Literal["estimated", "true"]
     links: Literal["all", "LoS", "NLoS"]
     n: Whole
-    rmse_db: Number | None
-    mae_db: Number | None
-    bias_db: Number | None
+    rmse_db: Real | None
+    mae_db: Real | None
+    bias_db: Real | None
 
 
 class LocationRecord(Record):
@@ -51,10 +51,10 @@ class LocationRecord(Record):
 
     model: str
     device: str
-    x_m: Number | None = None
-    y_m: Number | None = None
-    error_m: Number | None
-    credible_radius_m: Number | None = None
+    x_m: Real | None = None
+    y_m: Real | None = None
+    error_m: Real | None
+    credible_radius_m: Real | None = None
     located: bool = False
 
 

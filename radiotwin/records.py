@@ -31,7 +31,7 @@ def _whole(value: object) -> int:
     return value
 
 
-Number = Annotated[int | float, PlainValidator(_number)]
+Real = Annotated[int | float, PlainValidator(_number)]
 """A finite number; a whole one stays an integer, `true` and texts are refused."""
 Whole = Annotated[int, PlainValidator(_whole)]
 """A whole number from 0."""

@@ -14,7 +14,7 @@ _PROGRAM = """
 import sys
 import numpy as np
 if sys.argv[1] == "cpu":
-    from radiotwin import llvm
+    from radiotwin.runtime import llvm
     llvm.prepare()
 import mitsuba
 mitsuba.set_variant({"cpu": "llvm", "cuda": "cuda"}[sys.argv[1]] + "_ad_mono_polarized")

@@ -51,8 +51,8 @@ EVERY = 12  # one transmitter position in so many of the POWDER set
 CELL_M = 10.0  # one reading of a sector in each cell of the campus
 LEFT_OUT = re.compile(r"(^|_)(seconds|version|versions|cpu|wall|created|time_utc|date|elapsed)"
                       r"(_s)?$|^peak_|^seconds_")
-WORDS = re.compile(r"\b\d+(\.\d+)? (s|min|h|seconds|minutes)\b|\d\d:\d\d:\d\d|0\+source|/\S*guard\S*"
-                   r"|/tmp/\S*|0\.1\.0\S*")
+WORDS = re.compile(r"\b\d+(\.\d+)? (s|min|h|seconds|minutes)\b|\d\d:\d\d:\d\d|0\+source"
+                   r"|/\S*guard\S*|/tmp/\S*|0\.1\.0\S*")
 COST_RATIO = 1.1
 
 

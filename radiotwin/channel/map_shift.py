@@ -13,8 +13,8 @@ from radiotwin.inference.gaussian import Limit, limits_of
 from radiotwin.links import LinkGeometry
 from radiotwin.progress import progress
 
-LINKS = 300  # that are looked at
-MIN_LINKS = 60  # fewer say nothing of a map
+SHIFT_LINKS = 300  # that are looked at
+MIN_SHIFT_LINKS = 60  # fewer say nothing of a map
 RINGS_M = (2.5, 5.0)  # eight shifts each, to begin with
 STEPS_M = (2.0, 1.0, 0.5)
 MAX_SHIFT_M = 12.0
@@ -49,10 +49,10 @@ def estimate_shift(links: LinkGeometry, level_db: np.ndarray, limit_db: Limit, s
     if links.estimated is not None:
         known &= ~links.estimated
     rows = np.flatnonzero(known)
-    if len(rows) < MIN_LINKS or not np.isfinite(level_db[rows]).any():
+    if len(rows) < MIN_SHIFT_LINKS or not np.isfinite(level_db[rows]).any():
         return NO_SHIFT
     rng = np.random.default_rng(seed)
-    rows = np.sort(rng.choice(rows, min(LINKS, len(rows)), replace=False))
+    rows = np.sort(rng.choice(rows, min(SHIFT_LINKS, len(rows)), replace=False))
     links, level_db, limits_db = links.select(rows), level_db[rows], limits_db[rows]
     device = np.unique(links.device, return_inverse=True)[1]
     if device.max() + 1 < MIN_DEVICES:

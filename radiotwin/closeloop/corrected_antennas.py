@@ -13,7 +13,7 @@ from radiotwin.scene import Scene
 from radiotwin.scene.config import DeviceConfig, SceneConfig
 from radiotwin.scene.names import safe_name, unique_name
 
-FOLDER = "antennas"
+ANTENNAS = "antennas"
 AZIMUTH_DEG, ELEVATION_DEG = np.arange(0.0, 360.0, 5.0), np.arange(-90.0, 91.0, 2.0)
 DECIMALS = 2  # of a gain [dBi] and an azimuth
 
@@ -66,7 +66,7 @@ def with_antennas(config: SceneConfig, loop: Loop,
                 continue
         others = {Path(each.antenna).stem.lower() for each in devices.values()
                   if each.antenna is not None and each.device != name}
-        file = f"{FOLDER}/{unique_name(f'found_{safe_name(name)}', others)}.csv"
+        file = f"{ANTENNAS}/{unique_name(f'found_{safe_name(name)}', others)}.csv"
         azimuth_deg = round(pattern.azimuth_deg % 360, DECIMALS)
         devices[name] = device.model_copy(update={
             "antenna": file, "azimuth_deg": azimuth_deg, "tilt_deg": None})

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 
 from radiotwin.cells import write_csv
-from radiotwin.closeloop.corrected_antennas import FOLDER as ANTENNAS
+from radiotwin.closeloop.corrected_antennas import ANTENNAS
 from radiotwin.closeloop.corrected_antennas import with_antennas, write_antenna
 from radiotwin.closeloop.corrected_buildings import corrected_buildings, stretch
 from radiotwin.closeloop.run import Loop

@@ -4,17 +4,17 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from radiotwin.records import Number, Record, Whole
+from radiotwin.records import Real, Record, Whole
 
 
 class ScoresRecord(Record):
     """Errors of a model on a group of links; further ones are numbers, too."""
 
     model_config = {"extra": "allow"}
-    __pydantic_extra__: dict[str, Number | None]
+    __pydantic_extra__: dict[str, Real | None]
 
     n: Whole
-    rmse_db: Number | None
+    rmse_db: Real | None
 
 
 class BaselineRecord(ScoresRecord):
@@ -35,7 +35,7 @@ class ErrorRecord(BothRecord):
 
     combined: ScoresRecord | None = None
     after_without_quality: ScoresRecord | None = None
-    noise_floor_db: Number | None
+    noise_floor_db: Real | None
     by_los: dict[Literal["los", "nlos"], BothRecord] = Field(default_factory=dict)
     by_device: dict[str, BothRecord] = Field(default_factory=dict)
     by_receiver: dict[str, BothRecord] = Field(default_factory=dict)
@@ -45,9 +45,9 @@ class ErrorRecord(BothRecord):
 class ParameterRecord(Record):
     """Estimate with its 90 % interval."""
 
-    value: Number | None
-    low: Number | None
-    high: Number | None
+    value: Real | None
+    low: Real | None
+    high: Real | None
     unit: str
     determined: bool = True
 
@@ -55,17 +55,17 @@ class ParameterRecord(Record):
 class KnownParameterRecord(ParameterRecord):
     """Estimate that has all three numbers."""
 
-    value: Number
-    low: Number
-    high: Number
+    value: Real
+    low: Real
+    high: Real
 
 
 class EvidenceRecord(Record):
     """Evidence for an effect."""
 
-    heldout_nll_gain: Number | None
-    p_value: Number | None
-    evidence_nats: Number | None = None
+    heldout_nll_gain: Real | None
+    p_value: Real | None
+    evidence_nats: Real | None = None
 
 
 class EffectRecord(Record):
@@ -81,7 +81,7 @@ class EffectRecord(Record):
     size_db: ParameterRecord | None = None
     confused_with: list[str] = Field(default_factory=list)
     indistinguishable_from: list[str] = Field(default_factory=list)
-    probability: Number | None = None
+    probability: Real | None = None
     evidence: EvidenceRecord
 
 
@@ -91,15 +91,15 @@ class CandidateRecord(Record):
     name: str
     variant: str = ""
     step: Whole
-    heldout_rmse_db: Number | None
-    heldout_nll_gain: Number | None
-    p_value: Number | None
+    heldout_rmse_db: Real | None
+    heldout_nll_gain: Real | None
+    p_value: Real | None
     kept: bool
     reason: str
-    evidence_nats: Number | None = None
+    evidence_nats: Real | None = None
     passed: bool = False
-    features: list[Number | None] = Field(default_factory=list)
-    probability: Number | None = None
+    features: list[Real | None] = Field(default_factory=list)
+    probability: Real | None = None
     devices: list[str] = Field(default_factory=list)
     receivers: list[str] = Field(default_factory=list)
 
@@ -108,16 +108,16 @@ class WeightRecord(Record):
     """Weights of a member of the combination, near measurements and far from them."""
 
     name: str
-    weight_near: Number
-    weight_far: Number
+    weight_near: Real
+    weight_far: Real
 
 
 class PredictionRecord(Record):
     """How good the combination is beside the best of the other models."""
 
     best_baseline: str
-    best_baseline_rmse_db: Number
-    combined_rmse_db: Number
+    best_baseline_rmse_db: Real
+    combined_rmse_db: Real
     advice: str
 
 
@@ -125,8 +125,8 @@ class DependenceRecord(Record):
     """A variable that the residual depends on."""
 
     variable: str
-    p_value: Number | None
-    effect_db: Number | None = None
+    p_value: Real | None
+    effect_db: Real | None = None
 
 
 class RemainingRecord(Record):
@@ -140,7 +140,7 @@ class ProbabilityRecord(Record):
     """An effect that was scored, passed or not, `none` or `not in the catalogue`; they sum to 1."""
 
     name: str
-    probability: Number | None
+    probability: Real | None
 
 
 class StepRecord(Record):
@@ -148,16 +148,16 @@ class StepRecord(Record):
 
     step: Whole
     probabilities: list[ProbabilityRecord]
-    unnamed_nats: dict[str, Number | None]
-    rest_db: Number | None
-    noise_db: Number | None
+    unnamed_nats: dict[str, Real | None]
+    rest_db: Real | None
+    noise_db: Real | None
 
 
 class DetectableRecord(Record):
     """How large an effect would have had to be, to be named; no size where none would do."""
 
     name: str
-    size: Number | None
+    size: Real | None
     unit: str
     pattern: str
 
@@ -206,7 +206,7 @@ class ReportRecord(Record):
     prediction: PredictionRecord | None = None
     dependences_before: list[DependenceRecord] = Field(default_factory=list)
     remaining: RemainingRecord
-    criteria: dict[str, Number] = Field(default_factory=dict)
+    criteria: dict[str, Real] = Field(default_factory=dict)
     notes: list[str]
     inputs: InputsRecord = Field(default_factory=InputsRecord)
 

@@ -34,7 +34,6 @@ MIN_NATS = 5.0  # that losses must gain to be proposed for a receiver
 STRONGEST = 0.25  # share of the links, which must gain, too
 MIN_DEVICE_LINKS = 20  # of a device, to be asked whether it gains
 MIN_DEVICES = 0.6  # share of those devices that must gain
-DOF = 4.0  # of the errors: heavy tails
 PROBABILITIES = np.geomspace(0.002, 0.9, 60)  # tried
 MIN_PROBABILITY = 1e-9  # of a level below the limit; bounds the weight of one link
 MAX_VARIED = 8  # receivers whose probabilities are refined; more take too long

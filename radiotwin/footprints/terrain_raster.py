@@ -26,7 +26,6 @@ from radiotwin.tables import Origin
 if TYPE_CHECKING:
     from pyproj import CRS
 
-Bounds = tuple[float, float, float, float]
 MAX_NODES = 400_000  # of the grid, which is wider than the raster's where that has more
 MIN_SPACING_M = 1.0
 MARGIN_PIXELS = 2  # around the grid, for the interpolation at its border

@@ -71,7 +71,7 @@ def build_links(source: Source, settings: Settings, tally: Tally, problems: Prob
         if any(name not in source.table for name in columns_of(level.spec, source.table)):
             continue  # which is reported already
         with problems.noted():
-            parts.append(_links_of(source, level, shared, settings, tally))
+            parts.append(_rows_as_links(source, level, shared, settings, tally))
     if problems:
         return shared, 0
     links = parts[0] if len(parts) == 1 else pd.concat(parts).sort_index(kind="stable")
@@ -110,7 +110,7 @@ def _shared(source: Source, columns: dict[str, str], settings: Settings,
     return shared
 
 
-def _links_of(source: Source, level: LevelColumn, shared: pd.DataFrame, settings: Settings,
+def _rows_as_links(source: Source, level: LevelColumn, shared: pd.DataFrame, settings: Settings,
               tally: Tally) -> pd.DataFrame:
     """Return the usable links of one column of levels."""
     links = shared.copy(deep=False)  # columns are added and replaced, none is changed

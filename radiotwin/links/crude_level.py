@@ -12,7 +12,7 @@ from scipy.special import log_ndtr, ndtr
 SLOPE_DB, SLOPE_SD_DB = -30.0, 10.0  # prior of the fall per decade: path-loss exponent 2 to 4
 END_SD_DB = 8.0  # prior of what one device, or one receiver, differs from the others
 MIN_LINKS = 5  # of an end that has a level of its own
-ROUNDS = 8  # of expectation and maximisation
+LEVEL_ROUNDS = 8  # of expectation and maximisation
 FIRST_SD_DB, MIN_SD_DB = 8.0, 6.0
 LOST = 0.02  # probability that a link is blank although its level is above the limit
 FIRST_BELOW_DB = 3.0  # how far below its limit a blank is taken to be at first
@@ -53,7 +53,7 @@ def crude_level(level_db: np.ndarray, limit_db: np.ndarray, distance_m: np.ndarr
     ends = [_frequent(device), _frequent(receiver)]
     own_db = [np.zeros(end.max() + 1) for end in ends]
     slope_db, sd_db, variance = SLOPE_DB, FIRST_SD_DB, np.zeros(len(level_db))
-    for _ in range(ROUNDS):
+    for _ in range(LEVEL_ROUNDS):
         for number, end in enumerate(ends):
             rest = filled_db - slope_db * distance - own_db[1 - number][ends[1 - number]]
             rest = rest - rest[counted].mean()

@@ -7,7 +7,6 @@ from radiotwin.report.closeloop_data import LinkArrays
 from radiotwin.scene import Scene
 from radiotwin.scene.preview import draw_vegetation, height_grid
 
-BUILDING_M = 2.0  # lowest height that is drawn as a building
 CELLS = 45  # along the longer side of the map
 MIN_CELL_M = 10.0
 MIN_LINKS = 3  # of a cell

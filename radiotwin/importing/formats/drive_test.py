@@ -2,7 +2,7 @@
 
 from radiotwin.importing.formats.format import Format
 
-FORMATS = (
+DRIVE_TEST = (
     Format(
         "tems", "TEMS, text export",
         {"level": ("Serving Cell RSRP (dBm)", "LTE Serving Cell RSRP (dBm)",

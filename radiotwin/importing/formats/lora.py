@@ -46,7 +46,7 @@ def _things_stack(prefix: str) -> tuple[Format, Format]:
             _LEVEL, _STACK, _UNITS, caution=_CAUTION))
 
 
-FORMATS = (
+LORA = (
     Format(
         "ttn-mapper", "TTN Mapper, CSV export",
         {"level": "rssi", "snr": "snr", "device": ("gwaddr", "gtw_id", "gateway_id"),

@@ -7,7 +7,7 @@ _UNKNOWN = 2147483647  # of Android's telephony, CellInfo.UNAVAILABLE
 _MIXED = ("levels are RSRP of LTE and NR, RSCP of UMTS, RSSI of GSM: they differ by more than "
           "10 dB and are no one quantity; keep one with --only {}=LTE")
 
-FORMATS = (
+PHONE = (
     Format(
         "wigle", "WiGLE WiFi Wardriving, CSV 1.4 and 1.6",
         {"level": "RSSI", "device": "MAC", "time": "FirstSeen", "latitude": "CurrentLatitude",

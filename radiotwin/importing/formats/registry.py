@@ -3,12 +3,14 @@
 from collections.abc import Collection, Iterable
 
 from radiotwin.errors import BadInput
-from radiotwin.importing.formats import drive_test, lora, phone, scanner
+from radiotwin.importing.formats.drive_test import DRIVE_TEST
 from radiotwin.importing.formats.format import Format
+from radiotwin.importing.formats.lora import LORA
+from radiotwin.importing.formats.phone import PHONE
+from radiotwin.importing.formats.scanner import SCANNER
 from radiotwin.importing.read_source import Expected
 
-FORMATS: tuple[Format, ...] = (*phone.FORMATS, *drive_test.FORMATS, *lora.FORMATS,
-                              *scanner.FORMATS)
+FORMATS: tuple[Format, ...] = (*PHONE, *DRIVE_TEST, *LORA, *SCANNER)
 
 
 def expected(formats: Iterable[Format], columns: Collection[str] = ()) -> Expected:

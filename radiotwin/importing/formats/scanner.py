@@ -4,7 +4,7 @@ from radiotwin.importing.formats.format import Format
 from radiotwin.importing.read_source import WithoutHeader
 from radiotwin.importing.rtl_power import read_rtl_power
 
-FORMATS = (
+SCANNER = (
     Format(
         "rtl-power", "rtl_power",
         {"level": "power_db", "device": "band", "time": "{date} {time}"},

@@ -16,8 +16,8 @@ from radiotwin.importing.tracks.bag_chunks import Chunks
 from radiotwin.importing.tracks.bag_message import BagMessage, is_fix
 from radiotwin.inputs import open_input
 
-_MAGIC = b"\x89MCAP0\r\n"
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _DATA_END = 3, 4, 5, 6, 15
+_MCAP_MAGIC = b"\x89MCAP0\r\n"
+_SCHEMA, _CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK, _DATA_END = 3, 4, 5, 6, 15
 _ENCODINGS = {"cdr": False, "ros1": True}
 
 
@@ -32,7 +32,7 @@ def mcap_messages(path: Path) -> Iterator[BagMessage]:
     """
     walk = _Walk(path)
     with open_input(path, "recording (.mcap)") as file:
-        if file.read(len(_MAGIC)) != _MAGIC:
+        if file.read(len(_MCAP_MAGIC)) != _MCAP_MAGIC:
             raise BadInput(f"{path} is no MCAP file; fetch it again")
         try:
             yield from walk.messages(file)
@@ -57,7 +57,7 @@ class _Walk:
             kind, size = struct.unpack("<BQ", start)
             if kind == _DATA_END:
                 return
-            if kind not in (_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK) or kind == _CHUNK and is_chunk:
+            if kind not in (_SCHEMA, _CHANNEL, _MCAP_MESSAGE, _MCAP_CHUNK) or kind == _MCAP_CHUNK and is_chunk:
                 if size > end - file.tell():
                     return
                 file.seek(size, io.SEEK_CUR)
@@ -66,9 +66,9 @@ class _Walk:
             body = file.read(size)
             if len(body) < size:
                 return
-            if kind == _CHUNK:
+            if kind == _MCAP_CHUNK:
                 yield from self.messages(io.BytesIO(self._chunk(body)), True)
-            elif kind == _MESSAGE:
+            elif kind == _MCAP_MESSAGE:
                 number, _, time_ns = struct.unpack_from("<HIQ", body)
                 if number in self._channels:
                     topic, is_ros1 = self._channels[number]
